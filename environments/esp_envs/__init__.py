@@ -1,0 +1,37 @@
+"""Batched, device-agnostic multi-agent environments whose numbers say what they are."""
+
+from esp_envs.base import Body, Environment, Observation, Scene, Step, TaskSettings, generators_for
+from esp_envs.registry import make, task_class, task_names
+from esp_envs.spec import (
+    Continuous,
+    Discrete,
+    Field,
+    Items,
+    Kind,
+    Layout,
+    TaskSpec,
+    joint_layout,
+    layout,
+)
+
+__all__ = [
+    "Body",
+    "Continuous",
+    "Discrete",
+    "Environment",
+    "Field",
+    "Items",
+    "Kind",
+    "Layout",
+    "Observation",
+    "Scene",
+    "Step",
+    "TaskSettings",
+    "TaskSpec",
+    "generators_for",
+    "joint_layout",
+    "layout",
+    "make",
+    "task_class",
+    "task_names",
+]

@@ -1,0 +1,166 @@
+"""The one contract of all environments: a batch of worlds, S seeds times E worlds each.
+
+Every seed owns one random generator, so seed k sees the same episodes alone and among ten. Worlds never
+influence each other. Everything is a tensor on one device; nothing here synchronises with a GPU.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch import Tensor
+
+from esp_envs.spec import Continuous, TaskSpec
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the agents and the critic see.
+
+    Shape:
+        obs: [S, E, N, D] float32; a fresh tensor, never a view of the simulator's buffers.
+        state: [S, E, state width] float32.
+    """
+
+    obs: Tensor
+    state: Tensor
+
+
+@dataclass(frozen=True)
+class Step:
+    """The result of one step of all worlds, after automatic reset of those that ended.
+
+    Attributes:
+        next: the observation to act on next (of the new episode where one has just begun).
+        reward: [S, E, N] float32.
+        terminated: [S, E] bool; the episode reached an end of its own: no value lies beyond.
+        truncated: [S, E] bool; the horizon cut the episode: bootstrap from `final`.
+        final: the last observation of the episodes that ended in this step (elsewhere equal to `next`), or None
+            where no world can have ended; known without looking at the device.
+        metrics: task measures of this step, each [S, E] float32, averaged over an episode by whoever evaluates.
+    """
+
+    next: Observation
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    final: Observation | None
+    metrics: dict[str, Tensor]
+
+
+def generators_for(seeds: Sequence[int], device: torch.device | str = "cpu") -> list[torch.Generator]:
+    """Return one generator per seed, on the CPU-or-GPU `device`."""
+    return [torch.Generator(device=device).manual_seed(int(seed)) for seed in seeds]
+
+
+class TaskSettings(BaseModel):
+    """What a user may change of a task; each field has its default, unit and bounds here and nowhere else."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Environment(ABC):
+    """A batch of worlds of one task.
+
+    A subclass names its settings model, builds `spec` from settings in its constructor and implements the abstract
+    methods. Its class docstring is the environment card.
+    """
+
+    Settings: ClassVar[type[TaskSettings]] = TaskSettings
+    spec: TaskSpec
+    heuristics: ClassVar[tuple[str, ...]] = ()
+    """Names that `heuristic` accepts, the main anchor first."""
+
+    def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        if num_envs < 1 or not generators:
+            raise ValueError("an environment needs at least one world and one seed")
+        self.settings = settings
+        self.num_envs = num_envs
+        self.generators = list(generators)
+        self.device = self.generators[0].device
+
+    @property
+    def num_seeds(self) -> int:
+        """S, the number of seeds."""
+        return len(self.generators)
+
+    @abstractmethod
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+
+    @abstractmethod
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one step.
+
+        Args:
+            action: [S, E, N] int64 for a discrete action space, else [S, E, N, width] float32.
+        """
+
+    @abstractmethod
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state (as laid out by `spec.state`) at the start of an episode.
+
+        Args:
+            state: [S, E, state width]; it fixes the physics completely, up to the task's own noise.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return everything that `load_state_dict` needs to go on bit for bit, generators included."""
+
+    @abstractmethod
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+
+    @abstractmethod
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of a hand-written policy in the present state (shape as for `step`)."""
+
+    @abstractmethod
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return what there is to draw of one world (seed index, world index)."""
+
+    def random_action(self) -> Tensor:
+        """Return a uniformly random joint action, drawn from each seed's own generator."""
+        shape = (self.num_envs, self.spec.num_agents)
+        if isinstance(self.spec.action, Continuous):
+            shape += (self.spec.action.width,)
+            draws = [torch.rand(shape, generator=g, device=self.device) * 2 - 1 for g in self.generators]
+        else:
+            count = self.spec.action.count
+            draws = [torch.randint(count, shape, generator=g, device=self.device) for g in self.generators]
+        return torch.stack(draws)
+
+
+@dataclass(frozen=True)
+class Body:
+    """One thing to draw.
+
+    Attributes:
+        position: (x, y) in world units.
+        radius: in world units.
+        color: "#rrggbb".
+        shape: "disc", "ring", "cross" or "square".
+        heading: direction of a nose mark in radians, or None.
+        trail: whether a renderer may draw its path.
+    """
+
+    position: tuple[float, float]
+    radius: float
+    color: str
+    shape: str = "disc"
+    heading: float | None = None
+    trail: bool = False
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order."""
+
+    bodies: tuple[Body, ...]
+    window: tuple[float, float, float, float]

@@ -1,0 +1,206 @@
+"""What a task's numbers are: fields, layouts, action spaces and the task's spec.
+
+A task never says how it transforms under a rotation. It says what each number *is* (a scalar, a planar
+vector, a pair of wheel speeds, ...); how a group element acts on that kind is known once, elsewhere.
+
+Shape letters, used in every docstring of this project:
+    S seeds, T steps, E worlds (environments) per seed, B batch, N agents, D observation width,
+    A number of discrete actions, G number of group elements.
+
+Axes and signs: x points right, y points up, angles are counter-clockwise in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+
+class Kind(Enum):
+    """What one item of a field is; the value is its width in numbers.
+
+    SCALAR        unchanged by every planar transform (a distance, a flag, a mass).
+    PSEUDOSCALAR  changes sign under reflection, unchanged by rotation (a turning rate).
+    VECTOR        (x, y), turned by the 2x2 matrix of the element (a position, a velocity, a heading given as
+                  the unit vector (cos, sin)).
+    WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
+    """
+
+    SCALAR = "scalar", 1
+    PSEUDOSCALAR = "pseudoscalar", 1
+    VECTOR = "vector", 2
+    WHEELS = "wheels", 2
+
+    @property
+    def width(self) -> int:
+        """Numbers per item."""
+        return self.value[1]
+
+
+class Items(Enum):
+    """What the items of a field count over; only agent permutations look at it.
+
+    FIXED   things that no agent permutation moves (landmarks, the own body).
+    OTHERS  the other agents in index order, the observer left out.
+    AGENTS  all agents in index order.
+    """
+
+    FIXED = "fixed"
+    OTHERS = "others"
+    AGENTS = "agents"
+
+
+@dataclass(frozen=True)
+class Field:
+    """A run of numbers of one kind: `count` items of `kind.width` numbers each, item after item."""
+
+    name: str
+    kind: Kind
+    count: int = 1
+    unit: str = ""
+    items: Items = Items.FIXED
+
+    @property
+    def width(self) -> int:
+        """Numbers in the whole field."""
+        return self.count * self.kind.width
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A sequence of fields: the whole meaning of an observation, a state or a continuous action vector."""
+
+    fields: tuple[Field, ...]
+
+    def __post_init__(self) -> None:
+        names = [f.name for f in self.fields]
+        if len(set(names)) != len(names):
+            raise ValueError(f"field names must differ, got {names}")
+
+    @property
+    def width(self) -> int:
+        """Numbers in one row."""
+        return sum(f.width for f in self.fields)
+
+    def slices(self) -> dict[str, slice]:
+        """Where each field lies in a row."""
+        out, start = {}, 0
+        for f in self.fields:
+            out[f.name] = slice(start, start + f.width)
+            start += f.width
+        return out
+
+    def table(self) -> list[tuple[str, str, str, str]]:
+        """Rows (index range, name, kind x count, unit) for environment cards and export manifests."""
+        rows = []
+        for f, s in zip(self.fields, self.slices().values(), strict=True):
+            span = str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}"
+            rows.append((span, f.name, f"{f.kind.value[0]} x {f.count}", f.unit))
+        return rows
+
+
+def layout(*fields: Field) -> Layout:
+    """Build a layout from its fields."""
+    return Layout(tuple(fields))
+
+
+def joint_layout(observation: Layout, num_agents: int) -> Layout:
+    """Return the layout of all agents' observations one after the other (width N * D)."""
+    return Layout(
+        tuple(replace(f, name=f"agent{i}.{f.name}") for i in range(num_agents) for f in observation.fields)
+    )
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """One categorical choice per agent.
+
+    Attributes:
+        kind: what the points below are.
+        points: the physical meaning of action j as one item of `kind`: a direction, a wheel pair, ...
+        names: one word per action.
+    """
+
+    kind: Kind
+    points: tuple[tuple[float, ...], ...]
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.points) != len(self.names) or len(set(self.points)) != len(self.points):
+            raise ValueError("each action needs one name and a meaning of its own")
+        if any(len(p) != self.kind.width for p in self.points):
+            raise ValueError(f"a meaning of kind {self.kind.value[0]} has {self.kind.width} numbers")
+
+    @property
+    def count(self) -> int:
+        """A, the number of actions."""
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Continuous:
+    """A bounded real action vector per agent.
+
+    Each VECTOR item lives in the unit disc (longer ones are scaled back to length 1, so that every rotation
+    maps the action set to itself); each number of any other kind lives in [-1, 1] (and is clipped).
+    """
+
+    layout: Layout
+
+    @property
+    def width(self) -> int:
+        """Numbers per agent."""
+        return self.layout.width
+
+
+ActionSpace = Discrete | Continuous
+
+RIGHT, LEFT, DOWN, UP = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """All that a learner, a prior or an exporter needs to know of a task.
+
+    Attributes:
+        name: registry name.
+        version: bumped by any change of observation, action, reward or start distribution.
+        convention: the reward convention in a few words; printed beside every number.
+        num_agents: N, learning agents.
+        horizon: steps of an episode, at which it is truncated.
+        observation: layout of one agent's row, D numbers.
+        state: layout of the global state that a centralised critic or mixer may see.
+        action: the action space, the same for every agent.
+        symmetry: name of the largest planar group under which the *dynamics and reward* are invariant ("d4", "o2").
+        shared_reward: whether all agents get the same reward, so that one value per world suffices.
+        control_period_s: simulated seconds of one step, for rendering in real time.
+    """
+
+    name: str
+    version: int
+    convention: str
+    num_agents: int
+    horizon: int
+    observation: Layout
+    state: Layout
+    action: ActionSpace
+    symmetry: str
+    shared_reward: bool = True
+    control_period_s: float = 0.1
+    settings: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.num_agents < 1 or self.horizon < 1 or not math.isfinite(self.control_period_s):
+            raise ValueError(f"task {self.name}: agents and horizon must be positive")
+
+
+def describe_action(action: ActionSpace) -> Sequence[tuple[str, str]]:
+    """Return (name, meaning) rows of an action space for cards."""
+    if isinstance(action, Discrete):
+        return [
+            (f"{j} {name}", "(" + ", ".join(f"{x:g}" for x in p) + ")")
+            for j, (name, p) in enumerate(zip(action.names, action.points, strict=True))
+        ]
+    return [(f.name, f"{f.kind.value[0]} x {f.count} {f.unit}".strip()) for f in action.layout.fields]

@@ -1,0 +1,3 @@
+"""ESP: symmetry priors for multi-agent reinforcement learning."""
+
+__version__ = "0.1.0"
