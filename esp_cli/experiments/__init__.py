@@ -1,0 +1,1 @@
+"""The studies of the paper: statistics over seeds, and the figures drawn from them."""

@@ -1,0 +1,1 @@
+"""Training: the collect-update-evaluate loop, run folders, checkpoints and metrics."""

@@ -1,0 +1,330 @@
+"""Checkpoint files: named tensors and a JSON description in one safetensors file, written whole or not at all.
+
+Loading never runs code, and trusts nothing: the header is checked against the size of the file before anything is
+parsed or allocated, and a SHA-256 over description and tensors is verified, so that a flipped bit, a truncated copy or
+a hostile file ends in one :class:`CheckpointError`. Policy files are the same container under another ``format_name``.
+
+Layout: the safetensors metadata has the key ``esp``, whose text is a JSON object with ``format``, ``version``,
+``sha256`` and, beside these three, the writer's own description.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import secrets
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import torch
+from safetensors import SafetensorError
+from safetensors import torch as safetensors_torch
+from torch import Tensor
+
+CHECKPOINT_FORMAT = "esp-checkpoint"
+CHECKPOINT_VERSION = 1
+TEMPORARY_PREFIX = ".esp-tmp-"
+"""Names of half-written files begin so; what a killed process left under such a name may be removed."""
+
+_METADATA_KEY = "esp"
+_RESERVED = ("format", "version", "sha256")
+# parsed JSON takes some 20 times the space of its text, so this bounds the memory that a hostile header can ask for
+_MAX_HEADER_BYTES = 4 * 2**20
+_MAX_FILE_BYTES = 8 * 2**30
+_MAX_DIMENSIONS = 16
+_MAX_ELEMENTS = 2**40
+_LENGTH_BYTES = 8
+_DTYPES = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "U8": torch.uint8,
+    "BOOL": torch.bool,
+}
+
+
+class CheckpointError(ValueError):
+    """A checkpoint or policy file cannot be written or read; the text is one sentence for the user."""
+
+
+def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
+    """Replace a file as a whole: whoever reads it, even after a kill or a power cut, sees the old or the new content.
+
+    The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
+    the folder's own entry is flushed.
+
+    Args:
+        path: file to write; its folder exists.
+        content: every byte of the file.
+
+    Raises:
+        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{path.name[:64]}-{secrets.token_hex(8)}")
+    try:
+        # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        # some network file systems cannot flush a folder; the rename itself has succeeded by now
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def save_checkpoint(
+    path: str | os.PathLike[str],
+    tensors: Mapping[str, Tensor],
+    meta: Mapping[str, Any],
+    format_name: str = CHECKPOINT_FORMAT,
+    version: int = CHECKPOINT_VERSION,
+) -> None:
+    """Write tensors and their description atomically.
+
+    Args:
+        path: file to write; its folder exists.
+        tensors: dense tensors by name, on any device, float, integer or bool. Generator states are uint8 tensors.
+        meta: JSON-able description. The keys ``format``, ``version`` and ``sha256`` are the container's own.
+        format_name: kind of file, asked for again when it is loaded.
+        version: version of that format.
+
+    Raises:
+        CheckpointError: a tensor or the description cannot be stored, or the file cannot be written.
+    """
+    taken = [key for key in _RESERVED if key in meta]
+    if taken:
+        raise CheckpointError(f"cannot write {path}: the description may not use the reserved key '{taken[0]}'")
+    try:
+        # through JSON and back, so that the digest is of what a reader will see (lists for tuples, text keys)
+        described = json.loads(json.dumps(dict(meta), allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise CheckpointError(f"cannot write {path}: its description is not JSON ({error})") from None
+    stored = _storable(path, tensors)
+    described = {"format": format_name, "version": version, **described}
+    described["sha256"] = _digest(stored, described)
+    content = safetensors_torch.save(stored, metadata={_METADATA_KEY: json.dumps(described, allow_nan=False)})
+    if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
+        raise CheckpointError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
+    try:
+        write_bytes_atomic(path, content)
+    except OSError as error:
+        raise CheckpointError(f"cannot write {path}: {error.strerror or error}") from None
+
+
+def load_checkpoint(
+    path: str | os.PathLike[str],
+    format_name: str = CHECKPOINT_FORMAT,
+    version: int = CHECKPOINT_VERSION,
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read and verify what :func:`save_checkpoint` wrote.
+
+    Args:
+        path: file to read.
+        format_name: kind of file that is expected.
+        version: newest version of that format that the caller understands.
+
+    Returns:
+        The tensors by name, on the CPU, and the description without the container's own keys.
+
+    Raises:
+        CheckpointError: the file is missing, unreadable, truncated, damaged, foreign or of another format.
+    """
+    try:
+        return _decode(_read(Path(path)), format_name, version)
+    except CheckpointError as error:
+        raise CheckpointError(f"{path} {error}") from None
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from None
+
+
+def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors as dense contiguous ones on the CPU, no two of which share memory."""
+    stored: dict[str, Tensor] = {}
+    storages: set[int] = set()
+    for name, tensor in tensors.items():
+        if not isinstance(name, str) or name == "__metadata__":
+            raise CheckpointError(f"cannot write {path}: {name!r} cannot be the name of a tensor")
+        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.dtype not in _DTYPES.values():
+            found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+            raise CheckpointError(f"cannot write {path}: '{name}' is no dense tensor of a storable dtype ({found})")
+        if tensor.dim() > _MAX_DIMENSIONS:
+            raise CheckpointError(f"cannot write {path}: '{name}' has more than {_MAX_DIMENSIONS} dimensions")
+        dense = tensor.detach().cpu().contiguous()
+        if dense.untyped_storage().data_ptr() in storages:
+            dense = dense.clone()
+        storages.add(dense.untyped_storage().data_ptr())
+        stored[name] = dense
+    return stored
+
+
+def _digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:
+    """Return the SHA-256, as hex, of the description and of each tensor's name, dtype, shape and bytes by name."""
+    digest = hashlib.sha256(_canonical(description))
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(_canonical([name, str(tensor.dtype), list(tensor.shape)]))
+        if tensor.numel():
+            digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def _read(path: Path) -> bytes:
+    """Return the bytes of a plain file whose header, as declared, fits into it."""
+    # a pipe or a device would block or never end, so only plain files are opened
+    if not path.is_file():
+        raise CheckpointError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > _MAX_FILE_BYTES:
+            raise CheckpointError(f"has {size} bytes, more than the {_MAX_FILE_BYTES} that are read")
+        prefix = file.read(_LENGTH_BYTES)
+        if len(prefix) < _LENGTH_BYTES:
+            raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
+        if struct.unpack("<Q", prefix)[0] > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
+            raise CheckpointError(
+                "is truncated or no safetensors file: the header that it declares does not fit into it"
+            )
+        return prefix + file.read(size - _LENGTH_BYTES)
+
+
+def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Return tensors and description; the text of a CheckpointError goes on where the name of the file ends."""
+    (header_bytes,) = struct.unpack_from("<Q", content)
+    header = _parse_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
+    description = _description(header, format_name, version)
+    _check_tensors(header, len(content) - _LENGTH_BYTES - header_bytes)
+    try:
+        tensors = safetensors_torch.load(content)
+    except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
+        raise CheckpointError(f"is damaged: {_short(error)}") from None
+    _check_bools(tensors)
+    expected = description.pop("sha256")
+    if _digest(tensors, description) != expected:
+        raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
+    return tensors, {key: value for key, value in description.items() if key not in _RESERVED}
+
+
+def _parse_object(text: bytes | str, what: str) -> dict[str, Any]:
+    """Parse strict JSON (no NaN, no key twice) that has to be an object."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result = dict(pairs)
+        if len(result) != len(pairs):
+            raise ValueError("a key stands twice")
+        return result
+
+    def refuse(constant: str) -> float:
+        raise ValueError(f"{constant} is no JSON number")
+
+    try:
+        decoded = text.decode("utf-8") if isinstance(text, bytes) else text
+        value = json.loads(decoded, object_pairs_hook=unique, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"is damaged or foreign: its {what} is not valid JSON ({_short(error)})") from None
+    if not isinstance(value, dict):
+        raise CheckpointError(f"is damaged or foreign: its {what} is no JSON object")
+    return value
+
+
+def _description(header: Mapping[str, Any], format_name: str, version: int) -> dict[str, Any]:
+    """Return the JSON object under the key ``esp`` of a file of the wanted format."""
+    metadata = header.get("__metadata__")
+    if not isinstance(metadata, dict) or any(not isinstance(value, str) for value in metadata.values()):
+        raise CheckpointError("was not written by esp: it has no metadata")
+    if _METADATA_KEY not in metadata:
+        raise CheckpointError(f"was not written by esp: its metadata has no '{_METADATA_KEY}'")
+    description = _parse_object(metadata[_METADATA_KEY], "description")
+    if description.get("format") != format_name:
+        found = _short(repr(description.get("format")))
+        raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed")
+    number = description.get("version")
+    if not _is_count(number) or not isinstance(description.get("sha256"), str):
+        raise CheckpointError("is damaged or foreign: it lacks a format version or a checksum")
+    if number > version:
+        raise CheckpointError(f"has version {_short(number)} of '{format_name}', newer than {version}; update esp")
+    return description
+
+
+def _check_tensors(header: Mapping[str, Any], data_bytes: int) -> None:
+    """Check that the declared tensors fill the data exactly: right dtypes and sizes, no gap, no overlap."""
+    spans = []
+    for name, entry in header.items():
+        if name == "__metadata__":
+            continue
+        span = _span(entry)
+        if span is None:
+            raise CheckpointError(f"is damaged: its tensor {_short(repr(name))} has no valid dtype, shape or place")
+        spans.append(span)
+    end = 0
+    for begin, stop in sorted(spans):
+        if begin != end:
+            raise CheckpointError("is damaged: its tensors overlap or leave a gap")
+        end = stop
+    if end != data_bytes:
+        raise CheckpointError(f"is truncated or damaged: its tensors need {_short(end)} bytes, it has {data_bytes}")
+
+
+def _span(entry: Any) -> tuple[int, int] | None:
+    """Return the first and the past-the-end byte of a declared tensor, or None where the declaration is not sound."""
+    if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data_offsets"}:
+        return None
+    dtype, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+    if not isinstance(dtype, str) or dtype not in _DTYPES or not _are_counts(shape) or not _are_counts(offsets):
+        return None
+    # an empty tensor may still declare sizes whose product overflows inside torch
+    if len(shape) > _MAX_DIMENSIONS or math.prod(max(size, 1) for size in shape) > _MAX_ELEMENTS:
+        return None
+    if len(offsets) != 2 or offsets[1] - offsets[0] != math.prod(shape) * _DTYPES[dtype].itemsize:
+        return None
+    return offsets[0], offsets[1]
+
+
+def _are_counts(value: object) -> TypeGuard[list[int]]:
+    return isinstance(value, list) and all(map(_is_count, value))
+
+
+def _is_count(value: object) -> TypeGuard[int]:
+    # not isinstance: True and 1.0 would pass for 1
+    return type(value) is int and value >= 0
+
+
+def _check_bools(tensors: Mapping[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
+        # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
+        if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
+            raise CheckpointError(f"is damaged: its tensor {_short(repr(name))} has truth values other than 0 and 1")
+
+
+def _short(value: object) -> str:
+    """Return the first line of a text, cut to a length that fits into a sentence."""
+    text = next(iter(str(value).splitlines()), type(value).__name__)
+    return text if len(text) <= 80 else text[:77] + "..."

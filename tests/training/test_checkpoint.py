@@ -1,0 +1,361 @@
+"""Checkpoint files: what goes in comes out, and whatever else is in a file ends in one CheckpointError."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import safetensors.torch
+import torch
+
+from esp_cli.training.checkpoint import (
+    TEMPORARY_PREFIX,
+    CheckpointError,
+    load_checkpoint,
+    save_checkpoint,
+    write_bytes_atomic,
+)
+
+FUZZ_ROUNDS = int(os.environ.get("ESP_FUZZ_ROUNDS", "600"))
+META = {"step": 500_000, "task": "navigation", "nested": {"list": [1, 2.5, None, True], "text": "é"}}
+
+
+def tensors():
+    whole = torch.arange(12, dtype=torch.float32)
+    return {
+        "weight": torch.tensor([[1.5, -2.0, float("nan")], [float("inf"), 0.0, -0.0]]),
+        "double": torch.tensor([1 / 3], dtype=torch.float64),
+        "half": torch.tensor([1.0, 2.0]).bfloat16(),
+        "counter": torch.tensor(2**62, dtype=torch.int64),
+        "generator": torch.Generator().manual_seed(7).get_state(),
+        "mask": torch.tensor([True, False, True]),
+        "empty": torch.zeros(0, 3),
+        "left": whole[:6],
+        "right": whole[6:],
+        "transposed": whole.view(3, 4).t(),
+        "expanded": torch.ones(1).expand(5),
+    }
+
+
+def small_tensors():
+    return {"a": torch.tensor([1.0, 2.0]), "b": torch.tensor([3], dtype=torch.int64), "c": torch.tensor([True])}
+
+
+def bits(tensor):
+    return tensor.contiguous().reshape(-1).view(torch.uint8)
+
+
+def assert_same(left, right):
+    assert left.keys() == right.keys()
+    for name in left:
+        assert left[name].dtype == right[name].dtype
+        assert left[name].shape == right[name].shape
+        assert torch.equal(bits(left[name]), bits(right[name])), name
+
+
+def test_round_trip_keeps_every_bit(tmp_path):
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, tensors(), META)
+    loaded, meta = load_checkpoint(path)
+    assert_same(loaded, tensors())
+    assert meta == META
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_a_restored_generator_goes_on_where_it_was(tmp_path):
+    generator = torch.Generator().manual_seed(3)
+    torch.rand(5, generator=generator)
+    save_checkpoint(tmp_path / "a", {"generator": generator.get_state()}, {})
+    expected = torch.rand(4, generator=generator)
+    restored = torch.Generator()
+    restored.set_state(load_checkpoint(tmp_path / "a")[0]["generator"])
+    assert torch.equal(torch.rand(4, generator=restored), expected)
+
+
+def test_loaded_tensors_are_writable_and_apart(tmp_path):
+    save_checkpoint(tmp_path / "a", tensors(), META)
+    loaded, _ = load_checkpoint(tmp_path / "a")
+    loaded["left"].fill_(-1.0)
+    assert loaded["right"].tolist() == [6.0, 7.0, 8.0, 9.0, 10.0, 11.0]
+
+
+def test_other_safetensors_readers_read_the_file(tmp_path):
+    save_checkpoint(tmp_path / "a", tensors(), META)
+    assert_same(safetensors.torch.load_file(tmp_path / "a"), tensors())
+
+
+def test_policy_files_have_their_description_at_the_top_level(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    meta = {"task": "navigation", "network": {"kind": "mlp"}, "activation": "tanh"}
+    save_checkpoint(path, small_tensors(), meta, format_name="esp-policy")
+    with safetensors.safe_open(path, framework="pt") as file:
+        description = json.loads(file.metadata()["esp"])
+    assert description.pop("sha256")
+    assert description == {"format": "esp-policy", "version": 1, **meta}
+    assert load_checkpoint(path, format_name="esp-policy")[1] == meta
+    with pytest.raises(CheckpointError, match="format 'esp-policy', where 'esp-checkpoint' is needed"):
+        load_checkpoint(path)
+
+
+def test_meta_is_seen_as_json_shows_it(tmp_path):
+    save_checkpoint(tmp_path / "a", {}, {"pair": (1, 2), "table": {10: "x", 9: "y"}})
+    assert load_checkpoint(tmp_path / "a") == ({}, {"pair": [1, 2], "table": {"10": "x", "9": "y"}})
+
+
+@pytest.mark.parametrize(
+    ("content", "meta", "text"),
+    [
+        ({}, {"sha256": "x"}, "reserved key 'sha256'"),
+        ({}, {"score": float("nan")}, "not JSON"),
+        ({}, {"tensor": torch.zeros(1)}, "not JSON"),
+        ({}, {"text": "x" * (5 * 2**20)}, "larger than a reader accepts"),
+        ({"a": torch.zeros(2, dtype=torch.complex64)}, {}, "'a' is no dense tensor"),
+        ({"a": torch.eye(2).to_sparse()}, {}, "'a' is no dense tensor"),
+        ({"a": [1.0]}, {}, r"'a' is no dense tensor of a storable dtype \(list\)"),
+        ({"__metadata__": torch.zeros(1)}, {}, "'__metadata__' cannot be the name"),
+        ({"a": torch.zeros([1] * 17)}, {}, "more than 16 dimensions"),
+    ],
+)
+def test_what_cannot_be_stored_is_refused_and_nothing_is_written(tmp_path, content, meta, text):
+    with pytest.raises(CheckpointError, match=text):
+        save_checkpoint(tmp_path / "a", content, meta)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_folder_is_one_sentence(tmp_path):
+    with pytest.raises(CheckpointError, match=r"cannot write .*no/a: No such file or directory"):
+        save_checkpoint(tmp_path / "no" / "a", {}, {})
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    save_checkpoint(path, small_tensors(), {"step": 1})
+
+    def full_disk(_descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        save_checkpoint(path, small_tensors(), {"step": 2})
+    assert load_checkpoint(path)[1] == {"step": 1}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a"]
+
+
+def test_written_files_follow_the_umask(tmp_path):
+    old = os.umask(0o027)
+    try:
+        write_bytes_atomic(tmp_path / "a", b"x")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "a").stat().st_mode & 0o777 == 0o640
+
+
+# Damaged, foreign and hostile files
+
+
+def build(tensor_entries, data, description=None, metadata=None, header=None):
+    """Return a file's bytes with a header typed by hand."""
+    if header is None:
+        metadata = metadata if metadata is not None else {"esp": json.dumps(description)}
+        header = json.dumps({"__metadata__": metadata, **tensor_entries}).encode()
+    return struct.pack("<Q", len(header)) + header + data
+
+
+def described(**changes):
+    return {"format": "esp-checkpoint", "version": 1, "sha256": "0" * 64, **changes}
+
+
+def entry(dtype="F32", shape=(2,), offsets=(0, 8)):
+    return {"dtype": dtype, "shape": list(shape), "data_offsets": list(offsets)}
+
+
+EIGHT = b"\0" * 8
+HOSTILE = {
+    "empty": b"",
+    "short": b"\x01\x02",
+    "huge header": struct.pack("<Q", 2**63) + b"{}",
+    "header past the end": struct.pack("<Q", 100) + b"{}",
+    "header over the limit": struct.pack("<Q", 5 * 2**20) + b" " * (5 * 2**20),
+    "no JSON": build({}, b"", header=b"{'a': 1}"),
+    "not UTF-8": build({}, b"", header=b'{"\xff": 1}'),
+    "a list": build({}, b"", header=b"[1, 2]"),
+    "nested deeply": build({}, b"", header=b"[" * 100_000),
+    "nested deeply inside": build({}, b"", metadata={"esp": '{"a":' * 100_000}),
+    "long number": build({}, b"", header=b'{"a": ' + b"9" * 10_000 + b"}"),
+    "key twice": build({}, b"", header=b'{"__metadata__": {"esp": "{}"}, "__metadata__": {"esp": "{}"}}'),
+    "no metadata": build({}, b"", header=json.dumps({"a": entry()}).encode()) + EIGHT,
+    "metadata a list": build({}, b"", metadata=["esp"]),
+    "metadata not text": build({}, b"", metadata={"esp": {"format": "esp-checkpoint"}}),
+    "foreign metadata": build({"a": entry()}, EIGHT, metadata={"format": "pt"}),
+    "description a number": build({}, b"", description=3),
+    "description NaN": build({}, b"", description=described(score=float("nan"))),
+    "other format": build({}, b"", description=described(format="esp-policy")),
+    "format a list": build({}, b"", description=described(format=["x"] * 1000)),
+    "newer": build({}, b"", description=described(version=2)),
+    "version true": build({}, b"", description=described(version=True)),
+    "no checksum": build({}, b"", description=described(sha256=None)),
+    "wrong checksum": build({"a": entry()}, EIGHT, description=described()),
+    "entry a number": build({"a": 1}, EIGHT, description=described()),
+    "entry with more": build({"a": {**entry(), "code": "x"}}, EIGHT, description=described()),
+    "wrong dtype": build({"a": entry("F8_E5M2")}, EIGHT, description=described()),
+    "dtype a list": build({"a": entry(["F32"])}, EIGHT, description=described()),
+    "dtype does not fit": build({"a": entry("F64")}, EIGHT, description=described()),
+    "gigantic": build({"a": entry("F32", (2**40,), (0, 2**42))}, EIGHT, description=described()),
+    "gigantic and empty": build({"a": entry("F32", (0, 2**62, 2**62), (0, 0))}, b"", description=described()),
+    "many dimensions": build({"a": entry("F32", [1] * 1000, (0, 4))}, EIGHT[:4], description=described()),
+    "negative shape": build({"a": entry("F32", (-1, -2))}, EIGHT, description=described()),
+    "shape of floats": build({"a": entry("F32", (2.0,))}, EIGHT, description=described()),
+    "offsets turned": build({"a": entry("F32", (2,), (8, 0))}, EIGHT, description=described()),
+    "three offsets": build({"a": entry("F32", (2,), (0, 8, 8))}, EIGHT, description=described()),
+    "overlap": build({"a": entry(), "b": entry()}, EIGHT, description=described()),
+    "partial overlap": build({"a": entry(), "b": entry(offsets=(4, 12))}, EIGHT * 2, description=described()),
+    "gap": build({"a": entry(offsets=(4, 12))}, EIGHT + EIGHT, description=described()),
+    "tail": build({"a": entry()}, EIGHT + b"x", description=described()),
+    "truncated": build({"a": entry()}, EIGHT[:5], description=described()),
+    "half a surrogate": build({"\ud800": entry()}, EIGHT, description=described()),
+    "pickle": b"\x80\x04\x95\x1f\x00\x00\x00\x00\x00\x00\x00\x8c\x05posix\x94\x8c\x06system\x94\x93\x94.",
+    "zip": b"PK\x03\x04" + b"\0" * 60,
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_files_end_in_one_sentence(tmp_path, name):
+    path = tmp_path / "bad.safetensors"
+    path.write_bytes(HOSTILE[name])
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path} ")
+    assert "\n" not in text
+    assert len(text) < len(str(path)) + 260
+
+
+def test_truth_values_are_zero_or_one(tmp_path):
+    description = {"format": "esp-checkpoint", "version": 1}
+    digest = hashlib.sha256(json.dumps(description, sort_keys=True, separators=(",", ":")).encode())
+    digest.update(b'["a","torch.bool",[1]]' + b"\x02")
+    bad = build({"a": entry("BOOL", (1,), (0, 1))}, b"\x02", {**description, "sha256": digest.hexdigest()})
+    (tmp_path / "a").write_bytes(bad)
+    with pytest.raises(CheckpointError, match="truth values other than 0 and 1"):
+        load_checkpoint(tmp_path / "a")
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "device"])
+def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, kind):
+    path = {"device": Path("/dev/zero"), "folder": tmp_path}.get(kind, tmp_path / "x")
+    if kind == "pipe":
+        os.mkfifo(path)
+    with pytest.raises(CheckpointError, match="is a folder" if kind == "folder" else "no plain file"):
+        load_checkpoint(path)
+
+
+def test_every_flipped_bit_and_every_cut_is_noticed(tmp_path):
+    path = tmp_path / "a"
+    save_checkpoint(path, {"a": torch.tensor([True]), "b": torch.tensor([1.5])}, {"n": 1})
+    good = path.read_bytes()
+    for position in range(len(good)):
+        path.write_bytes(good[:position])
+        with pytest.raises(CheckpointError):
+            load_checkpoint(path)
+        for bit in range(8):
+            flipped = bytearray(good)
+            flipped[position] ^= 1 << bit
+            path.write_bytes(flipped)
+            with pytest.raises(CheckpointError):
+                load_checkpoint(path)
+
+
+def mutate(data, other, rng):
+    """Return a copy of ``data`` with a few random edits of the kinds that disks, tools and attackers make."""
+    data = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 5))):
+        position = rng.randrange(len(data) + 1)
+        length = rng.choice((1, 2, 8, 64))
+        kind = rng.randrange(6)
+        if kind == 0:
+            data[position : position + length] = rng.randbytes(length)
+        elif kind == 1:
+            del data[position : position + length]
+        elif kind == 2:
+            data[position:position] = rng.randbytes(length)
+        elif kind == 3:
+            data[position : position + length] = other[position : position + length]
+        elif kind == 4:
+            digits = [index for index, byte in enumerate(data[: len(data) // 2 + 8]) if chr(byte).isdigit()]
+            for index in rng.sample(digits, min(3, len(digits))):
+                data[index] = rng.choice(b"0123456789-e.")
+        else:
+            data[:8] = struct.pack("<Q", rng.choice((0, 1, len(data), len(data) - 8, 2**31, 2**64 - 1)))
+    return bytes(data)
+
+
+def test_fuzzed_files_load_unchanged_or_not_at_all(tmp_path):
+    path, rng = tmp_path / "a", random.Random(0)
+    save_checkpoint(path, small_tensors(), META, format_name="esp-policy")
+    other = path.read_bytes()
+    save_checkpoint(path, small_tensors(), META)
+    good = path.read_bytes()
+    refused = 0
+    for _ in range(FUZZ_ROUNDS):
+        path.write_bytes(mutate(good, other, rng))
+        try:
+            loaded, meta = load_checkpoint(path)
+        except CheckpointError:
+            refused += 1
+        else:
+            assert_same(loaded, small_tensors())
+            assert meta == META
+    assert refused > 0.8 * FUZZ_ROUNDS
+
+
+# Killed writers
+
+KILLER = """
+import os, random, signal, sys, time
+import torch
+torch.set_num_threads(1)
+from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
+
+path, rounds = sys.argv[1], int(sys.argv[2])
+rng = random.Random(1)
+
+def content(step):
+    return {"weight": torch.full((100_000,), float(step)), "step": torch.tensor(step)}
+
+save_checkpoint(path, content(0), {"step": 0})
+last = 0
+for _ in range(rounds):
+    child = os.fork()
+    if child == 0:
+        step = last
+        while True:
+            step += 1
+            save_checkpoint(path, content(step), {"step": step})
+    time.sleep(rng.uniform(0.002, 0.03))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    tensors, meta = load_checkpoint(path)
+    assert meta["step"] >= last, (meta, last)
+    assert tensors["step"] == meta["step"] and bool((tensors["weight"] == meta["step"]).all())
+    last = meta["step"]
+print(last)
+"""
+
+
+def test_a_good_checkpoint_is_there_whenever_the_writer_is_killed(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", KILLER, str(tmp_path / "a.safetensors"), "40"]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) > 0
+    left = {entry.name for entry in tmp_path.iterdir()} - {"a.safetensors"}
+    # negative control: kills did hit half-written files
+    assert left
+    assert all(name.startswith(TEMPORARY_PREFIX) for name in left)
