@@ -242,12 +242,16 @@ def _parse_object(text: bytes | str, what: str) -> dict[str, Any]:
             raise ValueError("a key stands twice")
         return result
 
-    def refuse(constant: str) -> float:
-        raise ValueError(f"{constant} is no JSON number")
+    def finite(number: str) -> float:
+        # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
+        value = float(number)
+        if not math.isfinite(value):
+            raise ValueError(f"{number} is no finite number")
+        return value
 
     try:
         decoded = text.decode("utf-8") if isinstance(text, bytes) else text
-        value = json.loads(decoded, object_pairs_hook=unique, parse_constant=refuse)
+        value = json.loads(decoded, object_pairs_hook=unique, parse_constant=finite, parse_float=finite)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"is damaged or foreign: its {what} is not valid JSON ({_short(error)})") from None
     if not isinstance(value, dict):

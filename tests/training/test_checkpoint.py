@@ -196,6 +196,7 @@ HOSTILE = {
     "foreign metadata": build({"a": entry()}, EIGHT, metadata={"format": "pt"}),
     "description a number": build({}, b"", description=3),
     "description NaN": build({}, b"", description=described(score=float("nan"))),
+    "description infinite": build({}, b"", metadata={"esp": json.dumps(described())[:-1] + ', "score": 1e999}'}),
     "other format": build({}, b"", description=described(format="esp-policy")),
     "format a list": build({}, b"", description=described(format=["x"] * 1000)),
     "newer": build({}, b"", description=described(version=2)),
