@@ -1,0 +1,41 @@
+"""The mathematics of symmetry: groups, their representations on a task's spaces, and numeric checks."""
+
+from esp_cli.symmetry.admission import admit, carried_groups
+from esp_cli.symmetry.checks import environment_errors, network_equivariance_error
+from esp_cli.symmetry.elements import Element, mirror, rotation
+from esp_cli.symmetry.groups import (
+    FiniteGroup,
+    Group,
+    agent_permutations,
+    cyclic,
+    dihedral,
+    direct_product,
+    orthogonal,
+    special_orthogonal,
+)
+from esp_cli.symmetry.parse import parse_elements, parse_group
+from esp_cli.symmetry.transforms import Transform, TransformSet, build_transform, transform_set
+
+__all__ = [
+    "Element",
+    "FiniteGroup",
+    "Group",
+    "Transform",
+    "TransformSet",
+    "admit",
+    "agent_permutations",
+    "build_transform",
+    "carried_groups",
+    "cyclic",
+    "dihedral",
+    "direct_product",
+    "environment_errors",
+    "mirror",
+    "network_equivariance_error",
+    "orthogonal",
+    "parse_elements",
+    "parse_group",
+    "rotation",
+    "special_orthogonal",
+    "transform_set",
+]

@@ -1,0 +1,104 @@
+"""Which transforms a task admits: its actions must carry them, and its dynamics and reward must not notice them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from esp_cli.symmetry.elements import Element
+from esp_cli.symmetry.groups import Group
+from esp_cli.symmetry.parse import parse_elements, parse_group
+from esp_cli.symmetry.representation import action_map, joint_matrix, state_matrix
+from esp_envs.spec import Discrete, Items, TaskSpec, joint_layout
+
+PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
+"""The planar groups that `carried_groups` tries, smaller ones first."""
+
+
+def admit(text: str, elements: Sequence[Element] | Group, spec: TaskSpec) -> None:
+    """Refuse transforms that a task cannot carry.
+
+    Args:
+        text: what the user wrote, for the message.
+        elements: what it means.
+        spec: the task.
+
+    Raises:
+        ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
+            are to change places and a layout does not say which numbers follow them.
+    """
+    moved = elements.witnesses() if isinstance(elements, Group) else tuple(elements)
+    reason = _action_reason(moved, spec) or _task_reason(moved, spec) or _agents_reason(moved, spec)
+    if reason is None:
+        return
+    advice = "use --prior none"
+    if carried := carried_groups(spec):
+        plane = [name for name in carried if name != "agents"]
+        advice = f"use a group within {plane[-1]}" if plane else "use agents"
+        if _action_reason(moved, spec) and not _task_reason(moved, spec):
+            advice = advice.replace("use ", "use continuous actions or ", 1)
+    raise ValueError(f"{text} cannot act on {spec.name}: {reason}; {advice}")
+
+
+def carried_groups(spec: TaskSpec) -> tuple[str, ...]:
+    """Return the named groups that a task's actions and declared symmetry both carry, the largest planar one last.
+
+    `agents` stands at the end if the agents of the task may change places.
+    """
+    carried = [name for name in PLANE_GROUPS if _carries(name, spec)]
+    if spec.num_agents > 1 and _carries("agents", spec):
+        carried.append("agents")
+    return tuple(carried)
+
+
+def _carries(name: str, spec: TaskSpec) -> bool:
+    moved = parse_group(name, spec.num_agents).witnesses()
+    return not (_action_reason(moved, spec) or _task_reason(moved, spec) or _agents_reason(moved, spec))
+
+
+def _action_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+    """Say which action has no image, if one has none."""
+    if isinstance(spec.action, Discrete):
+        try:
+            action_map(spec.action, elements)
+        except ValueError as error:
+            return str(error)
+    return None
+
+
+def _task_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+    """Say which element is no symmetry of the dynamics and reward, if one is none."""
+    plane = [name for name in spec.symmetry.split("*") if name != "agents"]
+    declared = parse_group(plane[0] if plane else "c1", spec.num_agents)
+    for element in elements:
+        if element.planar not in declared:
+            return f"{element.planar.name} is no symmetry of its dynamics and reward, which carry {declared.name}"
+    return None
+
+
+def _agents_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+    """Say why agents cannot change places, if some are asked to and cannot."""
+    moving = [e.permutation for e in elements if e.permutation is not None]
+    if not moving:
+        return None
+    if any(len(sigma) != spec.num_agents for sigma in moving):
+        return f"the permutation is not one of its {spec.num_agents} agents"
+    places = np.array(moving[:1], dtype=np.int64)
+    plane = np.eye(2)[None]
+    joint = spec.state == joint_layout(spec.observation, spec.num_agents)
+    if not joint and all(f.items is not Items.AGENTS for f in spec.state.fields):
+        return "its state does not say which numbers belong to which agent"
+    try:
+        joint_matrix(spec.observation, plane, places)
+        state_matrix(spec, plane, places)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def admitted_elements(text: str, spec: TaskSpec) -> tuple[Element, ...] | Group:
+    """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`)."""
+    elements = parse_elements(text, spec.num_agents)
+    admit(text, elements, spec)
+    return elements

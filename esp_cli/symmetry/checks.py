@@ -1,0 +1,105 @@
+"""Numeric checks: is a network equivariant (Eq. 2), are an environment's reward and transition invariant (Eq. 5, 6)?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from esp_cli.symmetry.transforms import Transform
+from esp_envs.base import Environment, Observation, Step
+
+Network = Callable[[Tensor], Tensor]
+
+
+def network_equivariance_error(
+    policy: Network | None, value: Network | None, obs: Tensor, state: Tensor, transform: Transform
+) -> dict[str, float]:
+    """Measure how far a policy is from pi(K_g a | L_g s) = pi(a | s) and a value from V(L_g s) = V(s).
+
+    Args:
+        policy: obs to logits [S, ..., N, A] (compared as probabilities) or to means [S, ..., N, width]; or None.
+        value: state to values [S, ..., 1] or [S, ..., N]; or None.
+        obs: [S, ..., N, D].
+        state: [S, ..., Ds].
+        transform: the elements to try.
+
+    Returns:
+        The largest absolute errors under "policy" and "value", for those that were given.
+    """
+    errors = {}
+    with torch.no_grad():
+        if policy is not None:
+            here, there = policy(obs), policy(transform.obs(obs))
+            if transform.action_index is None:
+                errors["policy"] = _gap(transform.pull_back_mean(there), here)
+            else:
+                errors["policy"] = _gap(transform.pull_back(there).softmax(-1), here.softmax(-1))
+        if value is not None:
+            errors["value"] = _gap(transform.values(value(transform.state(state))), value(state))
+    return errors
+
+
+def environment_errors(
+    env: Environment,
+    transform: Transform,
+    state: Tensor,
+    actions: Sequence[Tensor],
+    restore_noise: Callable[[Environment, Transform | None], None] | None = None,
+) -> dict[str, float]:
+    """Measure how far a task is from symmetric rewards (Eq. 5) and transitions (Eq. 6).
+
+    Eq. 5: r(L_g s, K_g a) = r(s, a). Eq. 6: P(L_g s' | L_g s, K_g a) = P(s' | s, a).
+
+    The worlds are put into `state` and take the actions, then into L_g state and take K_g of the actions; every
+    observation, state and reward of the second run is held against the transformed one of the first. A world counts
+    until its episode ends. Noise enters equally: both runs start from the same generator states.
+
+    Args:
+        env: worlds to use; they are left in the second run's last state.
+        transform: the elements to try, for as many seeds as `env` has, or one for all.
+        state: [S, E, state width].
+        actions: joint actions, one tensor per step.
+        restore_noise: called before each run (with None, then with the transform) by tasks whose own noise has a
+            direction that must be turned along.
+
+    Returns:
+        The largest absolute errors: "observation" (of the start), "reward" (Eq. 5), "next_obs", "next_state" (Eq. 6)
+        and "end" (1 where one run ended and the other went on).
+    """
+    noise = [g.get_state() for g in env.generators]
+
+    def run(start: Tensor, moves: Sequence[Tensor], turned: Transform | None) -> tuple[Observation, list[Step]]:
+        for generator, saved in zip(env.generators, noise, strict=True):
+            generator.set_state(saved)
+        if restore_noise is not None:
+            restore_noise(env, turned)
+        first = env.set_state(start)
+        return first, [env.step(move) for move in moves]
+
+    first, steps = run(state, actions, None)
+    turned_first, turned_steps = run(transform.state(state), [transform.action(a) for a in actions], transform)
+    errors = {"observation": _gap(transform.obs(first.obs), turned_first.obs)}
+    errors |= {"reward": 0.0, "next_obs": 0.0, "next_state": 0.0, "end": 0.0}
+    alive = torch.ones(state.shape[:2], dtype=torch.bool, device=state.device)
+    for step, turned in zip(steps, turned_steps, strict=True):
+        reached, turned_reached = step.final or step.next, turned.final or turned.next
+        pairs = {
+            "reward": (transform.per_agent(step.reward), turned.reward),
+            "next_obs": (transform.obs(reached.obs), turned_reached.obs),
+            "next_state": (transform.state(reached.state), turned_reached.state),
+            "end": (_ended(step).float(), _ended(turned).float()),
+        }
+        for name, (expected, got) in pairs.items():
+            errors[name] = max(errors[name], _gap(expected[alive], got[alive]))
+        alive = alive & ~_ended(step) & ~_ended(turned)
+    return errors
+
+
+def _ended(step: Step) -> Tensor:
+    return step.terminated | step.truncated
+
+
+def _gap(a: Tensor, b: Tensor) -> float:
+    return float((a - b).abs().max()) if a.numel() else 0.0

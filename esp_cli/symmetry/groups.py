@@ -1,0 +1,205 @@
+"""Groups built from generators: C_n, D_n, SO(2), O(2), agent permutations and their direct products."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from fractions import Fraction
+from functools import cached_property
+from itertools import permutations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from esp_cli.symmetry.elements import Element, mirror
+
+LISTED_LIMIT = 1024
+"""Largest number of elements that is listed; larger groups (all orders of 7 agents: 5040) are sampled instead."""
+
+
+class Group(ABC):
+    """A group that can be drawn from and asked for membership; `FiniteGroup` can also be listed."""
+
+    name: str
+
+    @abstractmethod
+    def draw(self, generator: torch.Generator) -> Element:
+        """Draw one element uniformly (identity included) from a generator on the CPU."""
+
+    @abstractmethod
+    def __contains__(self, element: object) -> bool:
+        """Whether the element belongs to the group."""
+
+    @abstractmethod
+    def witnesses(self) -> tuple[Element, ...]:
+        """Return elements such that whatever carries all of these carries the whole group."""
+
+
+class FiniteGroup(Group):
+    """A listed group: identity first, then by mirror, turn and permutation.
+
+    Attributes:
+        name: what `parse_elements` calls it.
+        elements: all G elements.
+    """
+
+    def __init__(self, name: str, elements: Iterable[Element]) -> None:
+        self.name = name
+        self.elements = tuple(sorted(set(elements), key=lambda e: (e.permutation or (), e.mirrored, e.turn)))
+        self._index = {element: i for i, element in enumerate(self.elements)}
+
+    @classmethod
+    def generated_by(cls, name: str, generators: Iterable[Element]) -> FiniteGroup:
+        """Build the smallest group that holds the generators.
+
+        Raises:
+            ValueError: it has more than `LISTED_LIMIT` elements.
+        """
+        gens = tuple(generators)
+        found, frontier = {Element()}, [Element()]
+        while frontier:
+            # In a finite group, products of generators already contain every inverse.
+            frontier = [p for p in {g @ h for g in gens for h in frontier} if p not in found]
+            found.update(frontier)
+            if len(found) > LISTED_LIMIT:
+                raise ValueError(f"{name} has more than {LISTED_LIMIT} elements; use a smaller group or so2, o2")
+        return cls(name, found)
+
+    @property
+    def order(self) -> int:
+        """G, the number of elements."""
+        return len(self.elements)
+
+    @cached_property
+    def product(self) -> NDArray[np.int64]:
+        """The product table [G, G]: entry (i, j) is the index of elements[i] @ elements[j]."""
+        return np.array([[self._index[g @ h] for h in self.elements] for g in self.elements])
+
+    @cached_property
+    def inverses(self) -> NDArray[np.int64]:
+        """The index of each element's inverse [G]."""
+        return np.array([self._index[g.inverse()] for g in self.elements])
+
+    def draw(self, generator: torch.Generator) -> Element:
+        """Draw uniformly; see `Group.draw`."""
+        return self.elements[int(torch.randint(self.order, (), generator=generator))]
+
+    def __contains__(self, element: object) -> bool:
+        return element in self._index
+
+    def witnesses(self) -> tuple[Element, ...]:
+        """Return all elements."""
+        return self.elements
+
+
+class PlaneGroup(Group):
+    """SO(2), all turns, or O(2), all turns and mirrors; drawn from the uniform (Haar) measure."""
+
+    def __init__(self, mirrors: bool) -> None:
+        self.name = "o2" if mirrors else "so2"
+        self.mirrors = mirrors
+
+    def draw(self, generator: torch.Generator) -> Element:
+        """Draw an angle uniformly, and for O(2) a fair mirror flag."""
+        turn = Fraction(float(torch.rand((), generator=generator, dtype=torch.float64)))
+        mirrored = self.mirrors and bool(torch.randint(2, (), generator=generator))
+        return Element(turn, mirrored)
+
+    def __contains__(self, element: object) -> bool:
+        return isinstance(element, Element) and element.permutation is None and (self.mirrors or not element.mirrored)
+
+    def witnesses(self) -> tuple[Element, ...]:
+        """Return one radian (its multiples come near every turn) and, for O(2), `flip-x`."""
+        radian = Element(Fraction(1 / math.tau))
+        return (radian, mirror()) if self.mirrors else (radian,)
+
+
+class AgentPermutations(Group):
+    """All orders of N agents, sampled; for N with more than `LISTED_LIMIT` orders."""
+
+    def __init__(self, num_agents: int) -> None:
+        self.name = "agents"
+        self.num_agents = num_agents
+
+    def draw(self, generator: torch.Generator) -> Element:
+        """Draw an order uniformly."""
+        return Element(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
+
+    def __contains__(self, element: object) -> bool:
+        if not isinstance(element, Element) or not element.planar.is_identity:
+            return False
+        return element.permutation is None or len(element.permutation) == self.num_agents
+
+    def witnesses(self) -> tuple[Element, ...]:
+        """Return the swap of the first two agents and the round of all of them, which generate every order."""
+        return tuple(Element(permutation=p) for p in _swap_and_round(self.num_agents))
+
+
+class ProductGroup(Group):
+    """The direct product of a planar group and a group of agent permutations, sampled factor by factor."""
+
+    def __init__(self, plane: Group, agents: Group) -> None:
+        self.name = f"{plane.name}*{agents.name}"
+        self.plane, self.agents = plane, agents
+
+    def draw(self, generator: torch.Generator) -> Element:
+        """Draw each factor."""
+        return self.plane.draw(generator) @ self.agents.draw(generator)
+
+    def __contains__(self, element: object) -> bool:
+        if not isinstance(element, Element):
+            return False
+        return element.planar in self.plane and Element(permutation=element.permutation) in self.agents
+
+    def witnesses(self) -> tuple[Element, ...]:
+        """Return those of both factors."""
+        return self.plane.witnesses() + self.agents.witnesses()
+
+
+def _swap_and_round(num_agents: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return (1, 0, *range(2, num_agents)), (*range(1, num_agents), 0)
+
+
+def cyclic(n: int) -> FiniteGroup:
+    """Return C_n, the turns by multiples of 360/n degrees."""
+    return FiniteGroup.generated_by(f"c{n}", [Element(Fraction(1, n))])
+
+
+def dihedral(n: int) -> FiniteGroup:
+    """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
+    return FiniteGroup.generated_by(f"d{n}", [Element(Fraction(1, n)), mirror()])
+
+
+def special_orthogonal() -> PlaneGroup:
+    """Return SO(2)."""
+    return PlaneGroup(mirrors=False)
+
+
+def orthogonal() -> PlaneGroup:
+    """Return O(2)."""
+    return PlaneGroup(mirrors=True)
+
+
+def agent_permutations(num_agents: int) -> Group:
+    """Return S_N: listed up to `LISTED_LIMIT` orders, sampled beyond.
+
+    Raises:
+        ValueError: fewer than two agents.
+    """
+    if num_agents < 2:
+        raise ValueError("agents can only change places where there are two or more; choose a planar group")
+    if math.factorial(num_agents) > LISTED_LIMIT:
+        return AgentPermutations(num_agents)
+    return FiniteGroup("agents", (Element(permutation=p) for p in permutations(range(num_agents))))
+
+
+def direct_product(plane: Group, agents: Group) -> Group:
+    """Return the direct product of a planar group and agent permutations, listed where small enough."""
+    product = ProductGroup(plane, agents)
+    if not (isinstance(plane, FiniteGroup) and isinstance(agents, FiniteGroup)):
+        return product
+    if plane.order * agents.order > LISTED_LIMIT:
+        return product
+    return FiniteGroup(product.name, (g @ h for g in plane.elements for h in agents.elements))

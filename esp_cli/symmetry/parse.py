@@ -1,0 +1,130 @@
+"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from functools import reduce
+
+from esp_cli.symmetry.elements import Element, mirror, rotation
+from esp_cli.symmetry.groups import (
+    LISTED_LIMIT,
+    FiniteGroup,
+    Group,
+    agent_permutations,
+    cyclic,
+    dihedral,
+    direct_product,
+    orthogonal,
+    special_orthogonal,
+)
+
+_NAMED = {
+    "identity": Element(),
+    "flip-x": mirror(0),
+    "flip-diagonal": mirror(45),
+    "flip-y": mirror(90),
+    "flip-antidiagonal": mirror(135),
+}
+_KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, flip-antidiagonal, c4, d4, c8, so2, o2, agents, d4*agents"
+_DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
+_MAX_FOLD = 360
+
+
+def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
+    """Read a comma-separated list of elements and groups.
+
+    Args:
+        text: elements (`rot90`, `flip-x`, `flip22.5`, `agents-1-0-2`) and groups (`c4`, `d4`, `so2`, `o2`, `agents`),
+            each possibly a product with `*`, whose right factor acts first.
+        num_agents: N, which gives `agents` its meaning.
+
+    Returns:
+        The non-identity elements in the order written, each once; or the group itself where it has to be sampled
+        (continuous, or larger than `LISTED_LIMIT`).
+
+    Raises:
+        ValueError: an unknown name, nothing besides the identity, or a sampled group that does not stand alone.
+    """
+    items = [_item(part.strip(), text, num_agents) for part in text.lower().split(",")]
+    listed = [item for item in items if isinstance(item, tuple)]
+    if len(listed) < len(items):
+        if len(items) == 1 and isinstance(items[0], Group):
+            return items[0]
+        raise ValueError(f"transforms '{text}' list a group that is sampled; let so2, o2 or a large group stand alone")
+    unique = tuple(dict.fromkeys(e for item in listed for e in item if not e.is_identity))
+    if not unique:
+        raise ValueError(f"transforms '{text}' hold nothing besides the identity; name one that moves something")
+    return unique
+
+
+def parse_group(text: str, num_agents: int) -> Group:
+    """Read one group name or a product of a planar group and `agents`, such as a task's declared symmetry.
+
+    Raises:
+        ValueError: unknown, or no group.
+    """
+    factors = [_factor(part.strip(), text, num_agents) for part in text.lower().split("*")]
+    groups = [f for f in factors if isinstance(f, Group)]
+    if len(groups) != len(factors) or len(groups) > 2:
+        raise ValueError(f"'{text}' names no group; write one such as c4, d4, o2, agents or d4*agents")
+    if len(groups) == 1:
+        return groups[0]
+    plane, agents = groups
+    if plane.name == "agents" or agents.name != "agents":
+        raise ValueError(f"'{text}' is no direct product; write a planar group, then agents, as in d4*agents")
+    return direct_product(plane, agents)
+
+
+def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
+    """Read one item of the list: a tuple of elements, or a group that has to be sampled."""
+    factors = [_factor(p.strip(), text, num_agents) for p in part.split("*")]
+    groups = [f for f in factors if isinstance(f, Group)]
+    if len(groups) == len(factors) and (len(groups) == 1 or groups[-1].name == "agents"):
+        group = parse_group(part, num_agents)
+        return group.elements if isinstance(group, FiniteGroup) else group
+    lists = []
+    for factor in factors:
+        if isinstance(factor, Group) and not isinstance(factor, FiniteGroup):
+            raise ValueError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
+        lists.append(factor.elements if isinstance(factor, FiniteGroup) else (factor,))
+    size = reduce(lambda a, b: a * b, (len(x) for x in lists))
+    if size > LISTED_LIMIT:
+        raise ValueError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
+    return reduce(lambda a, b: tuple(g @ h for g in a for h in b), lists)
+
+
+def _factor(word: str, text: str, num_agents: int) -> Element | Group:
+    """Read one word: an element or a group."""
+    if word in _NAMED:
+        return _NAMED[word]
+    if word == "so2":
+        return special_orthogonal()
+    if word == "o2":
+        return orthogonal()
+    if word == "agents":
+        return agent_permutations(num_agents)
+    if match := re.fullmatch(r"([cd])(\d{1,3})", word):
+        return _polygon(match[1], int(match[2]))
+    if match := re.fullmatch("rot" + _DEGREES, word):
+        return rotation(Fraction(match[1]))
+    if match := re.fullmatch("flip-?" + _DEGREES, word):
+        return mirror(Fraction(match[1]))
+    if re.fullmatch(r"agents(-\d{1,4})+", word):
+        return _permutation(word, num_agents)
+    where = f" in '{text}'" if word != text else ""
+    raise ValueError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+
+
+def _polygon(letter: str, n: int) -> FiniteGroup:
+    if not 1 <= n <= _MAX_FOLD:
+        raise ValueError(f"group '{letter}{n}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
+    return cyclic(n) if letter == "c" else dihedral(n)
+
+
+def _permutation(word: str, num_agents: int) -> Element:
+    sigma = tuple(int(x) for x in word.split("-")[1:])
+    if sorted(sigma) != list(range(num_agents)):
+        order = "-".join(map(str, (*range(1, num_agents), 0)))
+        raise ValueError(f"'{word}' is no order of {num_agents} agents; write each place once, as in agents-{order}")
+    return Element(permutation=sigma)
