@@ -1,0 +1,165 @@
+"""The `esp` application: finds commands by name, imports them when asked for, and turns failures into exit codes.
+
+Exit codes: 0 done; 1 the machine failed (disk full) or a bug (with its traceback); 2 the user can mend it: one
+sentence on standard error, no traceback; 130 interrupted. Set ESP_TRACEBACK=1 to see where a sentence came from.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Sequence
+from difflib import get_close_matches
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from esp_cli import __version__, console
+from esp_cli.commands import COMMANDS
+
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
+EXIT_MACHINE, EXIT_USER, EXIT_INTERRUPTED = 1, 2, 130
+
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
+_USER_CAN_MEND = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError)
+
+
+class LazyGroup(TyperGroup):
+    """A command group over `COMMANDS` that imports a command's module only when the command is asked for."""
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override] # same class, public name
+        """Return the names in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: typer.Context, cmd_name: str) -> Any:  # type: ignore[override]
+        """Import and build one command; None where the table does not name it."""
+        return build_command(cmd_name, COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
+
+    def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
+        """Find the command that the first argument names, or say which one is like it."""
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            close = get_close_matches(name, COMMANDS, n=1)
+            hint = f"did you mean '{close[0]}'?" if close else "'esp --help' lists the commands"
+            raise UserError(f"there is no command '{name}'; {hint}")
+        return super().resolve_command(ctx, args)
+
+    def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> Any:  # type: ignore[override]
+        """Run a command line; every failure that has a sentence becomes that sentence and its exit code."""
+        extra["standalone_mode"] = False  # usage errors then come here instead of being printed in a box
+        try:
+            code = super().main(args, prog_name or self.name, **extra)
+        except Exception as failure:
+            code = report(failure)
+            if code is None or os.environ.get("ESP_TRACEBACK"):
+                raise
+        raise SystemExit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: typer.Context) -> Any:  # type: ignore[override]
+        """Run the chosen command; an interrupt ends it with a short sentence."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            console.note("interrupted")
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+class UserError(ValueError):
+    """A mistake on the command line itself; the engine raises ValueError and its subclasses."""
+
+
+def build_command(name: str, target: str) -> Any:
+    """Import "module:function" and make it a typer command, with the module's `EPILOG` below its help."""
+    module_name, function_name = target.split(":")
+    module = import_module(module_name)
+    single = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+    single.command(name, epilog=getattr(module, "EPILOG", None))(getattr(module, function_name))
+    command = typer.main.get_command(single)
+    command.name = name
+    return command
+
+
+def report(failure: Exception) -> int | None:
+    """Print the sentence that a failure deserves and return its exit code; None where it is a bug without one."""
+    if isinstance(failure, typer.TyperException):
+        return _report_usage(failure)
+    if isinstance(failure, typer.Abort):
+        console.note("aborted")
+        return EXIT_MACHINE
+    if isinstance(failure, ValueError):
+        console.error(_sentence(failure))
+        return EXIT_USER
+    if isinstance(failure, OSError) and failure.errno in _DISK_FULL:
+        console.error(f"no space is left on the disk{_place(failure)}; free some and run the command again")
+        return EXIT_MACHINE
+    if isinstance(failure, _USER_CAN_MEND):
+        reason = (failure.strerror or str(failure) or type(failure).__name__).lower()
+        console.error(f"{reason}{_place(failure)}; check the path and its permissions")
+        return EXIT_USER
+    return None
+
+
+def _report_usage(failure: typer.TyperException) -> int:
+    message = failure.format_message()
+    context = getattr(failure, "ctx", None)
+    if message:  # empty where no argument was given at all: typer has shown the help already
+        console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
+    return failure.exit_code
+
+
+def _place(failure: OSError) -> str:
+    return f": {failure.filename}" if failure.filename else ""
+
+
+def _sentence(failure: ValueError) -> str:
+    """Return the message in one line; what pydantic found wrong is listed by setting."""
+    if hasattr(failure, "errors") and callable(failure.errors):
+        return _validation_sentence(failure)  # type: ignore[arg-type] # told apart without importing pydantic
+    return str(failure) or type(failure).__name__
+
+
+def _validation_sentence(failure: ValidationError) -> str:
+    found = []
+    for item in failure.errors(include_url=False):
+        where = ".".join(str(part) for part in item["loc"])
+        if item["type"] == "extra_forbidden":
+            found.append(f"there is no setting '{where}'")
+            continue
+        message = item["msg"].removeprefix("Value error, ")
+        found.append(f"setting '{where}': {message} (got {item['input']!r})" if where else message)
+    return f"{failure.title}: {'; '.join(found)}"
+
+
+app = typer.Typer(
+    name="esp",
+    cls=LazyGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    epilog="Start with: esp train --algo mappo --task navigation",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        console.say(f"esp {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and leave.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Train, evaluate and render multi-agent policies with the symmetry prior of ESP."""
+
+
+def main() -> None:
+    """Run the application on the command line of this process."""
+    app()

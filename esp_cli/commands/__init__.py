@@ -1,0 +1,11 @@
+"""The commands of `esp`, one module each: parse, make one call into the engine, print.
+
+A command module may import typer and the console at its top; the engine and torch are imported inside the function,
+so that `esp --help`, which reads every module, answers at once. Its docstring is the help text; `EPILOG` holds an
+example.
+"""
+
+from __future__ import annotations
+
+COMMANDS: dict[str, str] = {}
+"""Command name -> "module:function", in the order in which `esp --help` lists them."""

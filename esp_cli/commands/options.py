@@ -1,0 +1,152 @@
+"""Options and arguments that several commands share, and the parsers behind them.
+
+A command writes `task: TaskOption = "navigation"`: the flag, its help and its parser stand here once, the default
+stands in the command.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from decimal import Decimal
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import typer
+
+T = TypeVar("T")
+
+_MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
+_COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
+MAX_SEEDS = 1000
+"""Seeds that one run may hold; more is a slip of the keyboard, not a study."""
+
+
+def parse_count(value: str | int) -> int:
+    """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6.
+
+    Raises:
+        ValueError: no number, not positive, or not a whole number of steps.
+    """
+    text = str(value).strip()
+    match = _COUNT.fullmatch(text)
+    if match is None:
+        raise ValueError(f"'{text}' is no number of steps; write for example 20000, 500k or 1.5M")
+    count = Decimal(match["number"].replace("_", "")) * _MULTIPLIERS[match["letter"].lower()]
+    if count != count.to_integral_value() or count < 1:
+        raise ValueError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
+    return int(count)
+
+
+def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
+    """Read the seeds of a run: "10" means the ten seeds 0..9, "3,7" the seeds 3 and 7, "7," the seed 7 alone.
+
+    Raises:
+        ValueError: no such list, a seed twice, or too many seeds.
+    """
+    if not isinstance(value, str | int):
+        return tuple(value)
+    text = str(value).strip()
+    if re.fullmatch(r"\d{1,9}", text):
+        count = int(text)
+        if not 1 <= count <= MAX_SEEDS:
+            raise ValueError(
+                f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one as '{text},'"
+            )
+        return tuple(range(count))
+    if not re.fullmatch(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?", text):
+        raise ValueError(f"'{text}' names no seeds; write a number of seeds as 10 or a list as 3,7")
+    seeds = tuple(int(item) for item in text.split(",") if item.strip())
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"the seeds '{text}' name one seed twice; name each once")
+    return seeds
+
+
+def parse_assignments(items: Iterable[str]) -> dict[str, object]:
+    """Read settings written as "name=value"; a value is JSON where it can be, else the text as it is.
+
+    "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; "prey=random" -> {"prey": "random"}.
+
+    Raises:
+        ValueError: an item without "=" or without a name, or a name twice.
+    """
+    settings: dict[str, object] = {}
+    for item in items:
+        name, equals, text = item.partition("=")
+        name = name.strip()
+        if not equals or not name:
+            raise ValueError(
+                f"--set {item} is no setting; write --set name=value, as in --set mappo.learning_rate=5e-4"
+            )
+        if name in settings:
+            raise ValueError(f"--set names '{name}' twice; set it once")
+        try:
+            settings[name] = json.loads(text)
+        except json.JSONDecodeError:
+            settings[name] = text.strip()
+    return settings
+
+
+def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
+    """Wrap a parser so that its message reaches the user beside the option it belongs to."""
+
+    def parser(value: str) -> T:
+        try:
+            return parse(value)
+        except ValueError as failure:
+            raise typer.BadParameter(str(failure)) from failure
+
+    parser.__name__ = name
+    return parser
+
+
+TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task to play; `esp tasks` lists them.", metavar="TASK")]
+AlgoOption = Annotated[str, typer.Option("--algo", "-a", help="Learning algorithm, such as mappo.", metavar="ALGO")]
+StepsOption = Annotated[
+    int,
+    typer.Option(
+        "--steps",
+        "-n",
+        help="Environment steps per seed, as 20000, 500k or 3M.",
+        metavar="STEPS",
+        parser=_option_parser(parse_count, "STEPS"),
+    ),
+]
+SeedsOption = Annotated[
+    tuple,  # type: ignore[type-arg] # typer takes the parser's word for it and would read tuple[int, ...] as a pattern
+    typer.Option(
+        "--seeds",
+        "-s",
+        help="How many seeds to train at once (10 means 0..9), or which, as 3,7.",
+        metavar="SEEDS",
+        parser=_option_parser(parse_seeds, "SEEDS"),
+    ),
+]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Where the result goes.", metavar="PATH")]
+DeviceOption = Annotated[
+    Literal["auto", "cpu", "cuda"], typer.Option("--device", help="Where to compute; auto takes a GPU if there is one.")
+]
+JsonOption = Annotated[
+    str | None,
+    typer.Option(
+        "--json",
+        help="Also write the result as JSON to this file; - writes it to standard output instead.",
+        metavar="FILE",
+    ),
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what stands where the result goes.")]
+EpisodesOption = Annotated[int, typer.Option("--episodes", "-e", min=1, help="Episodes per seed.", metavar="COUNT")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", help="Change one setting, as mappo.learning_rate=5e-4; may be repeated.", metavar="NAME=VALUE"
+    ),
+]
+TransformsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses.", metavar="LIST"
+    ),
+]
+PolicyArgument = Annotated[Path, typer.Argument(help="Run folder or policy file.", metavar="RUN|POLICY")]

@@ -1,0 +1,184 @@
+"""The application: lazy commands, help without torch, and one exit code per kind of failure."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import typer
+from pydantic import BaseModel, ConfigDict, Field
+from typer.testing import CliRunner
+
+from esp_cli import __version__
+from esp_cli.app import app
+from esp_cli.commands import COMMANDS
+from esp_cli.commands.options import SeedsOption, StepsOption
+
+runner = CliRunner()
+
+
+class ToySettings(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    learning_rate: float = Field(1e-3, gt=0)
+
+
+FAILURES: dict[str, BaseException] = {
+    "value": ValueError("task 'x' has no\nsymmetry; choose another"),
+    "interrupt": KeyboardInterrupt(),
+    "missing": FileNotFoundError(errno.ENOENT, "No such file or directory", "runs/a"),
+    "denied": PermissionError(errno.EACCES, "Permission denied", "runs/b"),
+    "full": OSError(errno.ENOSPC, "No space left on device", "runs/c"),
+    "io": OSError(errno.EIO, "Input/output error", "runs/d"),
+    "bug": ZeroDivisionError("division by zero"),
+}
+
+
+def toy(
+    kind: Annotated[str, typer.Argument(help="What to do.")] = "fine",
+    steps: StepsOption = 500_000,
+    seeds: SeedsOption = (0,),
+) -> None:
+    """Fail in the way that is asked for."""
+    if kind == "settings":
+        ToySettings.model_validate({"learning_rate": -1, "speed": 3})
+    if kind in FAILURES:
+        raise FAILURES[kind]
+    typer.echo(f"{kind} {steps} {seeds}")
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register the toy command, and one whose module does not import."""
+    module = types.ModuleType("toy_command")
+    module.toy = toy  # type: ignore[attr-defined]
+    module.EPILOG = "Example: esp toy fine --steps 20k"  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "toy_command", module)
+    monkeypatch.setitem(COMMANDS, "toy", "toy_command:toy")
+
+
+def test_a_command_gets_its_parsed_arguments(commands: None) -> None:
+    result = runner.invoke(app, ["toy", "hello", "--steps", "1.5M", "--seeds", "3,7"])
+    assert (result.exit_code, result.stdout) == (0, "hello 1500000 (3, 7)\n")
+
+
+def test_defaults_pass_through_the_parsers(commands: None) -> None:
+    assert runner.invoke(app, ["toy"]).stdout == "fine 500000 (0,)\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "sentence"),
+    [
+        ("value", 2, "error: task 'x' has no symmetry; choose another"),
+        (
+            "settings",
+            2,
+            "error: ToySettings: setting 'learning_rate': Input should be greater than 0 (got -1); "
+            "there is no setting 'speed'",
+        ),
+        ("interrupt", 130, "interrupted"),
+        ("missing", 2, "error: no such file or directory: runs/a; check the path and its permissions"),
+        ("denied", 2, "error: permission denied: runs/b; check the path and its permissions"),
+        ("full", 1, "error: no space is left on the disk: runs/c; free some and run the command again"),
+    ],
+)
+def test_a_failure_becomes_one_sentence_and_a_code(commands: None, kind: str, code: int, sentence: str) -> None:
+    result = runner.invoke(app, ["toy", kind])
+    assert (result.exit_code, result.stderr, result.stdout) == (code, sentence + "\n", "")
+
+
+@pytest.mark.parametrize("kind", ["bug", "io"])
+def test_a_bug_keeps_its_traceback(commands: None, kind: str) -> None:
+    result = runner.invoke(app, ["toy", kind])
+    assert result.exception is FAILURES[kind]
+
+
+def test_the_traceback_of_a_sentence_can_be_asked_for(commands: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ESP_TRACEBACK", "1")
+    assert runner.invoke(app, ["toy", "value"]).exception is FAILURES["value"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["toi"], "there is no command 'toi'; did you mean 'toy'?"),
+        (["fly"], "there is no command 'fly'; 'esp --help' lists the commands"),
+        (
+            ["toy", "--steps", "many"],
+            "'many' is no number of steps; write for example 20000, 500k or 1.5M (see 'esp toy --help')",
+        ),
+        (["toy", "--seeds", "2,2"], "name one seed twice"),
+        (["toy", "--speed", "3"], "No such option: --speed"),
+        (["--speed"], "No such option: --speed"),
+    ],
+)
+def test_a_slip_on_the_command_line_is_told_in_one_line(commands: None, arguments: list[str], sentence: str) -> None:
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 2
+    assert sentence in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+
+
+def test_help_lists_every_command_and_a_command_shows_its_example(commands: None) -> None:
+    listing = runner.invoke(app, ["--help"]).stdout
+    assert all(f" {name} " in listing for name in COMMANDS)
+    assert "Fail in the way that is asked for." in listing
+    assert "Example: esp toy fine --steps 20k" in runner.invoke(app, ["toy", "--help"]).stdout
+
+
+def test_no_arguments_show_the_help() -> None:
+    result = runner.invoke(app, [])
+    assert "Usage: esp" in result.stdout
+    assert result.stderr == ""
+
+
+def test_only_the_command_that_runs_is_imported(commands: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(COMMANDS, "broken", "no_such_module:run")
+    assert runner.invoke(app, ["toy"]).exit_code == 0
+    assert isinstance(runner.invoke(app, ["broken"]).exception, ModuleNotFoundError)
+
+
+def test_every_command_has_help_and_an_example() -> None:
+    for name in COMMANDS:
+        result = runner.invoke(app, [name, "--help"], env={"COLUMNS": "200"})
+        assert result.exit_code == 0, result.output
+        assert f"esp {name}" in result.stdout.split("╰")[-1], f"esp {name} --help ends without an example"
+
+
+def _python(code: str) -> subprocess.CompletedProcess[str]:
+    root = Path(__file__).parents[2]
+    path = os.pathsep.join([str(root), str(root / "environments")])
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        check=False,
+    )
+
+
+def test_help_imports_neither_torch_nor_numpy() -> None:
+    done = _python(
+        "import sys\n"
+        "from esp_cli.app import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit as leave: assert leave.code == 0, leave.code\n"
+        "print('heavy:', sorted({'torch', 'numpy', 'scipy', 'matplotlib'} & set(sys.modules)))\n"
+    )
+    assert done.stdout.endswith("heavy: []\n"), done.stdout + done.stderr
+
+
+def test_the_version_is_the_packages() -> None:
+    assert runner.invoke(app, ["--version"]).stdout == f"esp {__version__}\n"
+
+
+def test_main_leaves_with_the_exit_code_and_without_a_traceback() -> None:
+    done = _python("import sys; sys.argv = ['esp', 'nothing']; from esp_cli.app import main; main()")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: there is no command 'nothing'")
