@@ -67,7 +67,8 @@ def table(
         grid.add_column(heading.removesuffix(">"), justify="right" if heading.endswith(">") else "left")
     for row in rows:
         grid.add_row(*(Text(str(cell)) for cell in row))
-    out.print(grid, width=None if out.is_terminal else PIPE_WIDTH)
+    target = out if out.is_terminal else Console(highlight=False, width=PIPE_WIDTH)
+    target.print(grid)
 
 
 def write_json(path: str | Path, value: object) -> None:

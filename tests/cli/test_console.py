@@ -1,0 +1,143 @@
+"""What the console prints, and how it writes numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from pydantic import BaseModel
+
+from esp_cli import console
+from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean
+
+
+class Model(BaseModel):
+    rate: float = 0.5
+
+
+@dataclass
+class Interval:
+    low: float
+    high: float
+
+
+def test_json_takes_what_the_engine_hands_over(tmp_path: Path) -> None:
+    value = {
+        "tensor": torch.tensor([1.0, math.inf]),
+        "scalar": torch.tensor(2),
+        "nan": math.nan,
+        "flag": True,
+        "model": Model(),
+        "interval": Interval(-1.0, 1.5),
+        "path": Path("runs/a"),
+        3: (None, "ä"),
+    }
+    target = tmp_path / "new" / "result.json"
+    console.write_json(target, value)
+    assert json.loads(target.read_text(encoding="utf-8")) == {
+        "tensor": [1.0, None],
+        "scalar": 2,
+        "nan": None,
+        "flag": True,
+        "model": {"rate": 0.5},
+        "interval": {"low": -1.0, "high": 1.5},
+        "path": "runs/a",
+        "3": [None, "ä"],
+    }
+    assert [path.name for path in target.parent.iterdir()] == ["result.json"]
+
+
+def test_json_on_standard_output_is_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.write_json("-", {"text": "a" * 500})
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"text": "a" * 500}
+    assert captured.err == ""
+
+
+def test_what_has_no_place_in_json_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "result.json"
+    target.write_text("{}")
+    with pytest.raises(TypeError, match="object has no place in JSON"):
+        console.write_json(target, {"x": object()})
+    assert target.read_text() == "{}"
+
+
+def test_an_error_is_one_line_without_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    console.error("field [bold]x[/bold] is wrong;\n   " + "mend it " * 30)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == "error: field [bold]x[/bold] is wrong; " + ("mend it " * 30).strip() + "\n"
+
+
+def test_a_table_in_a_pipe_keeps_its_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    console.table(["policy", "mean>"], [["a" * 90, -122.5], ["random [x]", 3]], title="navigation", caption="esp")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].strip() == "navigation"
+    assert any("a" * 90 in line and "-122.5" in line for line in lines)
+    assert any("random [x]" in line and line.rstrip(" │").endswith("  3") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0"), (950, "950"), (20_000, "20k"), (999_999, "1M"), (1_500_000, "1.5M"), (3e9, "3G"), (43_210, "43.2k")],
+)
+def test_counts(count: float, text: str) -> None:
+    assert format_count(count) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.2, "0 s"), (59.4, "59 s"), (59.7, "1 min 00 s"), (125, "2 min 05 s"), (3780, "1 h 03 min"), (math.inf, "?")],
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert format_duration(seconds) == text
+
+
+def test_means_and_intervals() -> None:
+    assert format_mean(-122.251, 1.618) == "-122.25 ± 1.62"
+    assert format_mean(-122.251, math.nan) == "-122.25"
+    assert format_mean(3.0) == "3.00"
+    assert format_interval((-125.04, -119.96), digits=1) == "[-125.0, -120.0]"
+
+
+class Clock:
+    """A clock that the test turns."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_progress_in_a_pipe_is_a_line_every_ten_seconds_and_the_last(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = Clock()
+    with TrainingProgress(total=100_000, num_seeds=10, start=20_000, clock=clock) as progress:
+        for second in range(1, 25):
+            clock.now_s = 100.0 + second
+            progress.update(20_000 + 1000 * second, {"return": -130.0 - second})
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.splitlines() == [
+        "train   21%  21k/100k  10k steps/s  1 min 19 s left  return -131",
+        "train   31%  31k/100k  10k steps/s  1 min 09 s left  return -141",
+        "train   41%  41k/100k  10k steps/s  59 s left  return -151",
+        "train   44%  44k/100k  10k steps/s  56 s left  return -154",
+    ]
+
+
+def test_the_rate_forgets_what_is_half_a_minute_old() -> None:
+    clock = Clock()
+    with TrainingProgress(total=10**6, clock=clock) as progress:
+        for second in range(1, 101):
+            clock.now_s = 100.0 + second
+            progress.update(10 * second if second <= 60 else 600 + 500 * (second - 60))
+        assert progress.rate() == pytest.approx(500)
+
+
+def test_progress_before_its_first_update_promises_nothing() -> None:
+    with TrainingProgress(total=1000, clock=Clock()) as progress:
+        assert progress.status() == "0/1k  0 steps/s  ? left"

@@ -1,0 +1,88 @@
+"""The parsers behind the shared options."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from esp_cli.commands.options import MAX_SEEDS, parse_assignments, parse_count, parse_seeds
+from esp_cli.console import format_count
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ("20000", 20_000),
+        ("20_000", 20_000),
+        ("500k", 500_000),
+        ("3M", 3_000_000),
+        ("1.5m", 1_500_000),
+        ("2e6", 2_000_000),
+        (" 10 K ", 10_000),
+        ("1.001k", 1001),
+        ("4.35M", 4_350_000),  # in binary fractions 4.35 * 1e6 is 4349999.99...
+        (7, 7),
+    ],
+)
+def test_counts_are_read(text: str | int, count: int) -> None:
+    assert parse_count(text) == count
+
+
+@pytest.mark.parametrize(
+    "text", ["", "many", "-5", "0", "0.5", "1.0005k", "1e400", "k", "5 km", "1.2.3", "inf", "nan", "0k"]
+)
+def test_what_is_no_count_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="500k"):
+        parse_count(text)
+
+
+@given(st.integers(1, 999), st.sampled_from([1, 1_000, 1_000_000, 1_000_000_000]))
+def test_a_count_survives_being_written_and_read(number: int, scale: int) -> None:
+    assert parse_count(format_count(number * scale)) == number * scale
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [("1", (0,)), ("3", (0, 1, 2)), (2, (0, 1)), ("3,7", (3, 7)), ("7,", (7,)), ("5, 0", (5, 0)), ((4,), (4,))],
+)
+def test_seeds_are_read(text: str | int | tuple[int, ...], seeds: tuple[int, ...]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("0", "cannot be trained at once"),
+        (str(MAX_SEEDS + 1), "cannot be trained at once"),
+        ("1,1", "twice"),
+        ("a", "names no seeds"),
+        ("-1", "names no seeds"),
+        (",", "names no seeds"),
+        ("1.5", "names no seeds"),
+    ],
+)
+def test_what_names_no_seeds_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        parse_seeds(text)
+
+
+def test_assignments_are_json_where_they_can_be() -> None:
+    assert parse_assignments(
+        ["mappo.learning_rate=5e-4", "prey=random", "a.b=[1, 2]", "on=true", "text=a=b", "none="]
+    ) == {
+        "mappo.learning_rate": 5e-4,
+        "prey": "random",
+        "a.b": [1, 2],
+        "on": True,
+        "text": "a=b",
+        "none": "",
+    }
+
+
+@pytest.mark.parametrize(
+    ("items", "reason"), [(["x"], "no setting"), (["=3"], "no setting"), (["x=1", "x=2"], "twice")]
+)
+def test_what_is_no_assignment_is_refused(items: list[str], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        parse_assignments(items)

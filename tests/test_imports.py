@@ -1,0 +1,169 @@
+"""Imports point one way, heavy or chatty libraries stay in their rooms, and no file format can run code.
+
+commands -> experiments -> deploy -> training -> algorithms -> prior, networks -> symmetry -> esp_envs.spec
+
+The environment classes behind the contract (`esp_envs.spec` and `esp_envs.base`) are known to training and above only.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+RANKS = {
+    "": 0,  # esp_cli itself: the version
+    "symmetry": 1,
+    "prior": 2,
+    "networks": 2,
+    "algorithms": 3,
+    "training": 4,
+    "deploy": 5,
+    "experiments": 6,
+    "commands": 7,
+    "app": 8,
+}
+"""A part may import parts of a lower rank, and itself; parts of one rank do not know each other."""
+CONTRACT_ONLY_UP_TO = RANKS["algorithms"]
+"""Up to this rank, tasks are known by their contract alone; those above make environments by name."""
+CONTRACT = ("esp_envs.spec.", "esp_envs.base.")
+PRINTING = {"app", "commands", "console"}
+ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING}
+SIMULATORS = {"mujoco", "pymunk"}
+CODE_IN_DATA = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "torch.load", "torch.save"}
+_TARGET = re.compile(r"(esp_(?:cli|envs)[\w.]*):\w+")
+
+
+def imports_of(source: str, module: str, is_package: bool) -> Iterator[tuple[int, str]]:
+    """Yield (line, dotted name) of all that a module imports, wherever in it.
+
+    `from a import b` yields a.b, which is right for modules and harmless for names; lazy "module:function" targets
+    and uses of `torch.load` and `torch.save` count as imports too.
+    """
+    package = module.split(".") if is_package else module.split(".")[:-1]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{stem}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "torch":
+            yield node.lineno, f"torch.{node.attr}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and _TARGET.fullmatch(node.value):
+            yield node.lineno, node.value.split(":")[0]
+
+
+def forbidden(module: str, imported: str) -> str | None:
+    """Say which rule an import breaks, or None."""
+    package, _, rest = module.partition(".")
+    part, top = rest.partition(".")[0], imported.partition(".")[0]
+    if top in CODE_IN_DATA or imported in CODE_IN_DATA:
+        return "loading a file must never run code"
+    if top in SIMULATORS and not module.startswith("esp_envs.epuck"):
+        return f"{top} belongs in esp_envs.epuck"
+    if package == "esp_envs":
+        kept_out = {"esp_cli": "esp_envs knows nothing of esp_cli", "typer": "esp_envs does not print"}
+        return kept_out.get("typer" if top == "rich" else top)
+    for room, parts in ROOMS.items():
+        if (imported + ".").startswith(room + ".") and part not in parts:
+            return f"{room} belongs in {', '.join(sorted(parts))}"
+    if top == "esp_envs" and RANKS.get(part, 99) <= CONTRACT_ONLY_UP_TO:
+        return None if f"{imported}.".startswith(CONTRACT) else "below training, only the contract of tasks is known"
+    if top != "esp_cli" or imported.startswith("esp_cli.console"):
+        return None
+    if part == "console":
+        return "the console knows nothing of the application"
+    wanted = imported.split(".")[1] if "." in imported else ""
+    if wanted == part or wanted.startswith("__"):
+        return None
+    if part not in RANKS or wanted not in RANKS:
+        return f"{part if part not in RANKS else wanted} has no place in the order of imports"
+    return None if RANKS[wanted] < RANKS[part] else f"{part} may not import {wanted}"
+
+
+def violations(root: Path) -> list[str]:
+    """Return one line per forbidden import under the source roots of `root`."""
+    found = []
+    for source_root, package in ((root, "esp_cli"), (root / "environments", "esp_envs")):
+        for path in sorted((source_root / package).rglob("*.py")):
+            is_package = path.name == "__init__.py"
+            parts = path.relative_to(source_root).with_suffix("").parts
+            module = ".".join(parts[:-1] if is_package else parts)
+            for line, imported in imports_of(path.read_text(encoding="utf-8"), module, is_package):
+                rule = forbidden(module, imported)
+                if rule:
+                    found.append(f"{path.relative_to(root)}:{line} imports {imported}: {rule}")
+    return found
+
+
+def test_the_imports_keep_their_direction() -> None:
+    assert violations(ROOT) == []
+
+
+def test_both_packages_are_looked_at() -> None:
+    assert (ROOT / "esp_cli" / "app.py").exists()
+    assert (ROOT / "environments" / "esp_envs" / "spec.py").exists()
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "rule"),
+    [
+        ("esp_cli/symmetry/groups.py", "from esp_cli.prior import losses", "symmetry may not import prior"),
+        ("esp_cli/symmetry/groups.py", "import esp_cli.networks.layers", "symmetry may not import networks"),
+        ("esp_cli/symmetry/groups.py", "from ..training import loop", "symmetry may not import training"),
+        ("esp_cli/symmetry/__init__.py", "from ..training import loop", "symmetry may not import training"),
+        ("esp_cli/prior/losses.py", "from esp_cli.networks.layers import Linear", "prior may not import networks"),
+        ("esp_cli/networks/layers.py", "from esp_cli.prior import losses", "networks may not import prior"),
+        ("esp_cli/algorithms/mappo.py", "from esp_cli import training", "algorithms may not import training"),
+        ("esp_cli/algorithms/registry.py", "T = {'a': 'esp_cli.training.loop:run'}", "may not import training"),
+        ("esp_cli/training/loop.py", "def f():\n    import esp_cli.commands.train", "training may not import commands"),
+        ("esp_cli/training/loop.py", "from esp_cli.console import say", "esp_cli.console belongs in"),
+        ("esp_cli/training/loop.py", "from esp_cli import console", "esp_cli.console belongs in"),
+        ("esp_cli/training/loop.py", "from rich.table import Table", "rich belongs in"),
+        ("esp_cli/training/loop.py", "import typer", "typer belongs in"),
+        ("esp_cli/misc.py", "import esp_cli.training", "misc has no place"),
+        ("esp_cli/console.py", "from esp_cli.commands import COMMANDS", "the console knows nothing"),
+        ("esp_cli/algorithms/mappo.py", "from esp_envs.mpe.navigation import Navigation", "only the contract"),
+        ("esp_cli/symmetry/groups.py", "import esp_envs", "only the contract"),
+        ("esp_cli/training/checkpoint.py", "import pickle", "never run code"),
+        ("esp_cli/training/checkpoint.py", "import torch\nx = torch.load('f')", "never run code"),
+        ("esp_cli/training/checkpoint.py", "from torch import load", "never run code"),
+        ("environments/esp_envs/base.py", "from esp_cli.symmetry import groups", "knows nothing of esp_cli"),
+        ("environments/esp_envs/base.py", "import rich", "does not print"),
+        ("environments/esp_envs/mpe/world.py", "import mujoco", "mujoco belongs in esp_envs.epuck"),
+        ("esp_cli/deploy/export.py", "from pymunk import Body", "pymunk belongs in esp_envs.epuck"),
+    ],
+)
+def test_a_forbidden_import_is_found(tmp_path: Path, path: str, source: str, rule: str) -> None:
+    (tmp_path / path).parent.mkdir(parents=True)
+    (tmp_path / path).write_text(source)
+    found = violations(tmp_path)
+    assert len(found) == 1
+    assert path in found[0]
+    assert rule in found[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("esp_cli/app.py", "import typer\nfrom esp_cli import __version__, console\nfrom esp_cli.commands import X"),
+        (
+            "esp_cli/commands/train.py",
+            "from esp_cli import console\nfrom esp_cli.training import loop\nimport esp_envs",
+        ),
+        ("esp_cli/prior/losses.py", "from esp_cli.symmetry.groups import Group\nfrom esp_envs.spec import Layout"),
+        ("esp_cli/training/loop.py", "import torch\nfrom esp_envs import make\nfrom esp_cli.prior import losses"),
+        ("esp_cli/symmetry/transforms.py", "from esp_cli.symmetry.groups import Group\nfrom .groups import Element"),
+        ("environments/esp_envs/epuck/planar.py", "import mujoco\nfrom esp_envs.spec import Layout"),
+    ],
+)
+def test_an_allowed_import_is_let_through(tmp_path: Path, path: str, source: str) -> None:
+    (tmp_path / path).parent.mkdir(parents=True)
+    (tmp_path / path).write_text(source)
+    assert violations(tmp_path) == []
