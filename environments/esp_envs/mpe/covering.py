@@ -1,0 +1,128 @@
+"""Hand-written policies of cooperative navigation: who goes where, and how to get there.
+
+Everything works on all worlds at once, with the worlds on the last axis W.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+LOOKAHEAD_S = 0.2
+"""Time over which the present velocity is taken to carry an agent on; found by search, it brakes in time."""
+FULL_FORCE_DISTANCE = 0.2
+"""How far one step of full force carries an agent in all (0.5 length/s, fading by a quarter a step, 0.1 s each)."""
+MAX_SHARINGS = 4096
+"""Most ways of sharing out landmarks that `shared_out` tries."""
+TRAVEL_WEIGHT = 0.25
+"""Weight of the distance to travel against the distance that remains, in `shared_out`; found by search."""
+
+
+def approach(goal: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
+    """Return the force that each agent wishes for [N, 2, W] to come to rest at its goal."""
+    return (goal - position - LOOKAHEAD_S * velocity) / FULL_FORCE_DISTANCE
+
+
+def one_each(position: Tensor, landmark: Tensor) -> Tensor:
+    """Give each agent a landmark of its own: the nearest free pair first, then swaps that shorten the way.
+
+    Args:
+        position: [N, 2, W].
+        landmark: [L, 2, W].
+
+    Returns:
+        The goals [N, 2, W]; agents left over when all landmarks are taken stay where they are.
+    """
+    agents, landmarks = position.shape[0], landmark.shape[0]
+    distance = (position.unsqueeze(1) - landmark.unsqueeze(0)).norm(dim=2)
+    idle = distance.new_zeros(agents, max(agents - landmarks, 0), distance.shape[-1])
+    choice = _nearest_pairs_first(distance)
+    distance = torch.cat([distance, idle], dim=1)
+    for a, b in itertools.combinations(range(agents), 2):
+        own = distance[a].gather(0, choice[a : a + 1]) + distance[b].gather(0, choice[b : b + 1])
+        swapped = distance[a].gather(0, choice[b : b + 1]) + distance[b].gather(0, choice[a : a + 1])
+        pair = choice[[a, b]]
+        choice[[a, b]] = torch.where(swapped < own, pair.flip(0), pair)
+    goals = landmark.gather(0, choice.clamp_max(landmarks - 1).unsqueeze(1).expand(-1, 2, -1))
+    return torch.where((choice < landmarks).unsqueeze(1), goals, position)
+
+
+def _nearest_pairs_first(distance: Tensor) -> Tensor:
+    """Return the landmark index [N, W] of each agent; agents left over get L, L + 1, ...
+
+    Args:
+        distance: [N, L, W].
+    """
+    agents, landmarks, worlds = distance.shape
+    agent_index = torch.arange(agents, device=distance.device).view(-1, 1, 1)
+    target_index = torch.arange(landmarks, device=distance.device).view(1, -1, 1)
+    choice = torch.full((agents, worlds), -1, device=distance.device)
+    free = distance
+    for _ in range(min(agents, landmarks)):
+        pair = free.reshape(agents * landmarks, worlds).argmin(0)
+        agent, target = pair // landmarks, pair % landmarks
+        choice.scatter_(0, agent.unsqueeze(0), target.unsqueeze(0))
+        free = free.masked_fill((agent_index == agent) | (target_index == target), torch.inf)
+    idle = choice < 0
+    return torch.where(idle, landmarks - 1 + idle.cumsum(0), choice)
+
+
+def shared_out(position: Tensor, landmark: Tensor) -> Tensor:
+    """Share out all landmarks among the agents and send each agent to the best place for its share.
+
+    An agent with one landmark goes to it; with two, to the nearest point between them (every point of the segment has
+    the same sum of distances); with more, to the one of them with the least sum of distances. Among all sharings the
+    one with the least remaining distance plus TRAVEL_WEIGHT times the way there is taken.
+
+    Args:
+        position: [N, 2, W].
+        landmark: [L, 2, W].
+
+    Raises:
+        ValueError: more than MAX_SHARINGS ways.
+    """
+    agents, landmarks = position.shape[0], landmark.shape[0]
+    if agents**landmarks > MAX_SHARINGS:
+        raise ValueError(
+            f"the heuristic 'cover' would try {agents**landmarks} sharings of {landmarks} landmarks among {agents} "
+            f"agents; use 'greedy' above {MAX_SHARINGS}"
+        )
+    places, costs = _places(position, landmark)
+    best = torch.full_like(position[0, 0], torch.inf)
+    goal = position.clone()
+    for owners in itertools.product(range(agents), repeat=landmarks):
+        shares = [sum(1 << k for k in range(landmarks) if owners[k] == i) for i in range(agents)]
+        cost = torch.stack([costs[i][share] for i, share in enumerate(shares)]).sum(0)
+        better = cost < best
+        best = torch.where(better, cost, best)
+        goal = torch.where(better, torch.stack([places[i][share] for i, share in enumerate(shares)]), goal)
+    return goal
+
+
+def _places(position: Tensor, landmark: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
+    """Return, for each agent and each set of landmarks (a bit mask), where to stand [2, W] and its cost [W]."""
+    landmarks = landmark.shape[0]
+    places, costs = [], []
+    for here in position:
+        own_places, own_costs = [here], [torch.zeros_like(here[0])]
+        for mask in range(1, 1 << landmarks):
+            share = landmark[[k for k in range(landmarks) if mask >> k & 1]]
+            spot = _best_spot(here, share)
+            remaining = (share - spot).norm(dim=1).sum(0)
+            own_places.append(spot)
+            own_costs.append(remaining + TRAVEL_WEIGHT * (spot - here).norm(dim=0))
+        places.append(own_places)
+        costs.append(own_costs)
+    return places, costs
+
+
+def _best_spot(here: Tensor, share: Tensor) -> Tensor:
+    """Return where an agent at `here` [2, W] stands best for its landmarks `share` [K, 2, W]."""
+    if len(share) == 2:
+        along = share[1] - share[0]
+        part = ((here - share[0]) * along).sum(0) / along.square().sum(0).clamp_min(1e-12)
+        return share[0] + part.clamp(0, 1) * along
+    sums = (share.unsqueeze(1) - share.unsqueeze(0)).norm(dim=2).sum(1)
+    return share.gather(0, sums.argmin(0).expand(1, 2, -1))[0]

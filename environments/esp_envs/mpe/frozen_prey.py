@@ -1,0 +1,104 @@
+"""A frozen learned prey: an MLP read from a safetensors policy file.
+
+The file is a policy as trained with `control="prey"`: tensors `actor.layers.{k}.weight` [S, in, out] and
+`actor.layers.{k}.bias` [S, 1, out], one policy per seed along the first axis, and a metadata entry `esp` with JSON that
+says what the file is. Reading it never runs code.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+_ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
+_FORMAT, _VERSION, _TASK, _NETWORK = "esp-policy", 1, "predator-prey", "mlp"
+
+
+class FrozenPrey:
+    """Greedy moves of a learned prey.
+
+    Raises:
+        ValueError: the file is missing, damaged, of something else, or does not fit the task.
+    """
+
+    def __init__(self, path: str, seed: int, num_inputs: int, num_actions: int, device: torch.device) -> None:
+        header, tensors = _read(path)
+        self._activation = _ACTIVATIONS[_checked(header, path)]
+        self.layers = [(w.to(device), b.to(device)) for w, b in _layers(tensors, seed, path)]
+        widths = [self.layers[0][0].shape[0], self.layers[-1][0].shape[1]]
+        if widths != [num_inputs, num_actions]:
+            raise ValueError(
+                f"the prey policy {path} maps {widths[0]} observations to {widths[1]} actions, this task's prey has "
+                f"{num_inputs} and {num_actions}; train a prey with the same predators and obstacles and discrete actions"
+            )
+
+    def moves(self, observation: Tensor) -> Tensor:
+        """Return the move with the largest logit.
+
+        Args:
+            observation: [W, D].
+
+        Returns:
+            [W] int64.
+        """
+        hidden = observation
+        for index, (weight, bias) in enumerate(self.layers):
+            if index:
+                hidden = self._activation(hidden)
+            hidden = torch.addmm(bias, hidden, weight)
+        return hidden.argmax(-1)
+
+
+def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
+    """Return the JSON header and the actor's tensors of a policy file."""
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise ValueError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys() if name.startswith("actor.layers.")}
+        header = json.loads(metadata.get("esp", "null"))
+    except (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"the prey policy {path} is damaged or no safetensors file ({error}); export it again") from error
+    if not isinstance(header, dict):
+        raise ValueError(f"the file {path} is no policy of this project (no 'esp' entry); give an exported prey policy")
+    return header, tensors
+
+
+def _checked(header: dict[str, object], path: str) -> str:
+    """Return the activation named in the header of a fitting policy."""
+    wanted = {"format": _FORMAT, "version": _VERSION, "task": _TASK, "network": _NETWORK}
+    for key, value in wanted.items():
+        if header.get(key) != value:
+            raise ValueError(f"the prey policy {path} has {key} {header.get(key)!r}, but a prey needs {value!r}")
+    activation = header.get("activation")
+    if not isinstance(activation, str) or activation not in _ACTIVATIONS:
+        raise ValueError(f"the prey policy {path} has activation {activation!r}; known are {', '.join(_ACTIVATIONS)}")
+    return activation
+
+
+def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tensor, Tensor]]:
+    """Return (weight [in, out], bias [1, out]) of one seed, layer by layer, after checking that they chain."""
+    names = [(f"actor.layers.{k}.weight", f"actor.layers.{k}.bias") for k in range(len(tensors) // 2)]
+    if not names or {name for pair in names for name in pair} != set(tensors):
+        raise ValueError(f"the prey policy {path} lacks a weight or bias of its actor's layers; export it again")
+    layers: list[tuple[Tensor, Tensor]] = []
+    for weight_name, bias_name in names:
+        weight, bias = tensors[weight_name], tensors[bias_name]
+        fits = weight.ndim == 3 and bias.shape == (weight.shape[0], 1, weight.shape[2])
+        if not fits or (layers and layers[-1][0].shape[1] != weight.shape[1]):
+            raise ValueError(
+                f"the prey policy {path} has layers that do not fit together ({weight_name} {tuple(weight.shape)}, "
+                f"{bias_name} {tuple(bias.shape)}); export it again"
+            )
+        if not 0 <= seed < len(weight):
+            raise ValueError(f"the prey policy {path} holds {len(weight)} seeds; prey_policy_seed {seed} is not among them")
+        layers.append((weight[seed].float(), bias[seed].float()))
+    if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
+        raise ValueError(f"the prey policy {path} holds numbers that are not finite; export it again")
+    return layers

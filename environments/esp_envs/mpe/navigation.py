@@ -1,0 +1,218 @@
+"""Cooperative navigation (MPE `simple_spread`): N agents cover L landmarks without bumping into each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import torch
+from pydantic import Field as Setting
+from torch import Tensor
+
+from esp_envs.base import Body, Scene
+from esp_envs.mpe import covering
+from esp_envs.mpe.particles import Bodies
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
+from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
+
+AGENT_RADIUS = 0.15
+SENSITIVITY = 5.0
+"""Acceleration of a full force, length / s^2."""
+OCCUPIED_WITHIN = 0.1
+"""A landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)."""
+LANDMARK_EXTENT = {"esp": 0.8, "pettingzoo": 1.0}
+_AGENT_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
+_LANDMARK_COLOR = "#404040"
+
+
+class NavigationSettings(ParticleSettings):
+    """What a user may change of `navigation`."""
+
+    num_agents: int = Setting(3, ge=1, le=8, description="N, learning agents; the paper has 2, 3 and 4")
+    num_landmarks: int | None = Setting(
+        None,
+        ge=1,
+        le=8,
+        description="L, landmarks; by default as many as agents, but 3 for 2 agents, which is what the paper's row fits",
+    )
+    landmark_extent: float | None = Setting(
+        None,
+        gt=0,
+        description="landmarks start in the square [-extent, extent]^2 (lengths); 0.8 by default, 1.0 for pettingzoo",
+    )
+    local_ratio: float = Setting(
+        0.5, ge=0, le=1, description="pettingzoo convention only: weight of the own collisions against the team's term"
+    )
+
+    @property
+    def landmarks(self) -> int:
+        """L with its default filled in."""
+        return self.num_landmarks or (3 if self.num_agents == 2 else self.num_agents)
+
+    @property
+    def extent(self) -> float:
+        """The landmark extent with its default filled in."""
+        return self.landmark_extent or LANDMARK_EXTENT[self.convention]
+
+
+class Navigation(ParticleTask):
+    """Cooperative navigation, MPE's `simple_spread`.
+
+    N agents (discs of radius 0.15, mass 1) shall between them stand on L landmarks and not touch each other. The plane
+    is unbounded; lengths have no physical unit, a step is 0.1 s. `physics` is in `particles.py`.
+
+    Actions:
+        discrete: 0 no-op, 1 left, 2 right, 3 down, 4 up: a force of acceleration 5.0 length/s^2 in that direction.
+        continuous: `force`, a vector in the unit disc times 5.0 length/s^2; longer vectors are scaled back to 1.
+
+    Observation of one agent, 2 + L + (N - 1) planar vectors (N = L = 3: 14 numbers):
+
+        | index (N = L = 3) | field          | meaning                                          | unit     |
+        |-------------------|----------------|--------------------------------------------------|----------|
+        | 0..1              | velocity       | own velocity                                     | length/s |
+        | 2..3              | position       | own position                                     | length   |
+        | 4..9              | landmarks      | each landmark minus own position                 | length   |
+        | 10..13            | others         | each other agent, in index order, minus own pos. | length   |
+
+    State: velocities of all agents, positions of all agents, positions of the landmarks, in the world frame.
+
+    Reward, after the move, with d(j, l) the distance between agent j and landmark l, c_i the agents whose centres are
+    nearer than 0.3 to agent i:
+        convention `esp` (paper; original MPE): every agent gets sum_i [ -sum_l min_j d(j, l) - c_i - 1 ]
+            = -N sum_l min_j d(j, l) - 2 (colliding pairs) - N; the -1 is the original's "collision with itself".
+        convention `pettingzoo` (mpe2): agent i gets
+            -(1 - local_ratio) sum_l min_j d(j, l) - local_ratio c_i.
+
+    Start: velocities zero, agents uniform in [-1, 1]^2, landmarks uniform in [-0.8, 0.8]^2 (`esp`) or [-1, 1]^2
+    (`pettingzoo`). In the `esp` convention the velocity is updated before the position, as in the original MPE; in the
+    `pettingzoo` convention after it, as in mpe2.
+
+    Terminated: never. Truncated: after `horizon` = 25 steps; bootstrap there.
+
+    Metrics a step: `collisions` (touching pairs of agents), `landmark_distance` (mean over landmarks of the distance to
+    the nearest agent, length), `coverage` (share of landmarks with an agent within 0.1).
+
+    Symmetry: dynamics and reward are invariant under all rotations and reflections of the plane; five discrete moves
+    carry those of the square (`d4`), a planar force carries all (`o2`).
+
+    Heuristics: `greedy` (each agent takes a landmark of its own), `cover` (agents share out all landmarks
+    between them, for L > N).
+
+    Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, greedy -112.
+
+    Versions:
+        1: first.
+    """
+
+    Settings: ClassVar[type[NavigationSettings]] = NavigationSettings
+    heuristics: ClassVar[tuple[str, ...]] = ("greedy", "cover")
+    settings: NavigationSettings
+
+    def __init__(self, settings: NavigationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        agents, landmarks = settings.num_agents, settings.landmarks
+        bodies = Bodies(
+            radius=(AGENT_RADIUS,) * agents + (0.05,) * landmarks,
+            gain=(SENSITIVITY,) * agents,
+            max_speed=None,
+            contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
+            watched=tuple((a, agents + k) for a in range(agents) for k in range(landmarks)),
+        )
+        self._extents = (1.0,) * agents + (settings.extent,) * landmarks
+        self._build(_spec(settings), bodies)
+        # [N, pairs]: which agents take part in which pair
+        self._takes_part = torch.zeros(agents, len(bodies.contacts), device=self.device)
+        for pair, (a, b) in enumerate(bodies.contacts):
+            self._takes_part[a, pair] = self._takes_part[b, pair] = 1.0
+
+    def observation_of(self, state: Tensor) -> Tensor:
+        """Return all observations [..., N * D] in a global state [..., width]."""
+        agents = self.settings.num_agents
+        rows = state.unflatten(-1, (-1, 2))
+        velocity, position, landmark = rows.split((agents, agents, self.settings.landmarks), dim=-2)
+        parts = []
+        for i in range(agents):
+            here = position[..., i, :]
+            others = [position[..., j, :] - here for j in range(agents) if j != i]
+            parts += [velocity[..., i, :], here, (landmark - here.unsqueeze(-2)).flatten(-2), *others]
+        return torch.cat(parts, dim=-1)
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of `greedy` (default) or `cover`."""
+        name = name or self.heuristics[0]
+        worlds, agents = self.worlds, self.settings.num_agents
+        position, landmark = worlds.position, worlds.entity[agents:]
+        if name == "greedy":
+            goal = covering.one_each(position, landmark)
+        elif name == "cover":
+            goal = covering.shared_out(position, landmark)
+        else:
+            raise ValueError(f"navigation has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        return self._to_action(covering.approach(goal, position, worlds.velocity))
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return landmarks and agents of one world."""
+        lane = world[0] * self.num_envs + world[1]
+        places = self.worlds.entity[:, :, lane].tolist()
+        agents = self.settings.num_agents
+        bodies = [Body((x, y), 0.05, _LANDMARK_COLOR, shape="cross") for x, y in places[agents:]]
+        bodies += [
+            Body((x, y), AGENT_RADIUS, color, trail=True)
+            for (x, y), color in zip(places[:agents], _AGENT_COLORS, strict=False)
+        ]
+        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4))
+
+    def _start(self, seed: int, lanes: slice) -> None:
+        place(self.worlds, lanes, self._extents, self.generators[seed])
+
+    def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
+        agents, landmarks = self.settings.num_agents, self.settings.landmarks
+        pairs = len(self.worlds.bodies.contacts)
+        squared = self.worlds.squared_distance
+        bumps = (squared[:pairs] < (2 * AGENT_RADIUS) ** 2).float()
+        collisions = bumps.sum(0)
+        nearest = squared[pairs:].view(agents, landmarks, -1).amin(0).sqrt_()
+        distance = nearest.sum(0)
+        if self.settings.convention == "esp":
+            reward = (distance * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)
+        else:
+            ratio = self.settings.local_ratio
+            reward = torch.addmm(distance.expand(agents, -1), self._takes_part, bumps, beta=ratio - 1, alpha=-ratio)
+        coverage = (nearest < OCCUPIED_WITHIN).float().mean(0)
+        metrics = {"collisions": collisions, "landmark_distance": distance / landmarks, "coverage": coverage}
+        return reward, metrics
+
+
+def _spec(settings: NavigationSettings) -> TaskSpec:
+    """Return the spec that follows from the settings."""
+    agents, landmarks = settings.num_agents, settings.landmarks
+    discrete = settings.actions == "discrete"
+    esp = settings.convention == "esp"
+    return TaskSpec(
+        name="navigation",
+        version=1,
+        convention="esp: team sum, self-collision counted" if esp else f"pettingzoo: local_ratio {settings.local_ratio}",
+        num_agents=agents,
+        horizon=settings.horizon,
+        observation=_observation_layout(agents, landmarks),
+        state=layout(
+            Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
+            Field("position", Kind.VECTOR, agents, "length", Items.AGENTS),
+            Field("landmarks", Kind.VECTOR, landmarks, "length"),
+        ),
+        action=MOVES if discrete else FORCE,
+        symmetry="d4" if discrete else "o2",
+        shared_reward=esp,
+        settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
+    )
+
+
+def _observation_layout(agents: int, landmarks: int) -> Layout:
+    fields = [
+        Field("velocity", Kind.VECTOR, 1, "length/s"),
+        Field("position", Kind.VECTOR, 1, "length"),
+        Field("landmarks", Kind.VECTOR, landmarks, "length"),
+    ]
+    if agents > 1:
+        fields.append(Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS))
+    return layout(*fields)

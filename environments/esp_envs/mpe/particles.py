@@ -1,0 +1,183 @@
+"""Point bodies with soft contacts: the physics of the multi-agent particle environment (MPE), many worlds at once.
+
+Every world holds A moving agents and L fixed landmarks. One tensor `physics` of shape [2A + L, 2, W] keeps all worlds,
+worlds last: an elementwise operation then runs over long contiguous rows, and everything that is a sum of differences
+of physics rows (pair offsets, summed contact forces, observations) is one small matrix product.
+
+One step of MPE (Lowe et al. 2017, `multiagent/core.py`), which is what papers of that time measured on:
+
+    velocity <- (1 - DAMPING) * velocity + DT_S * (control * gain + contact forces)
+    velocity <- velocity * min(1, max_speed / |velocity|)
+    position <- position + DT_S * velocity
+
+The packages that keep MPE alive (PettingZoo since 1.23, mpe2) move the position first, by the old velocity, so an action
+shows one step later; `velocity_first=False` does the same. Two bodies that collide push each other apart along the
+line between their centres with CONTACT_FORCE * CONTACT_MARGIN * softplus(-gap / CONTACT_MARGIN), where `gap` is the
+distance between their rims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+DT_S = 0.1
+"""Simulated seconds of one step."""
+DAMPING = 0.25
+"""Share of the velocity lost in one step."""
+CONTACT_FORCE = 1e2
+"""Stiffness of a contact, force per length of overlap."""
+CONTACT_MARGIN = 1e-3
+"""Length over which a contact fades in."""
+
+LANE_MULTIPLE = 64
+"""The worlds axis is padded to a multiple of this, so that vector code never runs a scalar tail: the numbers of a world
+do not depend on how many worlds stand beside it."""
+_SOFTPLUS_LINEAR = 20.0
+"""Above this softplus(x) equals x in float32."""
+_SMALLEST_SQUARED_DISTANCE = 1e-24
+"""Keeps the direction of a contact finite when two centres coincide (the force is then zero)."""
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """What the bodies of a world are.
+
+    Attributes:
+        radius: one per entity, agents first and landmarks after them, in lengths.
+        gain: one per agent, acceleration of a full control (MPE's `sensitivity` or `accel`), length / s^2.
+        max_speed: one per agent in length / s, or None where speed is not limited.
+        contacts: pairs (a, b) of entities that push each other apart; a is an agent.
+        watched: further pairs (a, b) whose distance the task wants to know; they exert no force.
+    """
+
+    radius: tuple[float, ...]
+    gain: tuple[float, ...]
+    max_speed: tuple[float, ...] | None
+    contacts: tuple[tuple[int, int], ...]
+    watched: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def num_agents(self) -> int:
+        """A, the moving bodies."""
+        return len(self.gain)
+
+    @property
+    def num_landmarks(self) -> int:
+        """L, the fixed bodies."""
+        return len(self.radius) - len(self.gain)
+
+
+class ParticleWorlds:
+    """W worlds of the same bodies.
+
+    Attributes:
+        physics: [2A + L, 2, W'] float32; rows are the agents' velocities, the agents' positions, the landmarks'
+            positions; W' is W padded up (see LANE_MULTIPLE). `velocity`, `position` and `entity` are views of it.
+        squared_distance: [P, W'] of the pairs in `contacts` and `watched`, in that order, for the present positions.
+
+    Whoever writes to `physics` calls `measure` afterwards.
+    """
+
+    def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:
+        self.bodies = bodies
+        self.velocity_first = velocity_first
+        self.num_worlds = num_worlds
+        self.num_lanes = -(-num_worlds // LANE_MULTIPLE) * LANE_MULTIPLE
+        agents, lanes = bodies.num_agents, self.num_lanes
+        self.physics = torch.zeros(2 * agents + bodies.num_landmarks, 2, lanes, device=device)
+        self.velocity = self.physics[:agents]
+        self.position = self.physics[agents : 2 * agents]
+        self.entity = self.physics[agents:]
+        self._num_contacts = len(bodies.contacts)
+        self._differences = _difference_matrix([*bodies.contacts, *bodies.watched], len(bodies.radius)).to(device)
+        pushes = self._differences[: self._num_contacts, :agents].t()
+        self._pushes = pushes.contiguous()
+        touching = torch.tensor([bodies.radius[a] + bodies.radius[b] for a, b in bodies.contacts])
+        self._touching = _rows(touching / CONTACT_MARGIN, lanes).to(device)
+        self._gain = _rows(torch.tensor(bodies.gain) * DT_S, lanes).unsqueeze(1).repeat(1, 2, 1).to(device)
+        limit = None if bodies.max_speed is None else _rows(torch.tensor(bodies.max_speed), lanes).to(device)
+        self._max_speed = limit
+        self.measure()
+
+    def rows(self) -> Tensor:
+        """Return the physics of the real worlds as a view of shape [2 (2A + L), W]."""
+        return self.physics.view(-1, self.num_lanes)[:, : self.num_worlds]
+
+    def measure(self) -> None:
+        """Compute the pair offsets and distances of the present positions."""
+        self._offset = exact_matmul(self._differences, self.entity.view(-1, 2 * self.num_lanes)).view(
+            -1, 2, self.num_lanes
+        )
+        square = self._offset.square()
+        self.squared_distance = square[:, 0] + square[:, 1]
+
+    def advance(self, control: Tensor) -> None:
+        """Advance all worlds by DT_S.
+
+        Args:
+            control: [A, 2, W'] wish of each agent in units of its gain, normally of length <= 1.
+        """
+        contact = self._contact_impulses()
+        if not self.velocity_first:
+            self.position.add_(self.velocity, alpha=DT_S)
+        self.velocity.mul_(1 - DAMPING).addcmul_(control, self._gain).add_(contact)
+        if self._max_speed is not None:
+            square = self.velocity.square()
+            speed = (square[:, 0] + square[:, 1]).sqrt_()
+            self.velocity.mul_((self._max_speed / speed).clamp_max_(1.0).unsqueeze(1))
+        if self.velocity_first:
+            self.position.add_(self.velocity, alpha=DT_S)
+        self.measure()
+
+    def _contact_impulses(self) -> Tensor:
+        """Return the velocity change [A, 2, W'] that contacts cause in one step, from the measured pairs."""
+        pairs = self._num_contacts
+        distance = self.squared_distance[:pairs].clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
+        overlap = torch.add(self._touching, distance, alpha=-1 / CONTACT_MARGIN)
+        # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.
+        softplus = overlap.clamp_max(_SOFTPLUS_LINEAR).exp_().log1p_()
+        torch.maximum(softplus, overlap, out=softplus)
+        strength = softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
+        push = self._offset[:pairs] * strength.unsqueeze(1)
+        return exact_matmul(self._pushes, push.view(pairs, -1)).view(-1, 2, self.num_lanes)
+
+
+def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
+    """Multiply float32 matrices in full float32, even where PyTorch was told to round matrix products.
+
+    A learner may have switched on TF32, bfloat16 products or autocast for its networks; physics and observations must
+    not be rounded by that, so the product is then taken in float64.
+    """
+    kind = left.device.type
+    backend = torch.backends.cuda.matmul if kind == "cuda" else torch.backends.mkldnn.matmul
+    if backend.fp32_precision in ("none", "ieee") and not torch.is_autocast_enabled(kind):
+        return left @ right
+    return (left.double() @ right.double()).float()
+
+
+def linear_matrix(function: Callable[[Tensor], Tensor], num_inputs: int) -> Tensor:
+    """Return the matrix [inputs, outputs] of a linear function by applying it to the basis vectors.
+
+    Args:
+        function: maps [..., inputs] to [..., outputs] linearly.
+        num_inputs: width of its argument.
+    """
+    return function(torch.eye(num_inputs))
+
+
+def _difference_matrix(pairs: Sequence[tuple[int, int]], num_entities: int) -> Tensor:
+    """Return [pairs, entities] with +1 at a and -1 at b: times the positions it gives position[a] - position[b]."""
+    matrix = torch.zeros(len(pairs), num_entities)
+    for row, (a, b) in enumerate(pairs):
+        matrix[row, a] += 1
+        matrix[row, b] -= 1
+    return matrix
+
+
+def _rows(values: Tensor, lanes: int) -> Tensor:
+    """Repeat one number per row along the worlds: contiguous operands keep elementwise code vectorised."""
+    return values.to(torch.float32).unsqueeze(1).repeat(1, lanes)

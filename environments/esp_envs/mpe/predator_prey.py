@@ -1,0 +1,310 @@
+"""Predator-prey (MPE `simple_tag`): slow predators hunt a faster prey among obstacles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field as Setting
+from pydantic import model_validator
+from torch import Tensor
+
+from esp_envs.base import Body, Scene
+from esp_envs.mpe.chase import chase, flee
+from esp_envs.mpe.frozen_prey import FrozenPrey
+from esp_envs.mpe.particles import Bodies
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, move_control, nearest_move, place, unit_disc
+from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
+
+PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
+PREDATOR_GAIN, PREY_GAIN = 3.0, 4.0
+"""Acceleration of a full force, length / s^2."""
+PREDATOR_MAX_SPEED, PREY_MAX_SPEED = 1.0, 1.3
+"""length / s."""
+OBSTACLE_EXTENT = 0.9
+TOUCH_REWARD = 10.0
+
+
+class PredatorPreySettings(ParticleSettings):
+    """What a user may change of `predator-prey`."""
+
+    num_predators: int = Setting(3, ge=1, le=8, description="predators; 3 in the paper")
+    num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
+    control: Literal["predators", "prey"] = Setting(
+        "predators", description="who learns; with 'prey' the predators follow the greedy heuristic"
+    )
+    prey: Literal["random", "fleeing", "still", "policy"] = Setting(
+        "random", description="who drives the prey while the predators learn"
+    )
+    prey_policy: str | None = Setting(None, description="safetensors policy file, for prey 'policy' only")
+    prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
+
+    @model_validator(mode="after")
+    def _policy_goes_with_its_file(self) -> PredatorPreySettings:
+        if self.control == "prey" and self.prey != "random":
+            raise ValueError("with control 'prey' the prey is the learner; leave the setting prey out")
+        if (self.prey == "policy") != (self.prey_policy is not None):
+            raise ValueError("prey 'policy' and the file prey_policy go together; give both or neither")
+        return self
+
+
+class PredatorPrey(ParticleTask):
+    """Predator-prey, MPE's `simple_tag`.
+
+    Predators (radius 0.075, acceleration 3 length/s^2, at most 1.0 length/s) hunt one prey (0.05, 4, 1.3) among
+    obstacles (0.2). All bodies push each other apart. The plane is unbounded; lengths have no physical unit, a step is
+    0.1 s.
+
+    Actions, of each predator (of the prey with `control="prey"`):
+        discrete: 0 no-op, 1 left, 2 right, 3 down, 4 up: full acceleration in that direction.
+        continuous: `force`, a vector in the unit disc times the full acceleration; longer vectors are scaled to 1.
+
+    Observation of a predator, 2 + L + (N - 1) + 2 planar vectors (N = 3, L = 2: 16 numbers):
+
+        | index (N = 3, L = 2) | field         | meaning                                            | unit     |
+        |----------------------|---------------|----------------------------------------------------|----------|
+        | 0..1                 | velocity      | own velocity                                       | length/s |
+        | 2..3                 | position      | own position                                       | length   |
+        | 4..7                 | obstacles     | each obstacle minus own position                   | length   |
+        | 8..11                | predators     | each other predator, in index order, minus own pos.| length   |
+        | 12..13               | prey          | prey minus own position                            | length   |
+        | 14..15               | prey_velocity | velocity of the prey                               | length/s |
+
+    Observation of the prey: own velocity, own position, obstacles and predators relative to it; no velocities of others.
+
+    State: velocities of predators and of the prey, positions of predators and of the prey, positions of the obstacles.
+
+    Reward, after the move, a touch being a predator whose centre is nearer than 0.125 to the prey's:
+        predators: each gets 10 x (number of touches).
+        prey (`control="prey"`): -10 x touches - bound(|x|) - bound(|y|), with bound(u) = 0 below 0.9, 10 (u - 0.9)
+            below 1, then min(exp(2u - 2), 10).
+
+    Prey, when the predators learn: `random` draws one of the five moves each step (with continuous actions: no-op with
+    probability 1/5, else full force in a uniform direction; both leave the game symmetric), `fleeing` runs from the
+    nearest predator, and back towards the origin when farther than 0.9 from it, `still` exerts no force (it can be pushed), `policy` is a frozen
+    learned prey. The random prey's moves are drawn at the start of an episode: `prey_moves`.
+
+    Start: velocities zero, all agents uniform in [-1, 1]^2, obstacles uniform in [-0.9, 0.9]^2. Conventions differ in the
+    order of integration only: `esp` updates the velocity first (original MPE), `pettingzoo` the position (mpe2).
+
+    Terminated: never. Truncated: after `horizon` = 25 steps; bootstrap there.
+
+    Metrics a step: `contact` (1 where any predator touches the prey), `touches` (their number).
+
+    Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
+    `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`) need not be
+    equivariant: then the symmetry holds for physics and reward, but the prey breaks it.
+
+    Heuristics: `greedy` (predators run at the prey; with `control="prey"`: the fleeing prey).
+
+    Anchors, `esp` convention, return of one predator per episode against the random prey: random 2.9, greedy 89
+    (against the fleeing prey 63, against a still one 168).
+
+    Versions:
+        1: first.
+    """
+
+    Settings: ClassVar[type[PredatorPreySettings]] = PredatorPreySettings
+    heuristics: ClassVar[tuple[str, ...]] = ("greedy",)
+    settings: PredatorPreySettings
+
+    def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        predators, obstacles = settings.num_predators, settings.num_obstacles
+        agents = predators + 1
+        touches = tuple((a, predators) for a in range(predators))
+        shoves = [(a, b) for a in range(predators) for b in range(a + 1, predators)]
+        bumps = [(a, agents + k) for a in range(agents) for k in range(obstacles)]
+        bodies = Bodies(
+            radius=(PREDATOR_RADIUS,) * predators + (PREY_RADIUS,) + (OBSTACLE_RADIUS,) * obstacles,
+            gain=(PREDATOR_GAIN,) * predators + (PREY_GAIN,),
+            max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
+            contacts=(*touches, *shoves, *bumps),
+        )
+        self._extents = (1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles
+        self._prey_learns = settings.control == "prey"
+        self._build(_spec(settings), bodies, first_learner=predators if self._prey_learns else 0)
+        self._prey_plan = torch.zeros(settings.horizon, 2, self.worlds.num_lanes, device=self.device)
+        self._frozen: FrozenPrey | None = None
+        if settings.prey_policy is not None:
+            width = _prey_layout(settings).width
+            seed = settings.prey_policy_seed
+            self._frozen = FrozenPrey(settings.prey_policy, seed, width, MOVES.count, self.device)
+
+    @property
+    def prey_moves(self) -> Tensor:
+        """The random prey's controls of this episode, a view [horizon, S, E, 2] that may be written to."""
+        real = self._prey_plan[:, :, : self.worlds.num_worlds]
+        return real.unflatten(2, (self.num_seeds, self.num_envs)).permute(0, 2, 3, 1)
+
+    def observation_of(self, state: Tensor) -> Tensor:
+        """Return all observations [..., N * D] in a global state [..., width]."""
+        if self._prey_learns:
+            return self.prey_observation_of(state)
+        predators = self.settings.num_predators
+        velocity, position, obstacle = self._split(state)
+        prey, prey_velocity = position[..., predators, :], velocity[..., predators, :]
+        parts = []
+        for i in range(predators):
+            here = position[..., i, :]
+            others = [position[..., j, :] - here for j in range(predators) if j != i]
+            obstacles = (obstacle - here.unsqueeze(-2)).flatten(-2)
+            parts += [velocity[..., i, :], here, obstacles, *others, prey - here, prey_velocity]
+        return torch.cat(parts, dim=-1)
+
+    def prey_observation_of(self, state: Tensor) -> Tensor:
+        """Return the prey's observation [..., D] in a global state [..., width]."""
+        predators = self.settings.num_predators
+        velocity, position, obstacle = self._split(state)
+        here = position[..., predators, :]
+        obstacles = (obstacle - here.unsqueeze(-2)).flatten(-2)
+        others = (position[..., :predators, :] - here.unsqueeze(-2)).flatten(-2)
+        return torch.cat([velocity[..., predators, :], here, obstacles, others], dim=-1)
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of `greedy`: the chase, or the flight with `control="prey"`."""
+        if name not in (None, *self.heuristics):
+            raise ValueError(f"predator-prey has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        return self._to_action(self._flight() if self._prey_learns else self._chase())
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return obstacles, predators and prey of one world."""
+        lane = world[0] * self.num_envs + world[1]
+        places = self.worlds.entity[:, :, lane].tolist()
+        predators = self.settings.num_predators
+        bodies = [Body((x, y), OBSTACLE_RADIUS, "#808890") for x, y in places[predators + 1 :]]
+        bodies += [Body((x, y), PREDATOR_RADIUS, "#d84a3f", trail=True) for x, y in places[:predators]]
+        (x, y) = places[predators]
+        bodies.append(Body((x, y), PREY_RADIUS, "#3fa86a", trail=True))
+        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return physics, clock, generators and the random prey's plan."""
+        return super().state_dict() | {"prey_plan": self._prey_plan.clone()}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(tensors)
+        self._prey_plan.copy_(tensors["prey_plan"])
+
+    def _split(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return velocities and positions of predators and prey, and obstacles, each [..., items, 2]."""
+        agents = self.settings.num_predators + 1
+        rows = state.unflatten(-1, (-1, 2))
+        velocity, position, obstacle = rows.split((agents, agents, self.settings.num_obstacles), dim=-2)
+        return velocity, position, obstacle
+
+    def _start(self, seed: int, lanes: slice) -> None:
+        generator = self.generators[seed]
+        place(self.worlds, lanes, self._extents, generator)
+        if self._prey_learns or self.settings.prey != "random":
+            return
+        shape, device = (self.settings.horizon, self.num_envs), self.device
+        move = torch.randint(MOVES.count, shape, generator=generator, device=device)
+        if self.settings.actions == "discrete":
+            plan = move_control(move)
+        else:
+            angle = torch.rand(shape, generator=generator, device=device) * (2 * math.pi)
+            plan = torch.stack([angle.cos(), angle.sin()], dim=1) * (move != 0).unsqueeze(1)
+        self._prey_plan[:, :, lanes] = plan
+
+    def _drive(self) -> None:
+        """Set the controls of whoever does not learn."""
+        predators = self.settings.num_predators
+        if self._prey_learns:
+            self._control[:predators] = self._as_control(self._chase())
+        elif self.settings.prey == "random":
+            self._control[predators] = self._prey_plan[self._time]
+        elif self.settings.prey == "fleeing":
+            self._control[predators:] = self._as_control(self._flight())
+        elif self._frozen is not None:
+            moves = self._frozen.moves(self.prey_observation_of(self.worlds.rows().t()))
+            self._control[predators:, :, : self.worlds.num_worlds] = move_control(moves.unsqueeze(0))
+
+    def _as_control(self, wish: Tensor) -> Tensor:
+        return move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)
+
+    def _chase(self) -> Tensor:
+        predators, worlds = self.settings.num_predators, self.worlds
+        position, velocity = worlds.position, worlds.velocity
+        return chase(position[:predators], velocity[:predators], position[predators], velocity[predators])
+
+    def _flight(self) -> Tensor:
+        predators, position = self.settings.num_predators, self.worlds.position
+        return flee(position[:predators], position[predators]).unsqueeze(0)
+
+    def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
+        predators = self.settings.num_predators
+        touching = self.worlds.squared_distance[:predators] < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
+        touches = touching.float().sum(0)
+        metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
+        reward = touches * TOUCH_REWARD
+        if self._prey_learns:
+            reward = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
+        return reward.unsqueeze(0), metrics
+
+
+def out_of_bounds(position: Tensor) -> Tensor:
+    """Return MPE's penalty per coordinate: 0 below 0.9, 10 (u - 0.9) below 1, then min(exp(2u - 2), 10), u = |x|."""
+    u = position.abs()
+    return torch.where(u < 1.0, (u - 0.9).clamp_min(0.0) * 10, (2 * u - 2).exp().clamp_max(10.0))
+
+
+def _spec(settings: PredatorPreySettings) -> TaskSpec:
+    """Return the spec that follows from the settings."""
+    prey_learns, discrete = settings.control == "prey", settings.actions == "discrete"
+    order = "velocity first" if settings.convention == "esp" else "position first"
+    reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
+    opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
+    return TaskSpec(
+        name="predator-prey",
+        version=1,
+        convention=f"{settings.convention}: {reward}, {opponent}, {order}",
+        num_agents=1 if prey_learns else settings.num_predators,
+        horizon=settings.horizon,
+        observation=_prey_layout(settings) if prey_learns else _predator_layout(settings),
+        state=_state_layout(settings),
+        action=MOVES if discrete else FORCE,
+        symmetry="d4" if discrete or prey_learns else "o2",
+        shared_reward=True,
+        settings=settings.model_dump(),
+    )
+
+
+def _predator_layout(settings: PredatorPreySettings) -> Layout:
+    return _fields(
+        Field("velocity", Kind.VECTOR, 1, "length/s"),
+        Field("position", Kind.VECTOR, 1, "length"),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("predators", Kind.VECTOR, settings.num_predators - 1, "length", Items.OTHERS),
+        Field("prey", Kind.VECTOR, 1, "length"),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s"),
+    )
+
+
+def _prey_layout(settings: PredatorPreySettings) -> Layout:
+    return _fields(
+        Field("velocity", Kind.VECTOR, 1, "length/s"),
+        Field("position", Kind.VECTOR, 1, "length"),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("predators", Kind.VECTOR, settings.num_predators, "length"),
+    )
+
+
+def _state_layout(settings: PredatorPreySettings) -> Layout:
+    predators = settings.num_predators
+    hunters, hunted = (Items.FIXED, Items.AGENTS) if settings.control == "prey" else (Items.AGENTS, Items.FIXED)
+    return _fields(
+        Field("velocity", Kind.VECTOR, predators, "length/s", hunters),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted),
+        Field("position", Kind.VECTOR, predators, "length", hunters),
+        Field("prey_position", Kind.VECTOR, 1, "length", hunted),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+    )
+
+
+def _fields(*fields: Field) -> Layout:
+    """Build a layout without its empty fields."""
+    return layout(*(f for f in fields if f.count))

@@ -1,0 +1,227 @@
+"""What the particle tasks share: lockstep episodes, fast readouts, actions, saving and restoring.
+
+All worlds begin and end an episode together, so the clock is one Python integer and no device is ever asked whether an
+episode is over. All random numbers of an episode are drawn at its start, from each seed's own generator.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field as Setting
+from torch import Tensor
+
+from esp_envs.base import Environment, Observation, Step, TaskSettings
+from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
+
+STILL = (0.0, 0.0)
+MOVES = Discrete(Kind.VECTOR, (STILL, LEFT, RIGHT, DOWN, UP), ("no-op", "left", "right", "down", "up"))
+"""The five discrete actions in MPE's order; the meaning of each is the direction of its force."""
+FORCE = Continuous(layout(Field("force", Kind.VECTOR, 1, "share of the full force")))
+"""The continuous action: one force in the unit disc."""
+
+
+class ParticleSettings(TaskSettings):
+    """What all particle tasks let a user change."""
+
+    convention: Literal["esp", "pettingzoo"] = Setting(
+        "esp",
+        description="whose rules: 'esp' is the original MPE as the paper used it, 'pettingzoo' the later mpe2 package",
+    )
+    actions: Literal["discrete", "continuous"] = Setting(
+        "discrete", description="five moves, or a planar force in the unit disc"
+    )
+    horizon: int = Setting(25, ge=1, description="steps of an episode (0.1 s each); 25 in MPE")
+
+
+class ParticleTask(Environment):
+    """A batch of particle worlds in lockstep.
+
+    A subclass builds `spec`, calls `_build`, and implements the methods below that are abstract. Its state is laid out
+    like the rows of `ParticleWorlds.physics`.
+    """
+
+    settings: ParticleSettings
+
+    def _build(self, spec: TaskSpec, bodies: Bodies, first_learner: int = 0) -> None:
+        """Make the worlds.
+
+        Args:
+            spec: the finished spec.
+            bodies: what the worlds hold.
+            first_learner: index of the first agent that learns; the others are driven by the task.
+        """
+        self.spec = spec
+        velocity_first = self.settings.convention == "esp"
+        self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
+        self._learners = slice(first_learner, first_learner + spec.num_agents)
+        self._time = 0
+        lanes = self.worlds.num_lanes
+        self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
+        self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
+        backward = [MOVES.points.index(LEFT), MOVES.points.index(DOWN)]
+        forward = [MOVES.points.index(RIGHT), MOVES.points.index(UP)]
+        self._backward = torch.tensor(backward, dtype=torch.int8, device=self.device).view(1, 2, 1)
+        self._forward = torch.tensor(forward, dtype=torch.int8, device=self.device).view(1, 2, 1)
+        self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
+
+    @abstractmethod
+    def observation_of(self, state: Tensor) -> Tensor:
+        """Return all observations in a global state, written to be read: the fast path is derived from it.
+
+        Args:
+            state: [..., state width]; the result is linear in it.
+
+        Returns:
+            [..., N * D].
+        """
+
+    @abstractmethod
+    def _start(self, seed: int, lanes: slice) -> None:
+        """Draw a new episode for the worlds `lanes` of one seed into the physics (velocities are already zero)."""
+
+    @abstractmethod
+    def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the reward [N or 1, W'] and the metrics (each [W']) of the step just made; W' counts padded lanes."""
+
+    def _drive(self) -> None:
+        """Fill the controls of the agents that do not learn."""
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        self._time = 0
+        self.worlds.velocity.zero_()
+        for seed in range(self.num_seeds):
+            self._start(seed, slice(seed * self.num_envs, (seed + 1) * self.num_envs))
+        self.worlds.measure()
+        return self._observe()
+
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one step; see the class for the action."""
+        self._act(action)
+        self._drive()
+        self.worlds.advance(self._control)
+        self._time += 1
+        reward, metrics = self._outcome()
+        following, final = self._observe(), None
+        ended = self._time == self.spec.horizon
+        if ended:
+            final, following = following, self.reset()
+        shape = (self.num_seeds, self.num_envs)
+        return Step(
+            next=following,
+            reward=self._per_world(reward.expand(self.spec.num_agents, -1).t()),
+            terminated=torch.zeros(shape, dtype=torch.bool, device=self.device),
+            truncated=torch.full(shape, ended, dtype=torch.bool, device=self.device),
+            final=final,
+            metrics={name: self._per_world(value) for name, value in metrics.items()},
+        )
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state at the start of an episode."""
+        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
+        if tuple(state.shape) != expected:
+            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
+        self._time = 0
+        self.worlds.rows().copy_(state.reshape(-1, self.spec.state.width).t())
+        self.worlds.measure()
+        return self._observe()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return physics, clock and generators."""
+        return {
+            "physics": self.worlds.physics.clone(),
+            "time": torch.tensor(self._time),
+            "generators": torch.stack([g.get_state() for g in self.generators]),
+        }
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: the tensors belong to an environment of another size.
+        """
+        physics, states = tensors["physics"], tensors["generators"]
+        if physics.shape != self.worlds.physics.shape or len(states) != self.num_seeds:
+            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+        self.worlds.physics.copy_(physics)
+        self._time = int(tensors["time"])
+        for generator, state in zip(self.generators, states, strict=True):
+            generator.set_state(state.cpu())
+        self.worlds.measure()
+
+    def _observe(self) -> Observation:
+        rows = self.worlds.rows().t()
+        lead = (self.num_seeds, self.num_envs)
+        obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
+        return Observation(obs, rows.contiguous().view(*lead, -1))
+
+    def _act(self, action: Tensor) -> None:
+        """Write the learners' actions into the controls."""
+        learners, worlds = self.spec.num_agents, self.worlds.num_worlds
+        control = self._control[self._learners]
+        if self.settings.actions == "discrete":
+            self._moves[:, 0, :worlds] = action.reshape(worlds, learners).t()
+            steps = (self._moves == self._forward).view(torch.int8) - (self._moves == self._backward).view(torch.int8)
+            control.copy_(steps)
+        else:
+            force = action.reshape(worlds, learners, 2)
+            length = force.norm(dim=-1, keepdim=True).clamp_min(1.0)
+            control[:, :, :worlds] = (force / length).permute(1, 2, 0)
+
+    def _to_action(self, wish: Tensor) -> Tensor:
+        """Turn wishes [N, 2, W'] (1 is a full force) into a joint action of this task's kind."""
+        lead = (self.num_seeds, self.num_envs, self.spec.num_agents)
+        wish = wish[:, :, : self.worlds.num_worlds]
+        if self.settings.actions == "discrete":
+            return nearest_move(wish).t().reshape(lead)
+        return unit_disc(wish).permute(2, 0, 1).reshape(*lead, 2)
+
+    def _per_world(self, values: Tensor) -> Tensor:
+        """Return [S, E, ...] of the real worlds from [W', ...], as memory of its own."""
+        return values[: self.worlds.num_worlds].contiguous().view(self.num_seeds, self.num_envs, *values.shape[1:])
+
+
+def move_control(moves: Tensor) -> Tensor:
+    """Return the unit controls [N, 2, W] of discrete moves [N, W]."""
+    return torch.tensor(MOVES.points, device=moves.device)[moves].movedim(-1, 1)
+
+
+MOVE_THRESHOLD = 0.25
+"""A wish shorter than this along both axes becomes a no-op."""
+
+
+def nearest_move(wish: Tensor) -> Tensor:
+    """Return the discrete move [N, W] along the longer axis of a wish [N, 2, W].
+
+    The rule commutes with the eight symmetries of the square, except for wishes on a diagonal.
+    """
+    x, y = wish[:, 0], wish[:, 1]
+    sideways = x.abs() > y.abs()
+    left, right, down, up = (MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP))
+    move = torch.where(sideways, torch.where(x > 0, right, left), torch.where(y > 0, up, down))
+    return torch.where(torch.maximum(x.abs(), y.abs()) > MOVE_THRESHOLD, move, MOVES.points.index(STILL))
+
+
+def unit_disc(wish: Tensor) -> Tensor:
+    """Scale wishes [N, 2, W] longer than 1 back to length 1."""
+    return wish / wish.norm(dim=1, keepdim=True).clamp_min(1.0)
+
+
+def place(worlds: ParticleWorlds, lanes: slice, extents: Sequence[float], generator: torch.Generator) -> None:
+    """Draw the position of every entity of the worlds `lanes` uniformly from its own square.
+
+    Args:
+        worlds: where to write.
+        lanes: the worlds of one seed.
+        extents: half side of the square of each entity, agents first.
+        generator: that seed's generator.
+    """
+    device = worlds.physics.device
+    shape = (len(extents), 2, lanes.stop - lanes.start)
+    unit = torch.rand(shape, generator=generator, device=device).mul_(2).sub_(1)
+    worlds.entity[:, :, lanes] = unit * torch.tensor(extents, device=device).view(-1, 1, 1)

@@ -1,0 +1,99 @@
+"""Measure how fast the environments run alone, with random actions and resets.
+
+    python tests/benchmarks/env_speed.py [--task navigation] [--worlds 1024] [--seconds 1.0] [--json speed.json]
+
+Drawing the random actions, resets, observations, states, rewards and metrics all count. A step of one world is one env
+step, whatever the number of agents. Each figure is the median of several runs on `--threads` threads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+
+import torch
+from esp_envs import Environment, make
+from rich.console import Console
+from rich.table import Table
+
+DEFAULT_TASKS = ("navigation", "predator-prey")
+DEFAULT_WORLDS = (1024, 4096)
+
+
+def steps_per_second(env: Environment, seconds: float) -> float:
+    """Run `env` with random actions for whole episodes until `seconds` have gone by; return env steps per second."""
+    worlds = env.num_seeds * env.num_envs
+    env.reset()
+    steps = 0
+    begin = time.perf_counter()
+    while (elapsed := time.perf_counter() - begin) < seconds:
+        for _ in range(env.spec.horizon):
+            env.step(env.random_action())
+        if env.device.type == "cuda":
+            torch.cuda.synchronize()
+        steps += env.spec.horizon
+    return steps * worlds / elapsed
+
+
+def measure(
+    tasks: list[str], worlds: list[int], settings: dict[str, object], device: str, seconds: float, runs: int
+) -> list[dict[str, object]]:
+    """Return one record per task and number of worlds: median, least and most env steps per second."""
+    records: list[dict[str, object]] = []
+    for task in tasks:
+        for count in worlds:
+            env = make(task, count, [0], settings, device)
+            steps_per_second(env, min(seconds, 0.3))
+            rates = sorted(steps_per_second(env, seconds) for _ in range(runs))
+            records.append(
+                {
+                    "task": task,
+                    "worlds": count,
+                    "steps_per_second": statistics.median(rates),
+                    "least": rates[0],
+                    "most": rates[-1],
+                    "runs": runs,
+                }
+            )
+    return records
+
+
+def show(records: list[dict[str, object]], title: str) -> None:
+    """Print the records as a table."""
+    table = Table("task", "worlds", "env steps/s (median)", "range", title=title)
+    for record in records:
+        low, high = float(str(record["least"])), float(str(record["most"]))
+        median = float(str(record["steps_per_second"]))
+        table.add_row(
+            str(record["task"]), str(record["worlds"]), f"{median / 1e6:.2f} M", f"{low / 1e6:.2f} to {high / 1e6:.2f} M"
+        )
+    Console().print(table)
+
+
+def main() -> None:
+    """Parse the command line, measure, print, and write JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", action="append", help="task to measure; may be given several times")
+    parser.add_argument("--worlds", action="append", type=int, help="number of worlds; may be given several times")
+    parser.add_argument("--actions", choices=("discrete", "continuous"), default="discrete")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=1.0, help="length of one run")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="also write the records to this file")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    settings: dict[str, object] = {"actions": args.actions}
+    tasks, worlds = args.task or list(DEFAULT_TASKS), args.worlds or list(DEFAULT_WORLDS)
+    records = measure(tasks, worlds, settings, args.device, args.seconds, args.runs)
+    where = f"{args.device}, {args.threads} thread{'s' if args.threads > 1 else ''}, {args.actions} actions"
+    show(records, f"environments alone ({where})")
+    if args.json:
+        args.json.write_text(json.dumps({"device": args.device, "threads": args.threads, "records": records}, indent=2))
+
+
+if __name__ == "__main__":
+    main()
