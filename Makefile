@@ -1,0 +1,72 @@
+# Two commands do all the set-up: `make demo` and `make test`. `make help` lists the rest.
+#
+# The environment lives in .venv. Stamp files in it remember what was installed from which pyproject.toml and
+# constraints.txt, so that it is made when missing and brought up to date when those files change.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := runs/demo
+PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check bench docs clean
+
+help: ## list what make can do
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.installed ## train MAPPO with the symmetry prior, evaluate it and draw it as a GIF (about 3 minutes)
+	@if [ -f $(DEMO)/config.json ]; then \
+	    echo "Going on with $(DEMO) (make clean starts anew)"; \
+	    $(BIN)/esp train --resume $(DEMO); \
+	else \
+	    $(BIN)/esp train --algo mappo --task navigation --steps 300k --seeds 2 --out $(DEMO); \
+	fi
+	$(BIN)/esp eval $(DEMO)
+	$(BIN)/esp render $(DEMO) -o $(DEMO)/demo.gif
+	@echo "Look at $(DEMO)/demo.gif"
+
+test: $(VENV)/.installed-test ## run the whole test suite
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(VENV)/.installed-dev ## lint, format and types over every package
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.installed-test ## measure the speed of environments and training on this machine
+	@found=0; for script in tests/benchmarks/bench_*.py; do \
+	    [ -f "$$script" ] || continue; \
+	    found=1; echo "== $$script"; $(BIN)/python "$$script" || exit 1; \
+	done; \
+	[ $$found = 1 ] || { echo "make: tests/benchmarks holds no bench_*.py" >&2; exit 1; }
+
+docs: $(VENV)/.installed-test ## check the documentation: links lead somewhere, commands parse
+	$(BIN)/python -m pytest tests/test_docs.py
+
+clean: ## remove the demo run, builds and caches (runs and .venv stay)
+	rm -rf $(DEMO) build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find esp_cli environments tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# --- the environment ---------------------------------------------------------------------------------------------
+
+# torch comes first and alone, in the exact version that is pinned: a looser request could fetch another build.
+define install
+	@.ci/make-venv "$(PYTHON)" $(VENV)
+	@echo "Installing $(1) into $(VENV) ..."
+	@$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)" \
+	    && $(BIN)/python -m pip install --quiet -c constraints.txt -e "$(1)" \
+	    || { echo "make: installing failed; see pip's message above (is there a network connection and free disk?)" >&2; exit 1; }
+	@touch $@
+endef
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(call install,.)
+
+$(VENV)/.installed-test: pyproject.toml constraints.txt
+	$(call install,.[test])
+	@touch $(VENV)/.installed
+
+$(VENV)/.installed-dev: pyproject.toml constraints.txt
+	$(call install,.[dev])
+	@touch $(VENV)/.installed $(VENV)/.installed-test
