@@ -219,7 +219,7 @@ def _read(path: Path) -> bytes:
 def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and description; the text of a CheckpointError goes on where the name of the file ends."""
     (header_bytes,) = struct.unpack_from("<Q", content)
-    header = _parse_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
+    header = parse_json_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
     description = _description(header, format_name, version)
     _check_tensors(header, len(content) - _LENGTH_BYTES - header_bytes)
     try:
@@ -233,8 +233,16 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
     return tensors, {key: value for key, value in description.items() if key not in _RESERVED}
 
 
-def _parse_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """Parse strict JSON (no NaN, no key twice) that has to be an object."""
+def parse_json_object(text: bytes | str, what: str) -> dict[str, Any]:
+    """Parse strict JSON (no NaN, no infinity, no key twice) that has to be an object.
+
+    Args:
+        text: UTF-8 bytes or text; the caller bounds its length.
+        what: what the text is, for the message.
+
+    Raises:
+        CheckpointError: it is not; the message goes on where the name of the file ends.
+    """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         result = dict(pairs)
@@ -266,7 +274,7 @@ def _description(header: Mapping[str, Any], format_name: str, version: int) -> d
         raise CheckpointError("was not written by esp: it has no metadata")
     if _METADATA_KEY not in metadata:
         raise CheckpointError(f"was not written by esp: its metadata has no '{_METADATA_KEY}'")
-    description = _parse_object(metadata[_METADATA_KEY], "description")
+    description = parse_json_object(metadata[_METADATA_KEY], "description")
     if description.get("format") != format_name:
         found = _short(repr(description.get("format")))
         raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed")

@@ -1,0 +1,253 @@
+"""Metrics of a run: one JSON line per update, with one number per seed, written as it happens and read back as arrays.
+
+A row is ``{"step": 12800, "train/policy_loss": [0.1, 0.2], "time/steps_per_second": 51000.0}``: ``step`` counts env
+steps per seed, a list has one number per seed, a bare number belongs to the run as a whole. What is not finite is
+``null``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from esp_cli.training.checkpoint import write_bytes_atomic
+
+Value = float | int | Sequence[float] | NDArray[Any] | Tensor
+"""What a row may hold under a name: a number, or one number per seed."""
+
+
+class MetricsError(ValueError):
+    """A metrics file cannot be written or read; the text is one sentence for the user."""
+
+
+class _Board(Protocol):
+    """What is used of TensorBoard's ``SummaryWriter``, whose package has no types."""
+
+    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class MetricsWriter:
+    """Append rows to a JSONL file, each on its way to the file before :meth:`write` returns.
+
+    A torn last line, left by a killed process, is removed when the file is opened.
+
+    Args:
+        path: the JSONL file; made if missing.
+        tensorboard: folder for TensorBoard event files, or None. It gets the mean over seeds, and a sub-folder
+            ``seed-k`` per seed, which TensorBoard lays over the mean under the same name.
+        first_step: rows of TensorBoard from this step on are hidden, as a resumed run writes them anew.
+
+    Raises:
+        MetricsError: the file cannot be opened, or TensorBoard is asked for and not installed.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], tensorboard: Path | None = None, first_step: int = 0) -> None:
+        self._path = Path(path)
+        self._folder = tensorboard
+        self._first_step = first_step
+        self._boards: dict[str, _Board] = {}
+        if tensorboard is not None:
+            self._board("mean")
+        try:
+            _remove_torn_line(self._path)
+            # closed by close(), which __exit__ calls
+            self._file = self._path.open("ab", buffering=0)
+        except OSError as error:
+            raise MetricsError(f"cannot write {self._path}: {error.strerror or error}") from None
+
+    def __enter__(self) -> MetricsWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def write(self, step: int, values: Mapping[str, Value]) -> None:
+        """Append one row.
+
+        Args:
+            step: env steps per seed so far.
+            values: by name (``train/...``, ``eval/...``, ``time/...``), a number or one number per seed [S].
+
+        Raises:
+            MetricsError: a value is no number or list of numbers, or the disk is full.
+        """
+        row: dict[str, Any] = {"step": int(step)}
+        for name, value in values.items():
+            if name == "step":
+                raise MetricsError("'step' is the row's own column; give the metric another name")
+            row[name] = _plain(name, value)
+        line = json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+        try:
+            # a disk about to be full takes a part only; writing the rest then says so
+            while line:
+                line = line[self._file.write(line) :]
+        except OSError as error:
+            raise MetricsError(f"cannot write {self._path}: {error.strerror or error}") from None
+        if self._folder is not None:
+            self._write_boards(row)
+
+    def close(self) -> None:
+        """Close the file, and TensorBoard's."""
+        self._file.close()
+        for board in self._boards.values():
+            board.close()
+
+    def _write_boards(self, row: Mapping[str, Any]) -> None:
+        step = row["step"]
+        for name, value in row.items():
+            numbers = value if isinstance(value, list) else [value]
+            if name == "step" or any(number is None for number in numbers):
+                continue
+            self._board("mean").add_scalar(name, sum(numbers) / max(len(numbers), 1), step)
+            if len(numbers) > 1:
+                for seed, number in enumerate(numbers):
+                    self._board(f"seed-{seed}").add_scalar(name, number, step)
+
+    def _board(self, name: str) -> _Board:
+        if name not in self._boards:
+            try:
+                # only here: the import takes a second, and the package is an extra
+                from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415
+            except ImportError:
+                raise MetricsError(
+                    "TensorBoard is not installed: pip install 'esp-marl[tensorboard]', or train without it"
+                ) from None
+            folder = str(self._folder if name == "mean" else Path(str(self._folder)) / name)
+            self._boards[name] = SummaryWriter(folder, purge_step=self._first_step or None, flush_secs=10)
+        return self._boards[name]
+
+
+def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
+    """Read the rows of a metrics file, leaving out a torn last line.
+
+    Raises:
+        MetricsError: the file is missing, or damaged elsewhere than at its end.
+    """
+    return [row for _, row in _rows(Path(path))]
+
+
+def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
+    """Rewrite a metrics file atomically without its torn last line and without the rows past a step.
+
+    What remains is kept byte for byte.
+
+    Args:
+        path: metrics file.
+        last_step: env steps per seed of the checkpoint that the run goes on from.
+
+    Returns:
+        The number of whole rows removed.
+
+    Raises:
+        MetricsError: the file is missing, damaged elsewhere than at its end, or cannot be written.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    kept = [line for line, row in rows if row["step"] <= last_step]
+    try:
+        write_bytes_atomic(path, b"".join(line + b"\n" for line in kept))
+    except OSError as error:
+        raise MetricsError(f"cannot write {path}: {error.strerror or error}") from None
+    return len(rows) - len(kept)
+
+
+def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return one metric over time; rows without it are left out, ``null`` is NaN.
+
+    Args:
+        rows: as :func:`read_metrics` returns them.
+        name: name of the metric.
+
+    Returns:
+        Steps [K] (env steps per seed) and values [K, S]; a bare number is a value of one seed.
+
+    Raises:
+        MetricsError: no row has the metric, or its rows differ in the number of seeds.
+    """
+    found = [(row["step"], row[name]) for row in rows if name in row]
+    if not found:
+        names = sorted({key for row in rows for key in row if key != "step"})
+        near = difflib.get_close_matches(name, names, 3, 0.4) or names[:3]
+        hint = f"; there is {', '.join(near)}" if near else ", and no other metric either"
+        raise MetricsError(f"no row has the metric '{name}'{hint}")
+    lists = [value if isinstance(value, list) else [value] for _, value in found]
+    if len({len(numbers) for numbers in lists}) > 1:
+        raise MetricsError(f"the rows of '{name}' differ in the number of seeds")
+    try:
+        values = np.array([[math.nan if v is None else float(v) for v in numbers] for numbers in lists])
+    except (TypeError, ValueError, OverflowError):
+        raise MetricsError(f"the rows of '{name}' hold something that is no number") from None
+    return np.array([step for step, _ in found], dtype=np.int64), values
+
+
+def _plain(name: str, value: Value) -> float | int | list[float | int | None] | None:
+    """Return a number, or a list of numbers, with None where it is not finite."""
+    plain = value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
+    if isinstance(plain, list | tuple):
+        return [_number(name, item) for item in plain]
+    return _number(name, plain)
+
+
+def _number(name: str, value: Any) -> float | int | None:
+    if isinstance(value, np.generic):
+        value = value.item()
+    if not isinstance(value, bool | int | float):
+        raise MetricsError(f"the metric '{name}' is no number and no list of one number per seed")
+    return value if math.isfinite(value) else None
+
+
+def _rows(path: Path) -> list[tuple[bytes, dict[str, Any]]]:
+    """Return each row with the line that it stands on."""
+    if not path.is_file():
+        raise MetricsError(f"{path} does not exist or is no plain file; check the path")
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except OSError as error:
+        raise MetricsError(f"cannot read {path}: {error.strerror or error}") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        row = _parse(line)
+        if row is not None:
+            rows.append((line, row))
+        elif number < len(lines):
+            # only the text behind the last line break can be a line that a killed process had not finished
+            raise MetricsError(f"{path} is damaged: line {number} is no row of metrics; remove that line")
+    return rows
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    # a step beyond 64 bits could not be an array's element
+    sound = isinstance(row, dict) and type(row.get("step")) is int and abs(row["step"]) < 2**63
+    return row if sound else None
+
+
+def _remove_torn_line(path: Path) -> None:
+    """Cut what follows the last line break, so that the next row does not run into it; complete it if it is a row."""
+    if not path.is_file():
+        return
+    content = path.read_bytes()
+    if content.endswith(b"\n") or not content:
+        return
+    whole, _, last = content.rpartition(b"\n")
+    if _parse(last) is not None:
+        write_bytes_atomic(path, content + b"\n")
+    else:
+        write_bytes_atomic(path, whole + b"\n" if whole else b"")

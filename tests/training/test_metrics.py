@@ -1,0 +1,181 @@
+"""Metrics files: rows per update and seed, torn ends, resuming, TensorBoard."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli.training.metrics import MetricsError, MetricsWriter, column, read_metrics, truncate_metrics
+
+ROWS = [
+    {"step": 100, "train/loss": [1.0, 2.0], "time/seconds": 0.5},
+    {"step": 200, "train/loss": [0.5, None], "eval/return": [-120.0, -130.0]},
+    {"step": 300, "train/loss": [0.25, None], "eval/return": [-110.0, None]},
+]
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in ROWS))
+    return path
+
+
+def test_rows_take_tensors_arrays_and_numbers(tmp_path):
+    path = tmp_path / "m.jsonl"
+    with MetricsWriter(path) as writer:
+        writer.write(
+            100,
+            {
+                "train/loss": torch.tensor([0.5, float("nan")]),
+                "train/kl": np.array([1.0, -math.inf]),
+                "train/count": torch.tensor(3),
+                "train/list": [1, np.float32(0.25)],
+                "time/seconds": 0.1,
+            },
+        )
+    assert path.read_text() == (
+        '{"step":100,"train/loss":[0.5,null],"train/kl":[1.0,null],"train/count":3,'
+        '"train/list":[1,0.25],"time/seconds":0.1}\n'
+    )
+
+
+def test_each_row_is_in_the_file_when_write_returns(tmp_path):
+    path = tmp_path / "m.jsonl"
+    writer = MetricsWriter(path)
+    for step in (1, 2, 3):
+        writer.write(step, {"train/loss": [0.0]})
+        assert [row["step"] for row in read_metrics(path)] == list(range(1, step + 1))
+    writer.close()
+
+
+@pytest.mark.parametrize("value", ["text", [[1.0]], {"a": 1}, None, torch.zeros(2, 2)])
+def test_what_is_no_number_is_refused(tmp_path, value):
+    path = tmp_path / "m.jsonl"
+    with MetricsWriter(path) as writer, pytest.raises(MetricsError, match="'train/loss' is no number"):
+        writer.write(1, {"train/loss": value})
+    assert path.read_text() == ""
+
+
+def test_step_is_no_metric(tmp_path):
+    with MetricsWriter(tmp_path / "m.jsonl") as writer, pytest.raises(MetricsError, match="'step' is the row's own"):
+        writer.write(1, {"step": 2.0})
+
+
+def test_a_full_disk_is_one_sentence():
+    writer = MetricsWriter("/dev/full")
+    with pytest.raises(MetricsError, match="cannot write /dev/full: No space left on device"):
+        writer.write(1, {"train/loss": [1.0]})
+
+
+def test_column_is_steps_and_values_per_seed(path):
+    rows = read_metrics(path)
+    steps, values = column(rows, "train/loss")
+    assert steps.tolist() == [100, 200, 300]
+    np.testing.assert_array_equal(values, [[1.0, 2.0], [0.5, math.nan], [0.25, math.nan]])
+    steps, values = column(rows, "eval/return")
+    assert steps.tolist() == [200, 300]
+    assert values.shape == (2, 2)
+    assert column(rows, "time/seconds")[1].tolist() == [[0.5]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "text"),
+    [
+        ([], "no row has the metric 'train/loss', and no other"),
+        ([{"step": 1, "train/los": [1.0]}], "there is train/los"),
+        ([{"step": 1, "train/loss": [1.0]}, {"step": 2, "train/loss": [1.0, 2.0]}], "differ in the number of seeds"),
+        ([{"step": 1, "train/loss": ["x"]}], "no number"),
+        ([{"step": 1, "train/loss": [[1.0]]}], "no number"),
+        ([{"step": 1, "train/loss": [10**400]}], "no number"),
+    ],
+)
+def test_columns_that_are_not_there_are_one_sentence(rows, text):
+    with pytest.raises(MetricsError, match=text):
+        column(rows, "train/loss")
+
+
+def test_the_last_line_may_be_torn_at_any_byte(path):
+    whole = path.read_bytes()
+    start = whole.rindex(b"\n", 0, -1) + 1
+    for end in range(start, len(whole) - 1):
+        path.write_bytes(whole[:end])
+        assert read_metrics(path) == ROWS[:2]
+    path.write_bytes(whole[:-1])
+    assert read_metrics(path) == ROWS
+
+
+@pytest.mark.parametrize("line", [b"{}", b"[1]", b'{"step": "1"}', b'{"step": 1.5}', b"\x00\x00", b"[" * 100_000, b""])
+def test_damage_inside_is_told_with_its_line(path, line):
+    lines = path.read_bytes().split(b"\n")
+    path.write_bytes(b"\n".join([lines[0], line, *lines[1:]]))
+    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2 is no row"):
+        read_metrics(path)
+
+
+def test_a_missing_file_is_one_sentence(tmp_path):
+    with pytest.raises(MetricsError, match="does not exist"):
+        read_metrics(tmp_path / "m.jsonl")
+
+
+def test_truncating_keeps_the_rows_up_to_a_step_byte_for_byte(path):
+    lines = path.read_bytes().split(b"\n")
+    path.write_bytes(path.read_bytes() + b'{"step": 400, "train/l')
+    assert truncate_metrics(path, 200) == 1
+    assert path.read_bytes() == lines[0] + b"\n" + lines[1] + b"\n"
+    assert truncate_metrics(path, 200) == 0
+    assert truncate_metrics(path, 0) == 2
+    assert path.read_bytes() == b""
+
+
+@pytest.mark.parametrize("torn", [b"", b'{"step": 400, "tr', b"\x00\x00\x00"])
+def test_a_resumed_file_equals_that_of_an_uninterrupted_run(path, tmp_path, torn):
+    path.write_bytes(path.read_bytes() + torn)
+    truncate_metrics(path, 200)
+    through = tmp_path / "through.jsonl"
+    through.write_bytes(path.read_bytes())
+    for target in (path, through):
+        with MetricsWriter(target) as writer:
+            writer.write(300, {"train/loss": [0.1, 0.2]})
+    assert path.read_bytes() == through.read_bytes()
+
+
+def test_a_torn_line_does_not_swallow_the_next_row(path):
+    whole = path.read_bytes()
+    for end in range(len(whole) + 1):
+        path.write_bytes(whole[:end])
+        before = read_metrics(path)
+        with MetricsWriter(path) as writer:
+            writer.write(999, {"train/loss": [1.0]})
+        assert read_metrics(path) == [*before, {"step": 999, "train/loss": [1.0]}]
+
+
+def test_tensorboard_gets_the_mean_and_each_seed(tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    board = tmp_path / "tensorboard"
+    with MetricsWriter(tmp_path / "m.jsonl", tensorboard=board) as writer:
+        writer.write(100, {"train/loss": [1.0, 3.0], "time/seconds": 0.5, "train/kl": [math.nan, 1.0]})
+        writer.write(200, {"train/loss": [2.0, 6.0], "time/seconds": 0.75})
+
+    def scalars(folder, name):
+        accumulator = EventAccumulator(str(folder)).Reload()
+        return [(event.step, event.value) for event in accumulator.Scalars(name)]
+
+    assert scalars(board, "train/loss") == [(100, 2.0), (200, 4.0)]
+    assert scalars(board, "time/seconds") == [(100, 0.5), (200, 0.75)]
+    assert scalars(board / "seed-1", "train/loss") == [(100, 3.0), (200, 6.0)]
+    assert "train/kl" not in EventAccumulator(str(board)).Reload().Tags()["scalars"]
+
+
+def test_tensorboard_missing_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(MetricsError, match=r"pip install 'esp-marl\[tensorboard\]', or train without it"):
+        MetricsWriter(tmp_path / "m.jsonl", tensorboard=tmp_path / "tensorboard")
+    assert list(tmp_path.iterdir()) == []
