@@ -1,0 +1,1 @@
+"""Learners. Each is one file: its config, its linear `update`, and the presets that were measured for it."""

@@ -1,0 +1,99 @@
+"""The equations of the learners as pure functions; each is tested by numbers worked out by hand."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def gae(
+    reward: Tensor,
+    value: Tensor,
+    next_value: Tensor,
+    terminated: Tensor,
+    ended: Tensor,
+    gamma: float,
+    gae_lambda: float,
+) -> Tensor:
+    """Return generalised advantage estimates (Schulman et al., 2016).
+
+    delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)
+    A_t = delta_t + gamma lambda (1 - ended_t) A_{t+1}
+
+    Args:
+        reward: [S, T, E, C], C = 1 for a shared reward, else N.
+        value: [S, T, E, C] V(s_t).
+        next_value: [S, T, E, C] V of the state that really followed, the final one where an episode ended.
+        terminated: [S, T, E, 1]; no value lies beyond.
+        ended: [S, T, E, 1] terminated or truncated; the next row belongs to another episode.
+        gamma: discount factor.
+        gae_lambda: 0 is one-step temporal difference, 1 Monte Carlo.
+
+    Returns:
+        [S, T, E, C].
+    """
+    delta = torch.where(terminated, reward, reward + gamma * next_value) - value
+    decay = gamma * gae_lambda * (~ended).to(delta.dtype)
+    advantage, carry = torch.empty_like(delta), torch.zeros_like(delta[:, 0])
+    for t in reversed(range(delta.shape[1])):
+        carry = delta[:, t] + decay[:, t] * carry
+        advantage[:, t] = carry
+    return advantage
+
+
+def normalise_per_seed(x: Tensor, epsilon: float = 1e-5) -> Tensor:
+    """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed; x: [S, ...]."""
+    axes = tuple(range(1, x.dim()))
+    deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)
+    return (x - mean) / (deviation + epsilon)
+
+
+def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
+    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A), element by element (to be maximised)."""
+    ratio = log_ratio.exp()
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage)
+
+
+def huber(error: Tensor, delta: float) -> Tensor:
+    """Return e^2 / 2 within delta, delta (|e| - delta / 2) beyond, element by element."""
+    size = error.abs()
+    inner = size.clamp(max=delta)
+    return inner * (size - 0.5 * inner)
+
+
+def value_loss(
+    value: Tensor, target: Tensor, huber_delta: float, old_value: Tensor | None = None, clip_epsilon: float = 0.0
+) -> Tensor:
+    """Return the value loss element by element; with `old_value`, the larger of the clipped and the plain one.
+
+    The clipped prediction is V_old + clip(V - V_old, -eps, eps), as in the MAPPO paper.
+    """
+    loss = huber(value - target, huber_delta)
+    if old_value is None:
+        return loss
+    clipped = old_value + (value - old_value).clamp(-clip_epsilon, clip_epsilon)
+    return torch.maximum(loss, huber(clipped - target, huber_delta))
+
+
+def explained_variance(value: Tensor, target: Tensor) -> Tensor:
+    """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S]."""
+    residual = (target - value).flatten(1).var(1, correction=0)
+    return 1 - residual / target.flatten(1).var(1, correction=0).clamp_min(1e-8)
+
+
+def clip_gradients_per_seed(gradients: list[Tensor], max_norm: float) -> Tensor:
+    """Scale each seed's gradients in place so that their joint norm is at most `max_norm`.
+
+    Args:
+        gradients: tensors with a leading seed axis.
+        max_norm: largest norm allowed.
+
+    Returns:
+        [S] norms before clipping.
+    """
+    flat = [g.flatten(1) for g in gradients]
+    squares = torch.stack([torch.linalg.vecdot(g, g) for g in flat])
+    norm = squares.sum(0).sqrt()
+    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).unsqueeze(1)
+    torch._foreach_mul_(flat, [scale] * len(flat))
+    return norm

@@ -1,0 +1,372 @@
+"""Multi-agent proximal policy optimisation (Yu et al., 2022), plain or with a symmetry prior.
+
+The update follows the paper's order: advantages (GAE), the clipped objective of Eq. 3 and 7, the critic's loss of
+Eq. 4, the consistency terms of Eq. 8 and 9, combined as in Eq. 10.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from esp_envs.base import Environment, Observation
+from esp_envs.spec import TaskSpec
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.losses import (
+    clip_gradients_per_seed,
+    clipped_surrogate,
+    explained_variance,
+    gae,
+    normalise_per_seed,
+    value_loss,
+)
+from esp_cli.algorithms.normalisation import ValueNormaliser
+from esp_cli.algorithms.rollout import Collector, Rollout
+from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.policy import Policy
+from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
+from esp_cli.symmetry import Transform
+
+
+class MappoConfig(BaseModel):
+    """Hyperparameters; every default stands here and nowhere else."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_envs: int = Field(32, ge=1, description="worlds per seed; MAPPO paper on MPE: 128")
+    num_steps: int = Field(25, ge=1, description="steps per world and update")
+    num_epochs: int = Field(10, ge=1)
+    num_minibatches: int = Field(4, ge=1, description="paper: 1")
+    learning_rate: float = Field(7e-4, gt=0)
+    anneal_learning_rate: bool = Field(False, description="linearly to 0 over the run")
+    adam_epsilon: float = Field(1e-5, gt=0)
+    max_grad_norm: float = Field(10.0, gt=0)
+    gamma: float = Field(0.99, ge=0, le=1)
+    gae_lambda: float = Field(0.95, ge=0, le=1)
+    clip_epsilon: float = Field(0.2, gt=0)
+    clip_value: bool = Field(False, description="MAPPO paper: on; ours off, it slows learning badly")
+    huber_delta: float = Field(10.0, gt=0)
+    value_coef: float = Field(1.0, gt=0)
+    entropy_coef: float = Field(0.01, ge=0)
+    anneal_entropy: bool = Field(False, description="linearly to 0 over the run")
+    bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
+    value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
+    critic_input: Literal["state", "observations"] = Field(
+        "state", description="the task's global state, or all agents' observations in a row"
+    )
+    truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
+    chunk_steps: int = Field(800, ge=1, description="environment steps per seed and forward pass; speed only")
+
+
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
+    "default": {},
+    "paper": {
+        "mappo": {"num_minibatches": 1, "clip_value": True, "value_decay": 0.99999, "num_envs": 128},
+        "network": {"name": "gru", "layer_norm": True, "hidden": (64, 64)},
+        "prior": {"transforms": "rot90", "consistency_coef": 0.5},
+    },
+}
+"""What a preset changes; "paper" is supplement table 2 with the MAPPO paper's defaults where it is silent."""
+
+
+@dataclass
+class Batch:
+    """Experience ready for gradient steps: B sequences of tau steps (tau = 1 unless the network is recurrent).
+
+    Shape:
+        obs [S, B, tau, N, D], state [S, B, tau, state width], action [S, B, tau, N(, width)],
+        log_prob and advantage [S, B, tau, N], target and value [S, B, tau, C] in normalised units.
+    """
+
+    obs: Tensor
+    state: Tensor
+    action: Tensor
+    log_prob: Tensor
+    advantage: Tensor
+    target: Tensor
+    value: Tensor
+
+    def select(self, rows: Tensor) -> Batch:
+        """Return the sequences `rows`: [S, m]."""
+        num_seeds, count = self.obs.shape[:2]
+        flat = (rows + count * torch.arange(num_seeds, device=rows.device).unsqueeze(1)).flatten()
+        return self._map(lambda x: x.flatten(0, 1).index_select(0, flat).unflatten(0, rows.shape))
+
+    def chunks(self, size: int) -> list[Batch]:
+        """Cut the batch axis into pieces of at most `size`; views, no copies."""
+        return [self._map(lambda x, a=a: x[:, a : a + size]) for a in range(0, self.obs.shape[1], size)]  # type: ignore[misc]
+
+    def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
+        return Batch(**{name: function(tensor) for name, tensor in vars(self).items()})
+
+
+class Mappo(Learner):
+    """The learner: policy, centralised critic, optimiser and prior of S seeds.
+
+    Args:
+        env: the training worlds.
+        config: hyperparameters.
+        network: shape of actor and critic.
+        prior: the symmetry prior's settings; kind "none" gives the plain algorithm bit for bit.
+        generators: one CPU generator per seed for initial weights, action noise and minibatches.
+        prior_generators: one CPU generator per seed for the prior alone, so that it disturbs no other draw.
+
+    Raises:
+        ValueError: a recurrent network whose rollouts are not whole episodes.
+    """
+
+    config_class = MappoConfig
+
+    def __init__(
+        self,
+        env: Environment,
+        config: MappoConfig,
+        network: NetworkConfig,
+        prior: PriorConfig,
+        generators: Sequence[torch.Generator],
+        prior_generators: Sequence[torch.Generator],
+    ) -> None:
+        spec, device = env.spec, env.device
+        self.config, self.spec, self.device = config, spec, device
+        self.generators = {"learner": list(generators), "prior": list(prior_generators)}
+        self.prior = SymmetryPrior(prior, spec, device)
+        self.policy = Policy(spec, network, generators).to(device)
+        self.num_values = 1 if spec.shared_reward else spec.num_agents
+        self.critic = build_network(generators, _critic_width(spec, config), self.num_values, network, 1.0).to(device)
+        self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
+        self.recurrent = self.policy.actor.memory_width > 0
+        if self.recurrent and config.num_steps % spec.horizon:
+            raise ValueError(
+                f"a recurrent network needs whole episodes: set mappo.num_steps to a multiple of {spec.horizon}"
+            )
+        self.actor_parameters = list(self.policy.parameters())
+        self.critic_parameters = list(self.critic.parameters())
+        self.optimiser = torch.optim.Adam(
+            self.actor_parameters + self.critic_parameters, config.learning_rate, eps=config.adam_epsilon, fused=True
+        )
+        self.modules = {"policy": self.policy, "critic": self.critic, "normaliser": self.normaliser}
+        self.optimisers = {"adam": self.optimiser}
+        self.collector = Collector(env, self.policy, self.generators["learner"])
+        self._old: tuple[Policy, torch.nn.Module] | None = None
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps per seed of one iteration."""
+        return self.config.num_envs * self.config.num_steps
+
+    def iterate(self, progress: float) -> dict[str, Tensor]:
+        """Collect one rollout, learn from it, and return metrics, each [S].
+
+        Args:
+            progress: share of the run that is done, 0 to 1, for annealing.
+        """
+        rollout = self.collector.collect(self.config.num_steps)
+        metrics = self.update(rollout, progress)
+        return {"train/return": self.collector.pop_mean_return(), **metrics}
+
+    def update(self, rollout: Rollout, progress: float) -> dict[str, Tensor]:
+        """Learn from a rollout: epochs of minibatches, each one gradient step."""
+        config = self.config
+        remaining = 1.0 - progress
+        for group in self.optimiser.param_groups:
+            group["lr"] = config.learning_rate * (remaining if config.anneal_learning_rate else 1.0)
+        entropy_coef = config.entropy_coef * (remaining if config.anneal_entropy else 1.0)
+
+        batch, metrics = self._prepare(rollout)
+        self._remember_old_networks()
+        for epoch in range(config.num_epochs):
+            is_last = epoch == config.num_epochs - 1
+            sums: dict[str, Tensor] = {}
+            for minibatch in self._minibatches(batch):
+                self._gradient_step(minibatch, entropy_coef, sums if is_last else None)
+        metrics |= {f"train/{name}": value / config.num_minibatches for name, value in sums.items()}
+        share = self.prior.num_copies / (1 + self.prior.num_copies) if self.prior.config.augments else 0.0
+        metrics["train/augmented_share"] = torch.full((batch.obs.shape[0],), share)
+        return metrics
+
+    def _prepare(self, rollout: Rollout) -> tuple[Batch, dict[str, Tensor]]:
+        """Value every state, estimate advantages, and shape the rollout into sequences."""
+        config = self.config
+        reward = rollout.reward.mean(-1, keepdim=True) if self.num_values == 1 else rollout.reward
+        with torch.no_grad():
+            raw_value, raw_next = self._values(rollout)
+        value, next_value = self.normaliser.denormalise(raw_value), self.normaliser.denormalise(raw_next)
+        ended = rollout.ended.unsqueeze(-1)
+        terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
+        axes = [x.transpose(1, 2) for x in (reward, value, next_value, terminated, ended)]
+        advantage = gae(*axes, config.gamma, config.gae_lambda).transpose(1, 2)
+        target = advantage + value
+        self.normaliser.update(target)
+        per_agent = normalise_per_seed(advantage).expand(rollout.log_prob.shape)
+        fields = (
+            rollout.obs,
+            rollout.state,
+            rollout.action,
+            rollout.log_prob,
+            per_agent,
+            self.normaliser.normalise(target),
+            self.normaliser.normalise(value),
+        )
+        batch = Batch(*(self._as_sequences(x) for x in fields))
+        return batch, {"train/explained_variance": explained_variance(value, target)}
+
+    def _as_sequences(self, x: Tensor) -> Tensor:
+        """Shape [S, E, T, ...] into [S, E * T, 1, ...], or into whole episodes [S, E * k, horizon, ...]."""
+        length = self.spec.horizon if self.recurrent else 1
+        return x.unflatten(2, (-1, length)).flatten(1, 2)
+
+    def _values(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
+        """Return V(s_t) and V of what really followed, each [S, E, T, C], in normalised units."""
+        x = self._critic_input(rollout.obs, rollout.state)
+        if self.recurrent:
+            finals = torch.stack([self._critic_rows(rollout.finals[t]) for t in sorted(rollout.finals)], 2)
+            episodes = torch.cat([x.unflatten(2, (-1, self.spec.horizon)), finals.unsqueeze(3)], 3).flatten(1, 2)
+            values = self.critic.unroll(episodes).unflatten(1, (x.shape[1], -1))
+            return values[:, :, :, :-1].flatten(2, 3), values[:, :, :, 1:].flatten(2, 3)
+        value = self.critic.unroll(x)
+        next_value = torch.cat([value[:, :, 1:], self._value_of(rollout.last).unsqueeze(2)], 2)
+        for t, final in rollout.finals.items():
+            next_value[:, :, t] = self._value_of(final)
+        return value, next_value
+
+    def _value_of(self, observation: Observation) -> Tensor:
+        return self.critic.unroll(self._critic_rows(observation).unsqueeze(2)).squeeze(2)
+
+    def _critic_rows(self, observation: Observation) -> Tensor:
+        return self._critic_input(observation.obs, observation.state)
+
+    def _critic_input(self, obs: Tensor, state: Tensor) -> Tensor:
+        return state if self.config.critic_input == "state" else obs.flatten(-2)
+
+    def _remember_old_networks(self) -> None:
+        """Keep the behaviour policy and the critic of the rollout where something is evaluated anew under them."""
+        recompute = self.prior.config.augments and (
+            self.prior.config.old_log_prob == "recompute" or self.config.clip_value
+        )
+        self._old = (copy.deepcopy(self.policy), copy.deepcopy(self.critic)) if recompute else None
+
+    def _minibatches(self, batch: Batch) -> list[Batch]:
+        """Shuffle the sequences of each seed by its own generator and cut them into minibatches."""
+        count, parts = batch.obs.shape[1], self.config.num_minibatches
+        if parts == 1:
+            return [batch]
+        order = torch.stack([torch.randperm(count, generator=g) for g in self.generators["learner"]]).to(self.device)
+        size = count // parts
+        return [batch.select(order[:, k * size : (k + 1) * size]) for k in range(parts)]
+
+    def _gradient_step(self, minibatch: Batch, entropy_coef: float, sums: dict[str, Tensor] | None) -> None:
+        """Take one gradient step, accumulated over chunks small enough for the processor's cache."""
+        transforms = self.prior.for_minibatch(self.generators["prior"])
+        size = max(1, self.config.chunk_steps // minibatch.obs.shape[2])
+        total = minibatch.obs.shape[1]
+        self.optimiser.zero_grad(set_to_none=True)
+        for chunk in minibatch.chunks(size):
+            weight = chunk.obs.shape[1] / total
+            loss = self._loss(chunk, transforms, entropy_coef, weight, sums)
+            (loss.sum() * weight).backward()
+        actor_norm = clip_gradients_per_seed([_grad(p) for p in self.actor_parameters], self.config.max_grad_norm)
+        critic_norm = clip_gradients_per_seed([_grad(p) for p in self.critic_parameters], self.config.max_grad_norm)
+        if sums is not None:
+            _add(sums, 1.0, actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
+        self.optimiser.step()
+
+    def _loss(
+        self, chunk: Batch, transforms: list[Transform], entropy_coef: float, weight: float, sums: dict | None
+    ) -> Tensor:
+        """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S]."""
+        config, prior, head = self.config, self.prior.config, self.policy.head
+        count = chunk.obs.shape[1]
+        rows = self._with_copies(chunk, transforms)
+        outputs = self.policy.unroll(rows.obs, config.truncation)
+        values = self.critic.unroll(self._critic_input(rows.obs, rows.state), config.truncation)
+
+        used = rows if prior.augments else chunk
+        learned = used.obs.shape[1]
+        log_prob, entropy = head.log_prob_and_entropy(outputs[:, :learned], used.action)
+        log_ratio = log_prob - used.log_prob
+        objective = clipped_surrogate(log_ratio, used.advantage, config.clip_epsilon)
+        old_value = used.value if config.clip_value else None
+        value_error = value_loss(values[:, :learned], used.target, config.huber_delta, old_value, config.clip_epsilon)
+        loss = config.value_coef * _mean(value_error) - _mean(objective) - entropy_coef * _mean(entropy)
+
+        if transforms and prior.coefficient > 0:
+            originals = outputs[:, :count], values[:, :count]
+            policy_gap, value_gap = self._consistency(originals, outputs[:, count:], values[:, count:], transforms)
+            loss = loss + prior.coefficient * (policy_gap + value_gap)
+            if sums is not None:
+                _add(sums, weight, policy_symmetry_error=policy_gap, value_symmetry_error=value_gap)
+        if sums is not None:
+            ratio_gap = log_ratio.detach()[:, :count]
+            ratio = ratio_gap.exp()
+            _add(
+                sums,
+                weight,
+                clip_fraction=_mean(((ratio - 1).abs() > config.clip_epsilon).float()),
+                kl=_mean(ratio - 1 - ratio_gap),
+                entropy=_mean(entropy[:, :count]),
+                policy_loss=-_mean(objective[:, :count]),
+                value_loss=_mean(value_error[:, :count]),
+            )
+        return loss
+
+    def _with_copies(self, chunk: Batch, transforms: list[Transform]) -> Batch:
+        """Return the chunk with its transformed copies behind it along the batch axis."""
+        if not transforms:
+            return chunk
+        parts = [chunk, *(self._transformed(chunk, g) for g in transforms)]
+        return Batch(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(chunk)})
+
+    def _transformed(self, chunk: Batch, g: Transform) -> Batch:
+        """Return (L_g s, K_g a) with advantage and target of the original (Prop. 1).
+
+        The old log-probability is copied, or evaluated anew under the behaviour policy; the old value, which only
+        value clipping reads, is always evaluated anew. Recurrent networks are unrolled over the transformed history.
+        """
+        obs, state, action = g.obs(chunk.obs), g.state(chunk.state), g.action(chunk.action)
+        log_prob, value = g.per_agent(chunk.log_prob), g.per_agent(chunk.value)
+        if self._old is not None:
+            old_policy, old_critic = self._old
+            with torch.no_grad():
+                if self.prior.config.old_log_prob == "recompute":
+                    log_prob = old_policy.head.log_prob(old_policy.unroll(obs), action)
+                if self.config.clip_value:
+                    value = old_critic.unroll(self._critic_input(obs, state))  # type: ignore[operator]
+        return Batch(obs, state, action, log_prob, g.per_agent(chunk.advantage), g.per_agent(chunk.target), value)
+
+    def _consistency(
+        self, originals: tuple[Tensor, Tensor], outputs: Tensor, values: Tensor, transforms: list[Transform]
+    ) -> tuple[Tensor, Tensor]:
+        """Return S_pi (Eq. 8) and S_V (Eq. 9) per seed, averaged over the copies."""
+        stop, head = self.prior.config.stop_gradient, self.policy.head
+        policy_gaps, value_gaps = [], []
+        parts = zip(outputs.chunk(len(transforms), 1), values.chunk(len(transforms), 1), transforms, strict=True)
+        for copied_outputs, copied_values, g in parts:
+            pulled_back = head.pull_back(copied_outputs, g)
+            policy_gaps.append(_mean(policy_consistency_loss(head.divergence, pulled_back, originals[0], stop)))
+            value_gaps.append(_mean(value_consistency_loss(g.values(copied_values), originals[1], stop)))
+        return torch.stack(policy_gaps).mean(0), torch.stack(value_gaps).mean(0)
+
+
+def _critic_width(spec: TaskSpec, config: MappoConfig) -> int:
+    return spec.state.width if config.critic_input == "state" else spec.num_agents * spec.observation.width
+
+
+def _grad(parameter: torch.nn.Parameter) -> Tensor:
+    assert parameter.grad is not None
+    return parameter.grad
+
+
+def _mean(x: Tensor) -> Tensor:
+    """Return the mean per seed: [S, ...] -> [S]."""
+    return x.flatten(1).mean(1)
+
+
+def _add(sums: dict[str, Tensor], weight: float, **values: Tensor) -> None:
+    for name, value in values.items():
+        sums[name] = sums.get(name, 0.0) + weight * value.detach()  # type: ignore[arg-type]

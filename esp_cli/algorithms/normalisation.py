@@ -1,0 +1,51 @@
+"""Running statistics of value targets, one set per seed."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class ValueNormaliser(nn.Module):
+    """Keeps value targets near mean 0, variance 1 per seed, so that one learning rate fits every reward scale.
+
+    An exponential moving average with bias correction (as for Adam's moments), after the MAPPO paper's code, which
+    uses decay 0.99999 per update: nearly an average over all of training.
+
+    Shape:
+        Every argument is [S, ...]; statistics are over all other axes.
+    """
+
+    def __init__(self, num_seeds: int, decay: float) -> None:
+        super().__init__()
+        self.decay = decay
+        self.mean: Tensor
+        self.square: Tensor
+        self.weight: Tensor
+        self.register_buffer("mean", torch.zeros(num_seeds))
+        self.register_buffer("square", torch.zeros(num_seeds))
+        self.register_buffer("weight", torch.zeros(num_seeds))
+
+    def update(self, target: Tensor) -> None:
+        """Take in a batch of targets."""
+        flat = target.flatten(1)
+        for buffer, value in ((self.mean, flat.mean(1)), (self.square, flat.square().mean(1))):
+            buffer.mul_(self.decay).add_(value, alpha=1 - self.decay)
+        self.weight.mul_(self.decay).add_(1 - self.decay)
+
+    def _statistics(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        weight = self.weight.clamp_min(1e-8)
+        mean = self.mean / weight
+        variance = torch.where(self.weight > 0, self.square / weight - mean.square(), 1.0)
+        shape = (-1, *[1] * (like.dim() - 1))
+        return mean.view(shape), variance.clamp_min(1e-4).sqrt().view(shape)
+
+    def normalise(self, x: Tensor) -> Tensor:
+        """Return (x - mean) / deviation."""
+        mean, deviation = self._statistics(x)
+        return (x - mean) / deviation
+
+    def denormalise(self, x: Tensor) -> Tensor:
+        """Return x * deviation + mean."""
+        mean, deviation = self._statistics(x)
+        return x * deviation + mean

@@ -1,0 +1,117 @@
+"""On-policy experience: what one round of acting in all worlds leaves behind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from esp_envs.base import Environment, Observation
+from torch import Tensor
+
+from esp_cli.networks.policy import Policy
+
+
+@dataclass
+class Rollout:
+    """T steps of E worlds for S seeds.
+
+    Shape:
+        obs [S, E, T, N, D], state [S, E, T, state width], action [S, E, T, N(, width)] (latent, as the head drew it),
+        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool.
+
+    `last` is the observation after the final step; `finals[t]` the final observation of episodes that ended at t.
+    """
+
+    obs: Tensor
+    state: Tensor
+    action: Tensor
+    log_prob: Tensor
+    reward: Tensor
+    terminated: Tensor
+    ended: Tensor
+    last: Observation
+    finals: dict[int, Observation] = field(default_factory=dict)
+
+
+class Collector:
+    """Acts in the worlds and remembers, between rollouts, where each stands.
+
+    Args:
+        env: the worlds.
+        policy: the behaviour policy.
+        generators: one CPU generator per seed for action noise.
+    """
+
+    def __init__(self, env: Environment, policy: Policy, generators: Sequence[torch.Generator]) -> None:
+        self.env, self.policy, self.generators = env, policy, generators
+        self.observation = env.reset()
+        self.memory = policy.initial_memory(env.num_envs, self.observation.obs)
+        shape = (env.num_seeds, env.num_envs)
+        self.episode_return = torch.zeros(shape, device=env.device)
+        self.finished_return = torch.zeros(env.num_seeds, device=env.device)
+        self.finished_count = torch.zeros(env.num_seeds, device=env.device)
+
+    @torch.no_grad()
+    def collect(self, num_steps: int) -> Rollout:
+        """Act for `num_steps` steps in every world with actions drawn from the policy."""
+        spec, device = self.env.spec, self.env.device
+        lead = (self.env.num_seeds, self.env.num_envs, num_steps)
+        noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators).to(device)
+        obs = torch.empty(*lead, spec.num_agents, spec.observation.width, device=device)
+        state = torch.empty(*lead, spec.state.width, device=device)
+        log_prob = torch.empty(*lead, spec.num_agents, device=device)
+        reward = torch.empty_like(log_prob)
+        terminated = torch.empty(lead, dtype=torch.bool, device=device)
+        ended = torch.empty_like(terminated)
+        actions, finals = [], {}
+        for t in range(num_steps):
+            obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
+            outputs, self.memory = self.policy.step(self.observation.obs, self.memory)
+            action = self.policy.head.sample(outputs, noise[:, t])
+            log_prob[:, :, t] = self.policy.head.log_prob(outputs, action)
+            step = self.env.step(self.policy.head.to_environment(action))
+            actions.append(action)
+            reward[:, :, t], terminated[:, :, t] = step.reward, step.terminated
+            ended[:, :, t] = step.terminated | step.truncated
+            if step.final is not None:
+                finals[t] = step.final
+            self._finish(step.reward, ended[:, :, t], step.final is not None)
+            self.observation = step.next
+        action_rows = torch.stack(actions, 2)
+        return Rollout(obs, state, action_rows, log_prob, reward, terminated, ended, self.observation, finals)
+
+    def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
+        """Add up returns (mean over agents of the sum over time) and empty the memory of ended episodes."""
+        self.episode_return += reward.mean(-1)
+        if not any_ended:
+            return
+        self.finished_return += torch.where(ended, self.episode_return, 0.0).sum(1)
+        self.finished_count += ended.sum(1)
+        self.episode_return = torch.where(ended, 0.0, self.episode_return)
+        if self.memory.shape[-1]:
+            keep = (~ended).repeat_interleave(self.env.spec.num_agents, 1).unsqueeze(-1)
+            self.memory = self.memory * keep
+
+    def pop_mean_return(self) -> Tensor:
+        """Return the mean return [S] of episodes finished since the last call (NaN where none was)."""
+        mean = self.finished_return / self.finished_count
+        self.finished_return.zero_()
+        self.finished_count.zero_()
+        return mean
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a resumed run needs to go on bit for bit."""
+        own = {
+            "obs": self.observation.obs,
+            "state": self.observation.state,
+            "memory": self.memory,
+            "episode_return": self.episode_return,
+        }
+        return own | {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self.observation = Observation(tensors["obs"], tensors["state"])
+        self.memory, self.episode_return = tensors["memory"], tensors["episode_return"]
+        self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})

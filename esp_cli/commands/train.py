@@ -1,0 +1,167 @@
+"""`esp train`: train a new run, or go on with an old one."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.options import (
+    AlgoOption,
+    DeviceOption,
+    SeedsOption,
+    SetOption,
+    StepsOption,
+    TaskOption,
+    TransformsOption,
+    parse_assignments,
+)
+
+if TYPE_CHECKING:
+    from esp_cli.training.config import RunConfig
+    from esp_cli.training.run_folder import RunFolder
+    from esp_cli.training.trainer import Progress
+
+EPILOG = """Examples:\n
+    esp train --algo mappo --task navigation\n
+    esp train --task navigation --prior none --seeds 10 --steps 3M --out runs/cn-mappo\n
+    esp train --resume runs/cn-mappo"""
+
+DEFAULT_STEPS = 1_000_000
+
+
+def train(
+    task: TaskOption = "navigation",
+    algo: AlgoOption = "mappo",
+    preset: Annotated[
+        str, typer.Option("--preset", help="'default' (measured best) or 'paper' (the paper's settings).")
+    ] = "default",
+    prior: Annotated[
+        Literal["esp", "augment", "consistency", "none"] | None,
+        typer.Option("--prior", help="Both means of the prior, one of them, or the plain learner."),
+    ] = None,
+    transforms: TransformsOption = None,
+    consistency_coef: Annotated[
+        float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
+    ] = None,
+    network: Annotated[Literal["mlp", "gru"] | None, typer.Option("--network", help="Shape of the networks.")] = None,
+    steps: StepsOption = DEFAULT_STEPS,
+    seeds: SeedsOption = (0,),
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.", metavar="PATH")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option("--resume", help="Go on with this run folder, just as it was.", metavar="RUN")
+    ] = None,
+    device: DeviceOption = "cpu",
+    settings: SetOption = None,
+    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard files too.")] = False,
+) -> None:
+    """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
+    from esp_cli.training.config import resolve_config
+    from esp_cli.training.run_folder import RunFolder
+
+    if resume is not None:
+        folder = RunFolder.open(resume)
+    else:
+        overrides = parse_assignments(settings or [])
+        chosen = {
+            "prior.kind": prior,
+            "prior.transforms": transforms,
+            "prior.consistency_coef": consistency_coef,
+            "network.name": network,
+        }
+        overrides |= {name: value for name, value in chosen.items() if value is not None}
+        config = resolve_config(task, algo, preset, steps, seeds, _device(device), overrides)
+        name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+        folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
+    _run(folder, tensorboard)
+
+
+def _device(wanted: str) -> str:
+    import torch
+
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise ValueError("there is no CUDA device here; use --device cpu or auto")
+    return "cuda" if wanted != "cpu" and available else "cpu"
+
+
+def _run(folder: RunFolder, tensorboard: bool) -> None:
+    """Train in a locked run folder until the end or an interrupt, then say what came out and what to do next."""
+    from esp_cli.training.loading import parse_config
+    from esp_cli.training.trainer import Trainer
+
+    config = parse_config(folder.config, folder.path)
+    with folder.lock(), _stop_requests() as requests:
+        trainer = Trainer(config, folder, tensorboard)
+        if trainer.is_complete:
+            console.note(f"{folder.path} is complete at {console.format_count(trainer.step)} steps")
+            return
+        _announce(config, folder, trainer.step)
+        with console.TrainingProgress(config.steps, len(config.seeds), trainer.step, config.task) as progress:
+
+            def listen(news: Progress) -> bool:
+                for text in news.notes:
+                    console.note(text)
+                progress.update(min(news.step, news.total), _shown(news))
+                return not requests
+
+            complete = trainer.run(listen)
+    if not complete:
+        console.note(f"stopped at {console.format_count(trainer.step)} steps; go on with: esp train --resume {folder.path}")
+        raise typer.Exit(130)
+    _report(trainer.final_returns(), trainer.convention, folder)
+
+
+def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
+    prior = config.prior
+    symmetry = "no prior" if prior.kind == "none" else f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
+    verb = f"resuming at {console.format_count(step)}" if step else "training"
+    console.note(
+        f"{verb}: {config.algorithm} on {config.task}, {symmetry}, {len(config.seeds)} seed(s), "
+        f"{console.format_count(config.steps)} steps each -> {folder.path}"
+    )
+
+
+def _shown(news: Progress) -> dict[str, float]:
+    """Return the few numbers worth a look while it runs, as means over the seeds that still train."""
+    names = {"greedy": "eval/return_greedy", "return": "train/return", "entropy": "train/entropy"}
+    out = {}
+    for label, name in names.items():
+        values = [x for x in news.metrics.get(name, []) if x is not None and x == x]
+        if values:
+            out[label] = sum(values) / len(values)
+    return out
+
+
+def _report(returns: dict[str, tuple[float, float | None]], convention: str, folder: RunFolder) -> None:
+    rows = [(mode, console.format_mean(mean, sem)) for mode, (mean, sem) in returns.items()]
+    console.table(("policy", "episode return>"), rows, caption=f"convention {convention}; mean ± s.e.m. over seeds")
+    console.note(f"next: esp eval {folder.path}    esp render {folder.path} -o out.gif")
+
+
+@contextmanager
+def _stop_requests() -> Iterator[list[int]]:
+    """Turn the first Ctrl-C (or termination signal) into a request; a second one interrupts at once."""
+    requests: list[int] = []
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+        console.note("stopping after this iteration (press Ctrl-C again to stop at once)")
+
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requests
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)

@@ -1,0 +1,134 @@
+"""What a policy's outputs mean: a categorical choice or a bounded Gaussian, chosen by the task's action space.
+
+A head turns outputs into actions, log-probabilities, entropies and divergences, and knows how its outputs are pulled
+back under a symmetry. Shapes: outputs [S, B, N, outputs], action [S, B, N] (discrete) or [S, B, N, width].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind
+from torch import Tensor, nn
+
+from esp_cli.symmetry import Transform
+
+
+class Categorical(nn.Module):
+    """One of A actions with probabilities softmax(outputs)."""
+
+    def __init__(self, space: Discrete) -> None:
+        super().__init__()
+        self.num_outputs = space.count
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw what `sample` needs for actions of `shape`, per seed from its own generator: uniform [S, *shape]."""
+        return torch.stack([torch.rand(tuple(shape), generator=g, device=g.device) for g in generators])
+
+    def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Draw an action by inverting the cumulative distribution at `noise`."""
+        cumulative = torch.softmax(outputs, -1).cumsum(-1)
+        return (cumulative < noise.unsqueeze(-1)).sum(-1).clamp_(max=self.num_outputs - 1)
+
+    def mode(self, outputs: Tensor) -> Tensor:
+        """Return the most probable action."""
+        return outputs.argmax(-1)
+
+    def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
+        """Return log pi(action): [S, B, N]."""
+        return outputs.gather(-1, action.unsqueeze(-1)).squeeze(-1) - outputs.logsumexp(-1)
+
+    def log_prob_and_entropy(self, outputs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log pi(action) and the entropy - sum_a pi log pi, sharing the softmax: each [S, B, N]."""
+        log_probs = torch.log_softmax(outputs, -1)
+        entropy = -(log_probs.exp() * log_probs).sum(-1)
+        return log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1), entropy
+
+    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
+        """Return KL[softmax(p) || softmax(q)]: [S, B, N]."""
+        log_p, log_q = torch.log_softmax(p, -1), torch.log_softmax(q, -1)
+        return (log_p.exp() * (log_p - log_q)).sum(-1)
+
+    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
+        """Return the outputs whose action a has the probability that `outputs` give to K_g a."""
+        return transform.pull_back(outputs)
+
+    def to_environment(self, action: Tensor) -> Tensor:
+        """Return what `Environment.step` takes."""
+        return action
+
+
+class BoundedGaussian(nn.Module):
+    """A Gaussian over an unbounded latent action, squashed to the task's bounds when it is sent to the task.
+
+    outputs are the latent means; the log standard deviation is one learned number per item of the action layout (so
+    that rotations and reflections only move the mean). Log-probability, entropy and divergence are those of the
+    latent: the squash is a fixed bijection, so ratios and divergences are the same after it.
+    A planar vector u is squashed radially, u tanh|u| / |u|, which commutes with every rotation; other numbers by tanh.
+    """
+
+    def __init__(self, space: Continuous, num_seeds: int, initial_std: float = 0.6) -> None:
+        super().__init__()
+        self.num_outputs = space.width
+        items = [f.kind for f in space.layout.fields for _ in range(f.count)]
+        self.log_std = nn.Parameter(torch.full((num_seeds, 1, 1, len(items)), math.log(initial_std)))
+        self.item: Tensor
+        self.register_buffer("item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False)
+        self.disc: Tensor
+        self.register_buffer("disc", _same_disc(items), False)
+
+    def _log_std(self) -> Tensor:
+        return self.log_std[..., self.item]
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
+        full = (*shape, self.num_outputs)
+        return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
+
+    def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Return the latent action mean + std * noise."""
+        return outputs + self._log_std().exp() * noise
+
+    def mode(self, outputs: Tensor) -> Tensor:
+        """Return the mean."""
+        return outputs
+
+    def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
+        """Return the latent Gaussian's log density: [S, B, N]."""
+        log_std = self._log_std()
+        z = (action - outputs) * (-log_std).exp()
+        return -(0.5 * z.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
+
+    def log_prob_and_entropy(self, outputs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log density and entropy, each [S, B, N]."""
+        entropy = (self._log_std() + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+        return self.log_prob(outputs, action), entropy.expand(outputs.shape[:-1])
+
+    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
+        """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
+        return (0.5 * ((p - q) * (-self._log_std()).exp()).square()).sum(-1)
+
+    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
+        """Return K_g^{-1} applied to the means."""
+        return transform.pull_back_mean(outputs)
+
+    def to_environment(self, action: Tensor) -> Tensor:
+        """Squash the latent action to the task's bounds."""
+        length = (action.square() @ self.disc).sqrt_().clamp_min_(1e-9)
+        return action * (torch.tanh(length) / length)
+
+
+def _same_disc(items: Sequence[Kind]) -> Tensor:
+    """Return the [width, width] 0/1 matrix that is 1 where two numbers belong to one planar vector, and on the diagonal."""
+    blocks = [torch.ones(2, 2) if kind is Kind.VECTOR else torch.eye(kind.width) for kind in items]
+    return torch.block_diag(*blocks)
+
+
+Head = Categorical | BoundedGaussian
+
+
+def build_head(space: ActionSpace, num_seeds: int) -> Head:
+    """Return the head that fits an action space."""
+    return Categorical(space) if isinstance(space, Discrete) else BoundedGaussian(space, num_seeds)

@@ -1,0 +1,183 @@
+"""Layers with a leading seed axis: parameters are [S, in, out], data [S, B, in], one matrix product for all seeds.
+
+Seed k's parameters come from seed k's generator and its outputs and gradients depend on nothing else, so a seed
+learns the same alone and among ten.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import Function
+
+GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
+"""Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
+
+
+def orthogonal(generators: Sequence[torch.Generator], rows: int, columns: int, gain: float) -> Tensor:
+    """Draw one orthogonal matrix per seed (Saxe et al., 2014).
+
+    Returns:
+        [S, rows, columns] on the CPU, whatever the later device, so that a seed starts the same everywhere.
+    """
+    stack = [nn.init.orthogonal_(torch.empty(columns, rows), gain, generator=g).T for g in generators]
+    return torch.stack([matrix.contiguous() for matrix in stack])
+
+
+class SeedLinear(nn.Module):
+    """y = x W + b for S seeds.
+
+    Shape:
+        x: [S, B, in] -> [S, B, out].
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], inputs: int, outputs: int, gain: float) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(orthogonal(generators, inputs, outputs, gain))
+        self.bias = nn.Parameter(torch.zeros(len(generators), 1, outputs))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer."""
+        return torch.baddbmm(self.bias, x, self.weight)
+
+
+class SeedLayerNorm(nn.Module):
+    """Layer normalisation with one gain and bias vector per seed (Ba et al., 2016)."""
+
+    def __init__(self, num_seeds: int, width: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(num_seeds, 1, width))
+        self.bias = nn.Parameter(torch.zeros(num_seeds, 1, width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise the last axis of x: [S, B, width]."""
+        return torch.addcmul(self.bias, nn.functional.layer_norm(x, x.shape[-1:]), self.weight)
+
+
+class SeedMLP(nn.Module):
+    """A multi-layer perceptron for S seeds.
+
+    Without layer normalisation forward and backward run through one hand-written function (`_Perceptron`) that keeps
+    only the activations and works in place; with it, through torch's own layers.
+
+    Args:
+        generators: one per seed; they draw the initial weights.
+        sizes: input width, hidden widths, output width.
+        activation: "relu" or "tanh".
+        output_gain: orthogonal gain of the last layer (0.01 for a policy head, 1 for a value).
+        layer_norm: normalise the input and every hidden activation, as the MAPPO paper's code does.
+        activate_output: end with an activation, for a body on which something else stands.
+        precision: of the matrix products; parameters, inputs, outputs and parameter gradients stay float32.
+    """
+
+    def __init__(
+        self,
+        generators: Sequence[torch.Generator],
+        sizes: Sequence[int],
+        activation: str,
+        output_gain: float,
+        layer_norm: bool = False,
+        activate_output: bool = False,
+        precision: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        hidden_gain = GAINS[activation]
+        gains = [hidden_gain] * (len(sizes) - 2) + [output_gain]
+        self.layers = nn.ModuleList(
+            SeedLinear(generators, a, b, gain) for a, b, gain in zip(sizes[:-1], sizes[1:], gains, strict=True)
+        )
+        self.activation = activation
+        self.activate_output = activate_output
+        self.precision = precision
+        normed = sizes if activate_output else sizes[:-1]
+        self.norms = nn.ModuleList(SeedLayerNorm(len(generators), w) for w in normed) if layer_norm else None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [S, B, in] to [S, B, out]."""
+        if self.norms is not None:
+            return self._forward_normed(x)
+        parameters = [p for layer in self.layers for p in (layer.weight, layer.bias)]
+        return _Perceptron.apply(x, self.activation, self.activate_output, self.precision, *parameters)
+
+    def _forward_normed(self, x: Tensor) -> Tensor:
+        assert self.norms is not None
+        x = self.norms[0](x)
+        last = len(self.layers) - 1
+        for k, layer in enumerate(self.layers):
+            x = layer(x)
+            if k < last or self.activate_output:
+                x = self.norms[k + 1](torch.relu(x) if self.activation == "relu" else torch.tanh(x))
+        return x
+
+
+class _Perceptron(Function):
+    """y = W_n act(... act(x W_1 + b_1) ...) + b_n with in-place activations and a backward that reuses its buffers.
+
+    An activation's derivative is read off its output (relu: h > 0, tanh: 1 - h^2), so nothing but the
+    activations is kept. Autograd through torch's layers computes the same and is the reference in the tests.
+    """
+
+    @staticmethod
+    def forward(ctx, x, activation, activate_output, precision, *parameters):  # type: ignore[no-untyped-def]
+        x = x.to(precision)
+        inputs, weights, last = [x], [w.to(precision) for w in parameters[::2]], len(parameters) // 2 - 1
+        for k in range(last + 1):
+            x = torch.baddbmm(parameters[2 * k + 1].to(precision), x, weights[k])
+            if k < last or activate_output:
+                x = torch.relu_(x) if activation == "relu" else torch.tanh_(x)
+                inputs.append(x)
+        ctx.save_for_backward(*inputs, *weights)
+        ctx.activation, ctx.activate_output = activation, activate_output
+        return x.float()
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        saved = ctx.saved_tensors
+        count = (len(saved) - 1) // 2 if ctx.activate_output else len(saved) // 2
+        inputs, weights = saved[:-count], saved[-count:]
+        grad = grad.to(weights[0].dtype)
+        if ctx.activate_output:
+            grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
+        grads: list[Tensor | None] = [None] * (2 * count)
+        for k in reversed(range(count)):
+            grads[2 * k] = torch.bmm(inputs[k].transpose(1, 2), grad).float()
+            grads[2 * k + 1] = grad.sum(1, keepdim=True, dtype=torch.float32)
+            if k > 0:
+                grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
+        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None
+        return grad_x, None, None, None, *grads
+
+
+def _activation_backward(grad: Tensor, output: Tensor, activation: str) -> Tensor:
+    """Multiply `grad` in place by the activation's derivative at its `output`."""
+    if activation == "relu":
+        return torch.ops.aten.threshold_backward.grad_input(grad, output, 0, grad_input=grad)
+    return torch.ops.aten.tanh_backward.grad_input(grad, output, grad_input=grad)
+
+
+class SeedGRU(nn.Module):
+    """A gated recurrent unit (Cho et al., 2014) for S seeds.
+
+    r = s(x W_r + h U_r), z = s(x W_z + h U_z), n = tanh(x W_n + r * (h U_n + b_n)), h' = (1 - z) n + z h.
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int) -> None:
+        super().__init__()
+        self.hidden = hidden
+        self.input = SeedLinear(generators, inputs, 3 * hidden, 1.0)
+        self.recurrent = SeedLinear(generators, hidden, 3 * hidden, 1.0)
+
+    def forward(self, x: Tensor, h: Tensor) -> Tensor:
+        """Advance one step: x [S, B, in], h [S, B, H] -> h' [S, B, H]."""
+        return self.advance(self.input(x), h)
+
+    def advance(self, projected: Tensor, h: Tensor) -> Tensor:
+        """Advance one step from the already projected input [S, B, 3H]."""
+        xr, xz, xn = projected.chunk(3, -1)
+        hr, hz, hn = self.recurrent(h).chunk(3, -1)
+        reset, update = torch.sigmoid(xr + hr), torch.sigmoid(xz + hz)
+        candidate = torch.tanh(torch.addcmul(xn, reset, hn))
+        return torch.lerp(candidate, h, update)

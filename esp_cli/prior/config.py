@@ -1,0 +1,39 @@
+"""What a user may choose of the prior."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class PriorConfig(BaseModel):
+    """The symmetry prior: which elements, and by which of the two soft means.
+
+    `kind` "esp" is both means, "augment" and "consistency" one of them, "none" the plain learner.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["esp", "augment", "consistency", "none"] = "esp"
+    transforms: str = Field("d4", description="elements or a group; paper: rot90; ours: measured best on navigation")
+    copies: Literal["draw", "all"] = Field(
+        "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"
+    )
+    consistency_coef: float = Field(0.5, ge=0, description="c of Eq. 10; paper: 0.5")
+    old_log_prob: Literal["copy", "recompute"] = Field(
+        "copy", description="pi_old of a copied transition: that of the original, or evaluated anew on the copy (Eq. 7)"
+    )
+    stop_gradient: Literal["none", "original", "transformed"] = Field(
+        "none", description="which side of the consistency losses is held fixed; authors' code: none"
+    )
+
+    @property
+    def augments(self) -> bool:
+        """Whether copies of transitions enter the learner's own loss."""
+        return self.kind in ("esp", "augment")
+
+    @property
+    def coefficient(self) -> float:
+        """c, or 0 where the consistency loss is off."""
+        return self.consistency_coef if self.kind in ("esp", "consistency") else 0.0

@@ -1,0 +1,50 @@
+"""The object that a learner is given: it hands out transforms and says what to do with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from esp_envs.spec import TaskSpec
+
+from esp_cli.prior.config import PriorConfig
+from esp_cli.symmetry import Transform, transform_set
+
+
+class SymmetryPrior:
+    """A task's known symmetry, ready for use in a learner's update.
+
+    Args:
+        config: what the user chose.
+        spec: the task; it decides how an element acts, and may refuse it.
+        device: where the transforms live.
+
+    Raises:
+        ValueError: the task cannot carry an element, or all copies of an infinite group are asked for.
+    """
+
+    def __init__(self, config: PriorConfig, spec: TaskSpec, device: torch.device | str = "cpu") -> None:
+        self.config = config
+        self.active = config.augments or config.coefficient > 0
+        self.transforms = transform_set(config.transforms, spec, device) if self.active else None
+        if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
+            raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
+
+    @property
+    def num_copies(self) -> int:
+        """Transformed copies of every row of a minibatch."""
+        if self.transforms is None:
+            return 0
+        return self.transforms.size if self.config.copies == "all" else 1
+
+    def for_minibatch(self, generators: Sequence[torch.Generator]) -> list[Transform]:
+        """Return the transforms of the next minibatch, each one element per seed.
+
+        Args:
+            generators: one per seed; only `copies` "draw" uses them, and only if there is something to draw.
+        """
+        if self.transforms is None:
+            return []
+        if self.config.copies == "all" or self.transforms.size == 1:
+            return self.transforms.each()
+        return [self.transforms.draw(generators)]

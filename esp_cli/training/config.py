@@ -1,0 +1,124 @@
+"""The resolved configuration of a run: task, algorithm, network and prior are independent choices."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from esp_envs.registry import task_class
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from esp_cli.algorithms.registry import ALGORITHMS, PRESETS
+from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.prior import PriorConfig
+
+
+class EvaluationConfig(BaseModel):
+    """How a run is evaluated while it trains (the field's protocol: 32 episodes every 10k steps)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    every_steps: int = Field(10_000, ge=1, description="environment steps per seed between evaluations")
+    episodes: int = Field(32, ge=1, description="per seed, greedy and stochastic each")
+
+
+class RunConfig(BaseModel):
+    """Everything that decides a run's numbers. Two runs of one config on one machine are equal bit for bit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str
+    algorithm: str
+    preset: str = "default"
+    steps: int = Field(ge=1, description="environment steps per seed")
+    seeds: tuple[int, ...] = Field((0,), min_length=1)
+    task_settings: dict[str, Any] = Field(default_factory=dict)
+    algorithm_settings: dict[str, Any] = Field(default_factory=dict)
+    network: NetworkConfig = NetworkConfig()
+    prior: PriorConfig = PriorConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+    device: str = "cpu"
+
+
+def resolve_config(
+    task: str,
+    algorithm: str = "mappo",
+    preset: str = "default",
+    steps: int = 1_000_000,
+    seeds: Sequence[int] = (0,),
+    device: str = "cpu",
+    overrides: Mapping[str, object] | None = None,
+) -> RunConfig:
+    """Resolve a preset and overrides into a full configuration.
+
+    Args:
+        task: registered task name.
+        algorithm: registered algorithm name.
+        preset: one of the algorithm's presets.
+        steps: environment steps per seed.
+        seeds: run seeds.
+        device: "cpu" or "cuda".
+        overrides: dotted names to values: "mappo.learning_rate", "task.num_agents", "network.hidden",
+            "prior.kind", "evaluation.episodes". Text is read as JSON where that is possible.
+
+    Raises:
+        ValueError: an unknown name or a value out of range, in one sentence.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm '{algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    if preset not in PRESETS[algorithm]:
+        raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(PRESETS[algorithm])}")
+    names = {"task": "task", algorithm: algorithm, "network": "network", "prior": "prior", "evaluation": "evaluation"}
+    sections: dict[str, dict[str, object]] = {name: {} for name in names}
+    for section, values in PRESETS[algorithm][preset].items():
+        sections[section].update(values)
+    for dotted, value in (overrides or {}).items():
+        section, dot, key = dotted.partition(".")
+        if not dot or section not in sections:
+            raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {', '.join(names)}")
+        sections[section][key] = _read(value)
+
+    task_settings = _validated(task_class(task).Settings, sections["task"], "task")
+    algorithm_settings = _validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
+    return RunConfig(
+        task=task,
+        algorithm=algorithm,
+        preset=preset,
+        steps=steps,
+        seeds=tuple(seeds),
+        task_settings=task_settings.model_dump(),
+        algorithm_settings=algorithm_settings.model_dump(),
+        network=_validated(NetworkConfig, sections["network"], "network"),
+        prior=_validated(PriorConfig, sections["prior"], "prior"),
+        evaluation=_validated(EvaluationConfig, sections["evaluation"], "evaluation"),
+        device=device,
+    )
+
+
+def _read(value: object) -> object:
+    """Read command-line text as JSON where it is JSON ("64", "[64, 64]", "true"), else as it stands."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return json.loads(value)
+    except ValueError:
+        return value
+
+
+def _validated(model: type[BaseModel], values: Mapping[str, object], section: str) -> Any:
+    """Build `model`, turning pydantic's report into one sentence."""
+    try:
+        return model(**values)
+    except ValidationError as error:
+        raise ValueError(one_sentence(error, model, section)) from None
+
+
+def one_sentence(error: ValidationError, model: type[BaseModel], section: str) -> str:
+    """Say what is wrong with the first bad setting, and what could stand there."""
+    first = error.errors()[0]
+    name = ".".join([section, *(str(part) for part in first["loc"])])
+    if first["type"] == "extra_forbidden":
+        return f"unknown setting '{name}'; {section} has {', '.join(model.model_fields)}"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"bad value {first['input']!r} for '{name}': {message[0].lower()}{message[1:]}"

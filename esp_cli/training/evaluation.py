@@ -1,0 +1,108 @@
+"""Judging a policy: whole episodes, returns with their convention, beside random and heuristic anchors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from esp_envs.base import Environment, Observation
+from torch import Tensor
+
+from esp_cli.networks.policy import Policy
+
+
+class Controller(Protocol):
+    """Whoever chooses joint actions: a trained policy or an anchor."""
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        """Prepare for new episodes in all worlds."""
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        """Return what `Environment.step` takes."""
+
+
+class PolicyController:
+    """A trained policy, greedy or drawing its actions.
+
+    Args:
+        policy: S policies.
+        generators: one per seed for action noise, or None to act greedily.
+    """
+
+    def __init__(self, policy: Policy, generators: Sequence[torch.Generator] | None = None) -> None:
+        self.policy, self.generators = policy, generators
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        """Empty the memory."""
+        self.memory = self.policy.initial_memory(env.num_envs, observation.obs)
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        """Return the greedy or a drawn action."""
+        noise = None
+        if self.generators is not None:
+            shape = (env.num_envs, env.spec.num_agents)
+            noise = self.policy.head.noise(shape, self.generators).to(env.device)
+        action, self.memory = self.policy.act(observation.obs, self.memory, noise)
+        return action
+
+
+class RandomController:
+    """The uniformly random policy: the lower anchor."""
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        """Nothing to prepare."""
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        """Return a random action from the environment's own generators."""
+        return env.random_action()
+
+
+class HeuristicController:
+    """A hand-written policy of the task: the upper anchor."""
+
+    def __init__(self, name: str | None = None) -> None:
+        self.name = name
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        """Nothing to prepare."""
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        """Return the heuristic's action."""
+        return env.heuristic(self.name)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What one episode in every world brought.
+
+    Attributes:
+        returns: [S, E] mean over agents of the sum of rewards over time.
+        lengths: [S, E] steps.
+        metrics: task measures, each [S, E], averaged over the episode's steps.
+    """
+
+    returns: Tensor
+    lengths: Tensor
+    metrics: dict[str, Tensor]
+
+
+@torch.no_grad()
+def play(env: Environment, controller: Controller) -> Episodes:
+    """Play one episode in every world and add up what it brings; later episodes of a world do not count."""
+    observation = env.reset()
+    controller.begin(env, observation)
+    shape = (env.num_seeds, env.num_envs)
+    running = torch.ones(shape, dtype=torch.bool, device=env.device)
+    returns, lengths = torch.zeros(shape, device=env.device), torch.zeros(shape, device=env.device)
+    sums: dict[str, Tensor] = {}
+    for _ in range(env.spec.horizon):
+        step = env.step(controller.act(env, observation))
+        returns += torch.where(running, step.reward.mean(-1), 0.0)
+        lengths += running
+        for name, value in step.metrics.items():
+            sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)  # type: ignore[arg-type]
+        running &= ~(step.terminated | step.truncated)
+        observation = step.next
+    return Episodes(returns, lengths, {name: value / lengths for name, value in sums.items()})

@@ -1,0 +1,218 @@
+"""The collect-learn-evaluate loop: resumable bit for bit, stoppable at any moment, silent (a listener speaks)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from esp_envs.base import Environment
+from esp_envs.registry import make
+from torch import Tensor
+
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training.config import RunConfig
+from esp_cli.training.evaluation import PolicyController, play
+from esp_cli.training.metrics import MetricsWriter
+from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.streams import generators, stream_seeds
+
+CHECKPOINT_SECONDS = 30.0
+"""A kill loses at most this much work; a checkpoint takes some milliseconds."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a listener is told after every iteration.
+
+    Attributes:
+        step: environment steps per seed so far.
+        total: environment steps per seed of the whole run.
+        metrics: the newest row, each value one number per seed.
+        notes: sentences for the user (a seed stopped, a checkpoint was damaged).
+    """
+
+    step: int
+    total: int
+    metrics: Mapping[str, list[float | None]]
+    notes: tuple[str, ...] = ()
+
+
+Listener = Callable[[Progress], bool]
+"""Told of progress; returns False to ask for a clean stop after this iteration."""
+
+
+def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
+    """Make `num_envs` worlds per seed whose draws come from the named random stream."""
+    return make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
+
+
+def build_learner(config: RunConfig) -> Learner:
+    """Build the learner of a run, with its worlds, from the configuration alone."""
+    cls = ALGORITHMS[config.algorithm]
+    settings = cls.config_class(**config.algorithm_settings)
+    env = build_environment(config, settings.num_envs, "training worlds")
+    return cls(
+        env, settings, config.network, config.prior, generators(config.seeds, "learner"), generators(config.seeds, "prior")
+    )
+
+
+class Trainer:
+    """One run: S seeds of one configuration.
+
+    Args:
+        config: what to train.
+        folder: where results go; held by the caller's lock. A checkpoint found there is continued.
+
+    Raises:
+        ValueError: the checkpoint does not fit the configuration.
+    """
+
+    def __init__(self, config: RunConfig, folder: RunFolder) -> None:
+        self.config, self.folder = config, folder
+        self.learner = build_learner(config)
+        self.iteration = 0
+        self.stopped_seeds: dict[int, int] = {}
+        self.elapsed_s = 0.0
+        self.notes: list[str] = []
+        self._restore()
+        self._good = self._snapshot()
+        self._eval_env = build_environment(config, config.evaluation.episodes, "evaluation")
+
+    @property
+    def step(self) -> int:
+        """Environment steps per seed so far."""
+        return self.iteration * self.learner.steps_per_iteration
+
+    @property
+    def total_iterations(self) -> int:
+        """Iterations of the whole run, the last one rounded up."""
+        return -(-self.config.steps // self.learner.steps_per_iteration)
+
+    def run(self, listener: Listener) -> bool:
+        """Train to the end or until the listener asks to stop.
+
+        Returns:
+            Whether the run is complete.
+
+        Raises:
+            ValueError: every seed stopped on a number that is not finite.
+        """
+        started, saved = time.monotonic() - self.elapsed_s, time.monotonic()
+        with MetricsWriter(self.folder.metrics_path) as writer:
+            if self.iteration == 0:
+                self._record(writer, self._evaluate(), listener)
+            while self.iteration < self.total_iterations:
+                tick = time.monotonic()
+                row = self._iterate()
+                row["time/steps_per_second"] = self.learner.steps_per_iteration * len(self.config.seeds) / row.pop("_s")
+                self.elapsed_s = time.monotonic() - started
+                row["time/elapsed_s"] = self.elapsed_s
+                going = self._record(writer, row, listener)
+                is_last = self.iteration == self.total_iterations
+                if is_last or not going or tick - saved > CHECKPOINT_SECONDS:
+                    self._checkpoint()
+                    saved = time.monotonic()
+                if len(self.stopped_seeds) == len(self.config.seeds):
+                    raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
+                if not going and not is_last:
+                    return False
+        self.folder.write_policy(self._policy_tensors(), self._policy_meta())
+        return True
+
+    def _iterate(self) -> dict[str, Any]:
+        """Collect, learn, freeze broken seeds, evaluate where it is time."""
+        begun = time.monotonic()
+        before = self.step // self.config.evaluation.every_steps
+        metrics = self.learner.iterate(self.iteration / self.total_iterations)
+        self.iteration += 1
+        row: dict[str, Any] = {name: value.cpu() for name, value in metrics.items()}
+        self._stop_broken_seeds(row)
+        row["_s"] = time.monotonic() - begun
+        if self.step // self.config.evaluation.every_steps > before or self.iteration == self.total_iterations:
+            row |= self._evaluate()
+        return row
+
+    def _evaluate(self) -> dict[str, Tensor]:
+        """Play greedy and stochastic episodes; every seed's worlds depend on its seed and the step alone."""
+        env, row = self._eval_env, {}
+        for mode in ("greedy", "stochastic"):
+            stream = ("evaluation", mode, self.step)
+            for generator, seed in zip(env.generators, stream_seeds(self.config.seeds, *stream), strict=True):
+                generator.manual_seed(seed)
+            noise = generators(self.config.seeds, *stream, "noise") if mode == "stochastic" else None
+            episodes = play(env, PolicyController(self.learner.policy, noise))
+            row[f"eval/return_{mode}"] = episodes.returns.mean(1).cpu()
+            if mode == "greedy":
+                row |= {f"eval/{name}": value.mean(1).cpu() for name, value in episodes.metrics.items()}
+        return row
+
+    def _stop_broken_seeds(self, row: dict[str, Tensor]) -> None:
+        """Put a seed whose numbers are not finite back to its last good state, for the rest of the run."""
+        watched = [value for name, value in row.items() if "loss" in name or "grad_norm" in name]
+        finite = torch.stack(watched).isfinite().all(0)
+        for index in (~finite).nonzero().flatten().tolist():
+            if index not in self.stopped_seeds:
+                self.stopped_seeds[index] = self.step
+                seed = self.config.seeds[index]
+                self.notes.append(
+                    f"seed {seed} stopped at step {self.step}: a loss is not finite; its last good policy is kept"
+                )
+        if self.stopped_seeds:
+            # Not strict: before the first iteration the optimiser has no moments; weights come first.
+            for tensor, good in zip(self.learner.seed_tensors(), self._good, strict=False):
+                for index in self.stopped_seeds:
+                    tensor[index] = good[index]
+        self._good = self._snapshot()
+
+    @torch.no_grad()
+    def _snapshot(self) -> list[Tensor]:
+        return [tensor.clone() for tensor in self.learner.seed_tensors()]
+
+    def _record(self, writer: MetricsWriter, row: dict[str, Any], listener: Listener) -> bool:
+        """Write a metrics row, without the numbers of stopped seeds, and tell the listener."""
+        values: dict[str, Any] = {}
+        for name, value in row.items():
+            numbers = value.tolist() if isinstance(value, Tensor) else value
+            if isinstance(numbers, list):
+                numbers = [None if k in self.stopped_seeds else x for k, x in enumerate(numbers)]
+            values[name] = numbers
+        writer.write(self.step, values)
+        notes, self.notes = tuple(self.notes), []
+        return listener(Progress(self.step, self.config.steps, values, notes))
+
+    def _checkpoint(self) -> None:
+        meta = {
+            "iteration": self.iteration,
+            "step": self.step,
+            "elapsed_s": self.elapsed_s,
+            "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
+        }
+        self.folder.write_checkpoint(self.step, self.learner.state_dict(), meta)
+
+    def _restore(self) -> None:
+        """Continue from the newest good checkpoint, if there is one."""
+        found = self.folder.latest_checkpoint()
+        if found is None:
+            return
+        tensors, meta = found
+        self.learner.load_state_dict(tensors)
+        self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
+        self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
+        self.folder.truncate_metrics(self.step)
+
+    def _policy_tensors(self) -> dict[str, Tensor]:
+        return dict(self.learner.policy.state_dict())
+
+    def _policy_meta(self) -> dict[str, Any]:
+        """Describe the policy file so that it can be used without the run folder."""
+        return {
+            "task": self.config.task,
+            "task_version": self.learner.collector.env.spec.version,
+            "network": self.config.network.name,
+            "activation": self.config.network.activation,
+            "config": self.config.model_dump(mode="json"),
+        }
