@@ -36,7 +36,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spec: TaskSpec) -> Non
     if carried := carried_groups(spec):
         plane = [name for name in carried if name != "agents"]
         advice = f"use a group within {plane[-1]}" if plane else "use agents"
-        if _action_reason(moved, spec) and not _task_reason(moved, spec):
+        if _action_reason(moved, spec):
             advice = advice.replace("use ", "use continuous actions or ", 1)
     raise ValueError(f"{text} cannot act on {spec.name}: {reason}; {advice}")
 

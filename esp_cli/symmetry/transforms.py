@@ -136,7 +136,7 @@ class Transform:
         Shape:
             [S, ..., 1] or [S, ..., N] to the same.
         """
-        if self.places is None or (values.shape[-1] == 1 and self.num_agents > 1):
+        if self.places is None or values.shape[-1] == 1:
             return values
         return self._gather(values, self.places, agent_axis=-1)
 

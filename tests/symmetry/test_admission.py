@@ -1,0 +1,77 @@
+"""Which groups a task carries, and how the others are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from esp_cli.symmetry import carried_groups, transform_set
+from esp_envs.spec import Field, Kind, layout
+from tests.symmetry.toy_actions import FORCE, WHEEL_PAIRS
+
+UP_TO_D4 = ("c2", "d2", "c4", "d4")
+ALL = (*UP_TO_D4, "c8", "d8", "so2", "o2")
+
+
+def test_four_directions_carry_d4_whatever_the_dynamics_carry(make_spec) -> None:
+    assert carried_groups(make_spec()) == (*UP_TO_D4, "agents")
+
+
+def test_forces_and_wheels_carry_what_the_dynamics_carry(make_spec) -> None:
+    assert carried_groups(make_spec(action=FORCE)) == (*ALL, "agents")
+    assert carried_groups(make_spec(action=WHEEL_PAIRS)) == (*ALL, "agents")
+    assert carried_groups(make_spec(action=FORCE, symmetry="so2")) == ("c2", "c4", "c8", "so2", "agents")
+    assert carried_groups(make_spec(action=FORCE, symmetry="d4*agents")) == (*UP_TO_D4, "agents")
+    assert carried_groups(make_spec(action=FORCE, symmetry="c1")) == ("agents",)
+
+
+def test_agents_need_company_and_a_state_that_names_them(make_spec) -> None:
+    assert "agents" not in carried_groups(make_spec(1))
+    nameless = replace(make_spec(), state=layout(Field("positions", Kind.VECTOR, 5)))
+    assert "agents" not in carried_groups(nameless)
+    assert "agents" in carried_groups(make_spec(joint_state=True))
+
+
+def test_actions_that_cannot_follow_are_refused_in_one_sentence(make_spec) -> None:
+    with pytest.raises(ValueError, match=r"^c8 cannot act on toy: ") as caught:
+        transform_set("c8", make_spec())
+    assert str(caught.value) == (
+        "c8 cannot act on toy: action 'left' turned by 45 degrees is no action; "
+        "use continuous actions or a group within d4"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "changes", "message"),
+    [
+        ("so2", {}, "action 'left' turned by 57.2958 degrees is no action; use continuous actions or a group within"),
+        ("rot90,flip22.5", {}, "action 'left' mirrored by flip22.5 is no action"),
+        ("c8", {"symmetry": "d4"}, "is no action; use continuous actions or a group within d4"),
+        ("c8", {"action": FORCE, "symmetry": "d4"}, "rot45 is no symmetry of its dynamics and reward, which carry d4"),
+        ("flip-x", {"action": FORCE, "symmetry": "so2"}, "flip-x is no symmetry .*; use a group within so2"),
+        ("o2", {"action": FORCE, "symmetry": "d4"}, "rot57.296 is no symmetry"),
+        ("rot90", {"symmetry": "c1"}, "rot90 is no symmetry .* carry c1; use agents"),
+    ],
+)
+def test_refusals(make_spec, text, changes, message) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        transform_set(text, make_spec(**changes))
+    assert "\n" not in str(caught.value)
+
+
+def test_agents_are_refused_where_layouts_do_not_name_them(make_spec) -> None:
+    nameless = replace(make_spec(), state=layout(Field("positions", Kind.VECTOR, 5)))
+    with pytest.raises(
+        ValueError, match="state does not say which numbers belong to which agent; use a group within d4"
+    ):
+        transform_set("d4*agents", nameless)
+    with pytest.raises(ValueError, match="use --prior none"):
+        transform_set("rot90", replace(nameless, symmetry="c1"))
+
+
+def test_each_carried_group_makes_a_set(make_spec) -> None:
+    for action in (FORCE, WHEEL_PAIRS):
+        spec = make_spec(action=action)
+        for name in carried_groups(spec):
+            assert transform_set(name, spec).names

@@ -1,0 +1,131 @@
+"""Group axioms, over a registry of groups."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli.symmetry import (
+    Element,
+    FiniteGroup,
+    agent_permutations,
+    cyclic,
+    dihedral,
+    direct_product,
+    mirror,
+    orthogonal,
+    rotation,
+    special_orthogonal,
+)
+
+ORDERS = {
+    "c1": (cyclic(1), 1),
+    "c2": (cyclic(2), 2),
+    "c4": (cyclic(4), 4),
+    "c7": (cyclic(7), 7),
+    "c8": (cyclic(8), 8),
+    "d1": (dihedral(1), 2),
+    "d2": (dihedral(2), 4),
+    "d4": (dihedral(4), 8),
+    "d8": (dihedral(8), 16),
+    "agents": (agent_permutations(3), 6),
+    "d4*agents": (direct_product(dihedral(4), agent_permutations(3)), 48),
+}
+
+
+@pytest.fixture(params=ORDERS, ids=str)
+def group(request: pytest.FixtureRequest) -> FiniteGroup:
+    found = ORDERS[request.param][0]
+    assert isinstance(found, FiniteGroup)
+    return found
+
+
+def test_name_and_order(group: FiniteGroup) -> None:
+    assert group.order == ORDERS[group.name][1]
+    assert group.elements[0] == Element()
+
+
+def test_the_product_table_is_closed_and_each_row_and_column_holds_all(group: FiniteGroup) -> None:
+    everyone = np.arange(group.order)
+    assert np.all(np.sort(group.product, axis=0) == everyone[:, None])
+    assert np.all(np.sort(group.product, axis=1) == everyone[None, :])
+
+
+def test_identity_and_inverses(group: FiniteGroup) -> None:
+    everyone = np.arange(group.order)
+    np.testing.assert_array_equal(group.product[0], everyone)
+    np.testing.assert_array_equal(group.product[:, 0], everyone)
+    np.testing.assert_array_equal(group.product[everyone, group.inverses], 0)
+
+
+def test_products_associate(group: FiniteGroup) -> None:
+    p = group.product
+    np.testing.assert_array_equal(p[p], p[np.arange(group.order)[:, None, None], p[None]])
+
+
+def test_matrices_multiply_as_elements_do(group: FiniteGroup) -> None:
+    matrices = np.stack([e.matrix for e in group.elements])
+    np.testing.assert_allclose(matrices[:, None] @ matrices[None, :], matrices[group.product], atol=1e-15)
+    np.testing.assert_allclose(matrices[group.inverses], matrices.transpose(0, 2, 1), atol=1e-15)
+
+
+def test_d4_by_hand() -> None:
+    names = [e.name for e in dihedral(4).elements]
+    assert names == ["identity", "rot90", "rot180", "rot270", "flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal"]
+    d4 = dihedral(4)
+    row, column = names.index("rot90"), names.index("flip-x")
+    assert names[d4.product[row, column]] == "flip-diagonal"
+    assert names[d4.product[column, row]] == "flip-antidiagonal"
+
+
+def test_generators_decide_the_group() -> None:
+    assert FiniteGroup.generated_by("two mirrors", [mirror(0), mirror(45)]).elements == dihedral(4).elements
+    assert FiniteGroup.generated_by("half turn", [rotation(180)]).order == 2
+
+
+def test_too_many_elements_are_refused() -> None:
+    with pytest.raises(ValueError, match="more than 1024 elements"):
+        FiniteGroup.generated_by("fine", [rotation("0.1")])
+
+
+def test_one_agent_cannot_change_places() -> None:
+    with pytest.raises(ValueError, match="two or more"):
+        agent_permutations(1)
+
+
+def test_eight_agents_are_sampled_and_every_draw_is_an_order() -> None:
+    group = agent_permutations(8)
+    assert not isinstance(group, FiniteGroup)
+    generator = torch.Generator().manual_seed(0)
+    draws = [group.draw(generator) for _ in range(50)]
+    assert len(set(draws)) > 40
+    assert all(d in group for d in draws)
+    assert Element(permutation=(1, 0)) not in group
+    assert rotation(90) not in group
+
+
+@pytest.mark.parametrize("plane", [special_orthogonal(), orthogonal()], ids=["so2", "o2"])
+def test_angles_are_drawn_uniformly(plane) -> None:
+    generator = torch.Generator().manual_seed(1)
+    draws = [plane.draw(generator) for _ in range(2000)]
+    # The mean of cos and of sin of a uniform angle is 0 with a standard error of sqrt(1 / 2 / 2000) = 0.016.
+    angles = np.array([float(d.turn) * math.tau for d in draws])
+    assert abs(np.cos(angles).mean()) < 0.05
+    assert abs(np.sin(angles).mean()) < 0.05
+    share = np.mean([d.mirrored for d in draws])
+    assert share == 0 if plane.name == "so2" else 0.45 < share < 0.55
+
+
+def test_membership_of_continuous_groups() -> None:
+    assert rotation("12.34") in special_orthogonal()
+    assert mirror(0) not in special_orthogonal()
+    assert mirror(0) in orthogonal()
+    assert Element(permutation=(1, 0)) not in orthogonal()
+    both = direct_product(orthogonal(), agent_permutations(2))
+    assert both.name == "o2*agents"
+    assert mirror(10) @ Element(permutation=(1, 0)) in both
+    assert all(w in both for w in both.witnesses())
+    assert "rot90" not in both

@@ -1,0 +1,191 @@
+"""L_g and K_g: by hand, as homomorphisms over random layouts, and against a world whose observations are computed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from esp_cli.symmetry import Element, agent_permutations, dihedral, direct_product, mirror, rotation
+from esp_cli.symmetry.representation import (
+    KIND_MATRICES,
+    action_map,
+    joint_matrix,
+    kind_matrix,
+    layout_matrix,
+    state_matrix,
+)
+from esp_envs.spec import Discrete, Field, Items, Kind, layout
+from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
+
+D4, D8 = dihedral(4), dihedral(8)
+D4_AGENTS = direct_product(D4, agent_permutations(3))
+
+
+def stack(*elements: Element, num_agents: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Return planar matrices [G, 2, 2] and places [G, N]."""
+    stay = tuple(range(num_agents))
+    return np.stack([e.matrix for e in elements]), np.array([e.permutation or stay for e in elements])
+
+
+def test_every_kind_has_a_representation_of_its_width() -> None:
+    planar, _ = stack(*D8.elements)
+    assert set(KIND_MATRICES) == set(Kind)
+    for kind in Kind:
+        assert kind_matrix(kind, planar).shape == (16, kind.width, kind.width)
+
+
+@pytest.mark.parametrize("kind", Kind)
+def test_kinds_are_orthogonal_homomorphisms(kind: Kind) -> None:
+    matrices = kind_matrix(kind, stack(*D8.elements)[0])
+    np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[D8.product], atol=1e-15)
+    np.testing.assert_allclose(
+        matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(kind.width), (16, 1, 1)), atol=1e-15
+    )
+
+
+def test_a_row_by_hand() -> None:
+    row_layout = layout(
+        Field("velocity", Kind.VECTOR),
+        Field("battery", Kind.SCALAR),
+        Field("rate", Kind.PSEUDOSCALAR),
+        Field("wheels", Kind.WHEELS),
+        Field("landmarks", Kind.VECTOR, 2),
+    )
+    row = np.array([1.0, 2.0, 7.0, 3.0, 0.25, 0.5, 1.0, 0.0, 0.0, 1.0])
+    turned, mirrored = layout_matrix(row_layout, stack(rotation(90), mirror(0))[0]) @ row
+    np.testing.assert_array_equal(turned, [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0])
+    np.testing.assert_array_equal(mirrored, [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1])
+
+
+def test_others_are_reordered_by_hand() -> None:
+    # Row i: own number, then those of the others in index order. Agents 0, 1, 2 hold the numbers 10, 11, 12.
+    row_layout = layout(Field("own", Kind.SCALAR), Field("others", Kind.SCALAR, 2, items=Items.OTHERS))
+    rows = np.array([[10, 11, 12], [11, 10, 12], [12, 10, 11]], dtype=float)
+    # Agent 0 goes to place 1, 1 to 2, 2 to 0: the places now hold 12, 10, 11.
+    matrix = joint_matrix(row_layout, *stack(Element(permutation=(1, 2, 0))))[0]
+    np.testing.assert_array_equal((matrix @ rows.ravel()).reshape(3, 3), [[12, 10, 11], [10, 12, 11], [11, 12, 10]])
+
+
+def observe(positions: np.ndarray, landmark: np.ndarray) -> np.ndarray:
+    """Compute rows [N, D] of `WORLD` from positions [N, 2] and a landmark [2]."""
+    rows = []
+    for i, own in enumerate(positions):
+        others = np.delete(positions, i, axis=0) - own
+        distances = np.linalg.norm(positions - own, axis=1)
+        rows.append(np.concatenate([landmark - own, others.ravel(), distances]))
+    return np.array(rows)
+
+
+WORLD = layout(
+    Field("landmark", Kind.VECTOR),
+    Field("others", Kind.VECTOR, 2, items=Items.OTHERS),
+    Field("distances", Kind.SCALAR, 3, items=Items.AGENTS),
+)
+
+
+def test_transforming_rows_equals_observing_the_transformed_world() -> None:
+    rng = np.random.default_rng(0)
+    positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
+    joint = joint_matrix(WORLD, *stack(*D4_AGENTS.elements))
+    for element, matrix in zip(D4_AGENTS.elements, joint, strict=True):
+        moved = np.empty_like(positions)
+        for i in range(3):
+            place = i if element.permutation is None else element.permutation[i]
+            moved[place] = element.matrix @ positions[i]
+        expected = observe(moved, element.matrix @ landmark)
+        np.testing.assert_allclose((matrix @ observe(positions, landmark).ravel()).reshape(3, -1), expected, atol=1e-15)
+
+
+def test_forgetting_that_items_are_others_is_noticed() -> None:
+    wrong = replace(WORLD, fields=tuple(replace(f, items=Items.FIXED) for f in WORLD.fields))
+    rng = np.random.default_rng(0)
+    positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
+    swap = joint_matrix(wrong, *stack(Element(permutation=(1, 0, 2))))[0]
+    got = (swap @ observe(positions, landmark).ravel()).reshape(3, -1)
+    assert np.abs(got - observe(positions[[1, 0, 2]], landmark)).max() > 0.1
+
+
+def random_layout(rng: np.random.Generator, num_agents: int):
+    """Return a random layout of one to six fields of all kinds and ways of counting."""
+    counts = {Items.FIXED: None, Items.OTHERS: num_agents - 1, Items.AGENTS: num_agents}
+    fields = []
+    for i in range(rng.integers(1, 7)):
+        items = list(Items)[rng.integers(3)]
+        count = counts[items] or int(rng.integers(1, 4))
+        fields.append(Field(f"f{i}", list(Kind)[rng.integers(len(Kind))], count, items=items))
+    return layout(*fields)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_joint_matrices_are_homomorphisms_over_random_layouts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    row_layout = random_layout(rng, 3)
+    g = rng.integers(D4_AGENTS.order, size=40)
+    h = rng.integers(D4_AGENTS.order, size=40)
+    matrices = joint_matrix(row_layout, *stack(*D4_AGENTS.elements))
+    # Signed permutation matrices: products are exact.
+    np.testing.assert_array_equal(matrices[g] @ matrices[h], matrices[D4_AGENTS.product[g, h]])
+    np.testing.assert_array_equal(matrices[D4_AGENTS.inverses], matrices.transpose(0, 2, 1))
+    np.testing.assert_array_equal(np.abs(matrices).sum(axis=2), 1)
+
+
+def test_states_are_homomorphisms_and_a_joint_state_moves_like_the_rows(make_spec) -> None:
+    places = stack(*D4_AGENTS.elements)
+    own = state_matrix(make_spec(), *places)
+    np.testing.assert_array_equal(own[:, None] @ own, own[D4_AGENTS.product])
+    joint = make_spec(joint_state=True)
+    np.testing.assert_array_equal(state_matrix(joint, *places), joint_matrix(joint.observation, *places))
+
+
+def test_a_state_by_hand(make_spec) -> None:
+    # positions of agents 0, 1, 2; two landmarks; turning rates of agents 0, 1, 2.
+    state = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0.1, 0.2, 0.3])
+    element = mirror(0) @ Element(permutation=(1, 2, 0))
+    got = state_matrix(make_spec(), *stack(element))[0] @ state
+    np.testing.assert_array_equal(got, [5, -6, 1, -2, 3, -4, 7, -8, 9, -10, -0.3, -0.1, -0.2])
+
+
+def test_actions_by_hand() -> None:
+    stay, left, right, down, up = range(5)
+    turned, mirrored = action_map(FOUR_DIRECTIONS, [rotation(90), mirror(0)])
+    assert turned.tolist() == [stay, down, up, right, left]
+    assert mirrored.tolist() == [stay, left, right, up, down]
+
+
+def test_wheel_pairs_ignore_turns_and_swap_in_a_mirror() -> None:
+    turned, mirrored = action_map(WHEEL_PAIRS, [rotation("33.3"), mirror("12.5")])
+    assert turned.tolist() == [0, 1, 2, 3]
+    assert mirrored.tolist() == [0, 1, 3, 2]
+
+
+def test_actions_are_a_homomorphism_in_any_order_of_actions() -> None:
+    order = np.random.default_rng(0).permutation(5)
+    shuffled = Discrete(
+        Kind.VECTOR,
+        tuple(FOUR_DIRECTIONS.points[i] for i in order),
+        tuple(FOUR_DIRECTIONS.names[i] for i in order),
+    )
+    k = action_map(shuffled, D4.elements)
+    for g in range(8):
+        for h in range(8):
+            np.testing.assert_array_equal(k[g][k[h]], k[D4.product[g, h]])
+
+
+def test_an_action_without_an_image_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^action 'left' turned by 45 degrees is no action$"):
+        action_map(FOUR_DIRECTIONS, [rotation(90), rotation(45)])
+    with pytest.raises(ValueError, match=r"mirrored by flip22\.5 is no action$"):
+        action_map(FOUR_DIRECTIONS, [mirror("22.5")])
+
+
+def test_items_that_cannot_follow_are_refused(make_spec) -> None:
+    planar, places = stack(Element(permutation=(1, 0, 2)))
+    with pytest.raises(ValueError, match="field 'others' has 4 items for 2 other agents"):
+        joint_matrix(layout(Field("others", Kind.VECTOR, 4, items=Items.OTHERS)), planar, places)
+    with pytest.raises(ValueError, match="field 'tags' has 2 items for 3 agents"):
+        joint_matrix(layout(Field("tags", Kind.SCALAR, 2, items=Items.AGENTS)), planar, places)
+    odd = replace(make_spec(), state=layout(Field("others", Kind.VECTOR, 2, items=Items.OTHERS)))
+    with pytest.raises(ValueError, match="a state has no observer"):
+        state_matrix(odd, planar, places)

@@ -1,0 +1,88 @@
+"""What a user may write, and what one sentence she gets for the rest."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.symmetry import FiniteGroup, Group, dihedral, parse_elements, parse_group
+
+
+def names(text: str, num_agents: int = 3) -> list[str]:
+    elements = parse_elements(text, num_agents)
+    assert isinstance(elements, tuple)
+    return [e.name for e in elements]
+
+
+def test_lists_keep_their_order_and_drop_doubles_and_the_identity() -> None:
+    assert names("flip-x, rot90,ROT90,identity") == ["flip-x", "rot90"]
+    assert names("c4,rot90,flip-y") == ["rot90", "rot180", "rot270", "flip-y"]
+
+
+def test_groups() -> None:
+    assert len(names("d4")) == 7
+    assert names("c2") == ["rot180"]
+    assert names("agents", 2) == ["agents-1-0"]
+    assert len(names("d4*agents")) == 8 * 6 - 1
+    assert names("rot450") == ["rot90"]
+
+
+def test_products_compose_with_the_right_factor_first() -> None:
+    assert names("rot90*flip-x") == ["flip-diagonal"]
+    assert names("rot90*agents-1-0-2") == ["rot90*agents-1-0-2"]
+
+
+@pytest.mark.parametrize("group", ["c4", "d4", "c7", "d8", "agents", "d2*agents"])
+def test_every_name_reads_back(group: str) -> None:
+    for name in names(group):
+        assert names(name) == [name]
+
+
+@pytest.mark.parametrize("text", ["so2", "o2", "so2*agents", "o2*agents"])
+def test_continuous_groups_are_sampled(text: str) -> None:
+    group = parse_elements(text, 3)
+    assert isinstance(group, Group)
+    assert group.name == text
+
+
+def test_large_products_are_sampled() -> None:
+    group = parse_elements("d4*agents", 8)
+    assert isinstance(group, Group)
+    assert group.name == "d4*agents"
+
+
+def test_parse_group() -> None:
+    d4 = parse_group("d4", 3)
+    assert isinstance(d4, FiniteGroup)
+    assert d4.elements == dihedral(4).elements
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rot", "unknown transform 'rot'; write for example"),
+        ("rot90,spin", "unknown transform 'spin' in 'rot90,spin'"),
+        ("", "unknown transform ''"),
+        ("rot90,", "unknown transform '' in 'rot90,'"),
+        ("rot1/0", "unknown transform 'rot1/0'"),
+        ("c0", "'c0' is out of range"),
+        ("c999", "'c999' is out of range"),
+        ("identity", "nothing besides the identity"),
+        ("rot360", "nothing besides the identity"),
+        ("so2,rot90", "list a group that is sampled"),
+        ("flip-x*so2", "multiplies a sampled group"),
+        ("agents-0-1", "no order of 3 agents"),
+        ("agents-0-0-1", "no order of 3 agents"),
+        ("agents*agents", "no direct product"),
+        ("d100*d100", "40000 products"),
+    ],
+)
+def test_refusals(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=r"^[^\n]+$") as caught:
+        parse_elements(text, 3)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["rot90", "agents*d4", "d4*d4", "d4*agents*agents", "d4*rot90"])
+def test_what_is_no_group(text: str) -> None:
+    with pytest.raises(ValueError, match=r"names no group|no direct product"):
+        parse_group(text, 3)
