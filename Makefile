@@ -35,11 +35,11 @@ check: $(VENV)/.installed-dev ## lint, format and types over every package
 	$(BIN)/mypy
 
 bench: $(VENV)/.installed-test ## measure the speed of environments and training on this machine
-	@found=0; for script in tests/benchmarks/bench_*.py; do \
+	@found=0; for script in tests/benchmarks/*_speed.py; do \
 	    [ -f "$$script" ] || continue; \
 	    found=1; echo "== $$script"; $(BIN)/python "$$script" || exit 1; \
 	done; \
-	[ $$found = 1 ] || { echo "make: tests/benchmarks holds no bench_*.py" >&2; exit 1; }
+	[ $$found = 1 ] || { echo "make: tests/benchmarks holds no *_speed.py" >&2; exit 1; }
 
 docs: $(VENV)/.installed-test ## check the documentation: links lead somewhere, commands parse
 	$(BIN)/python -m pytest tests/test_docs.py

@@ -1,0 +1,131 @@
+"""The documentation keeps its word: relative links lead somewhere, and every `esp` command line parses."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from esp_cli import __version__
+from esp_cli.app import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "checkpoints").rglob("*.md")])
+
+_FENCE = re.compile(r"^(```|~~~).*?^\1", re.MULTILINE | re.DOTALL)
+_CODE_SPAN = re.compile(r"`[^`\n]*`")
+_LINK = re.compile(r"\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
+_ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+_HEADING = re.compile(r"^#{1,6}\s+(.+?)\s*#*$", re.MULTILINE)
+
+
+def prose(text: str) -> str:
+    """Return a page without its code."""
+    return _CODE_SPAN.sub("", _FENCE.sub("", text))
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, made as web views of Markdown make them."""
+    found: set[str] = set()
+    for heading in _HEADING.findall(_FENCE.sub("", text)):
+        words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower()
+        slug = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
+        count = 1
+        anchor = slug
+        while anchor in found:
+            anchor, count = f"{slug}-{count}", count + 1
+        found.add(anchor)
+    return found
+
+
+def broken_links(page: Path) -> list[str]:
+    """Return the relative links of a page that lead nowhere."""
+    broken = []
+    for link in _LINK.findall(prose(page.read_text(encoding="utf-8"))):
+        if _ELSEWHERE.match(link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if not target.exists() or (
+            anchor and target.suffix == ".md" and anchor not in anchors(target.read_text(encoding="utf-8"))
+        ):
+            broken.append(link)
+    return broken
+
+
+def command_lines(text: str) -> Iterator[str]:
+    """Yield the `esp` command lines in a page's code blocks, continued lines joined, comments and pipes cut off."""
+    for block in _FENCE.finditer(text):
+        for line in re.sub(r"\\\n\s*", " ", block.group()).splitlines():
+            for part in re.split(r"\s(?:&&|\|\||\||;|>|2>)\s", re.sub(r"\s#\s.*", "", line)):
+                command = part.strip().removeprefix("$ ")
+                if re.match(r"esp\s", command):
+                    yield command
+
+
+def complaint(command_line: str) -> str | None:
+    """Say why a command line does not parse, without running it; None where it does."""
+    words = shlex.split(command_line)[1:]
+    group = typer.main.get_command(app)
+    try:
+        with group.make_context("esp", list(words)) as context:
+            name, command, rest = group.resolve_command(context, words)
+            command.make_context(name, rest, parent=context).close()
+    except typer.Exit:  # --help and --version answer while parsing
+        return None
+    except (typer.TyperException, ValueError) as failure:
+        return str(failure) or type(failure).__name__
+    return None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    assert broken_links(page) == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_command_lines_parse(page: Path) -> None:
+    complaints = {line: complaint(line) for line in command_lines(page.read_text(encoding="utf-8"))}
+    assert {line: reason for line, reason in complaints.items() if reason} == {}
+
+
+def test_the_readme_is_among_the_pages() -> None:
+    assert ROOT / "README.md" in PAGES
+
+
+def test_a_broken_link_and_a_missing_anchor_are_found(tmp_path: Path) -> None:
+    (tmp_path / "other.md").write_text("# Two words, *here*\n```\n# no heading\n```\n## Two words, here\n")
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# Top\n[a](other.md) [b](other.md#two-words-here) [c](other.md#two-words-here-1) [d](#top) [e](https://x.y/z)\n"
+        "[![f](lost.png)](other.md) [g](gone.md) [h](other.md#no-heading) [i](#bottom) `[j](code.md)`\n"
+        "```\n[k](block.md)\n```\n"
+    )
+    assert broken_links(page) == ["lost.png", "gone.md", "other.md#no-heading", "#bottom"]
+
+
+def test_command_lines_are_found_where_they_stand() -> None:
+    text = (
+        "Use `esp nothing` or\n```sh\n$ esp --help\nesp one --two \\\n    three  # comment\n"
+        "make demo && esp four | jq .x\n"
+        "pip install esp\n```\nesp five\n"
+    )
+    assert list(command_lines(text)) == ["esp --help", "esp one --two  three", "esp four"]
+
+
+@pytest.mark.parametrize("line", ["esp --help", "esp --version"])
+def test_a_good_command_line_parses(line: str) -> None:
+    assert complaint(line) is None
+
+
+@pytest.mark.parametrize("line", ["esp nothing", "esp --speed 3 train"])
+def test_a_bad_command_line_does_not(line: str) -> None:
+    assert complaint(line) is not None
+
+
+def test_the_citation_names_the_version_of_the_package() -> None:
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
