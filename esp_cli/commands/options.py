@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable
 from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
@@ -113,16 +113,19 @@ StepsOption = Annotated[
         parser=_option_parser(parse_count, "STEPS"),
     ),
 ]
-SeedsOption = Annotated[
-    tuple,  # type: ignore[type-arg] # typer takes the parser's word for it and would read tuple[int, ...] as a pattern
-    typer.Option(
-        "--seeds",
-        "-s",
-        help="How many seeds to train at once (10 means 0..9), or which, as 3,7.",
-        metavar="SEEDS",
-        parser=_option_parser(parse_seeds, "SEEDS"),
-    ),
-]
+if TYPE_CHECKING:
+    SeedsOption = tuple[int, ...]
+else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
+    SeedsOption = Annotated[
+        tuple,
+        typer.Option(
+            "--seeds",
+            "-s",
+            help="How many seeds to train at once (10 means 0..9), or which, as 3,7.",
+            metavar="SEEDS",
+            parser=_option_parser(parse_seeds, "SEEDS"),
+        ),
+    ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Where the result goes.", metavar="PATH")]
 DeviceOption = Annotated[
     Literal["auto", "cpu", "cuda"], typer.Option("--device", help="Where to compute; auto takes a GPU if there is one.")
