@@ -60,6 +60,7 @@ class MappoConfig(BaseModel):
     critic_input: Literal["state", "observations"] = Field(
         "state", description="the task's global state, or all agents' observations in a row"
     )
+    critic_activation: Literal["relu", "tanh"] | None = Field(None, description="by default the network's")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
     chunk_steps: int = Field(800, ge=1, description="environment steps per seed and forward pass; speed only")
 
@@ -138,7 +139,9 @@ class Mappo(Learner):
         self.prior = SymmetryPrior(prior, spec, device)
         self.policy = Policy(spec, network, generators).to(device)
         self.num_values = 1 if spec.shared_reward else spec.num_agents
-        self.critic = build_network(generators, _critic_width(spec, config), self.num_values, network, 1.0).to(device)
+        critic_network = network.model_copy(update={"activation": config.critic_activation or network.activation})
+        critic_width = _critic_width(spec, config)
+        self.critic = build_network(generators, critic_width, self.num_values, critic_network, 1.0).to(device)
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
         self.recurrent = self.policy.actor.memory_width > 0
         if self.recurrent and config.num_steps % spec.horizon:
@@ -288,7 +291,7 @@ class Mappo(Learner):
 
         used = rows if prior.augments else chunk
         learned = used.obs.shape[1]
-        log_prob, entropy = head.log_prob_and_entropy(outputs[:, :learned], used.action)
+        log_prob, entropy = head.log_prob(outputs[:, :learned], used.action), head.entropy(outputs[:, :learned])
         log_ratio = log_prob - used.log_prob
         objective = clipped_surrogate(log_ratio, used.advantage, config.clip_epsilon)
         old_value = used.value if config.clip_value else None

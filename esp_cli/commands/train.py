@@ -27,7 +27,7 @@ from esp_cli.commands.options import (
 if TYPE_CHECKING:
     from esp_cli.training.config import RunConfig
     from esp_cli.training.run_folder import RunFolder
-    from esp_cli.training.trainer import Progress
+    from esp_cli.training.trainer import Progress, Trainer
 
 EPILOG = """Examples:\n
     esp train --algo mappo --task navigation\n
@@ -118,7 +118,7 @@ def _run(folder: RunFolder, tensorboard: bool) -> None:
     if not complete:
         console.note(f"stopped at {console.format_count(trainer.step)} steps; go on with: esp train --resume {folder.path}")
         raise typer.Exit(130)
-    _report(trainer.final_returns(), trainer.convention, folder)
+    _report(trainer, folder)
 
 
 def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
@@ -142,9 +142,14 @@ def _shown(news: Progress) -> dict[str, float]:
     return out
 
 
-def _report(returns: dict[str, tuple[float, float | None]], convention: str, folder: RunFolder) -> None:
-    rows = [(mode, console.format_mean(mean, sem)) for mode, (mean, sem) in returns.items()]
-    console.table(("policy", "episode return>"), rows, caption=f"convention {convention}; mean ± s.e.m. over seeds")
+def _report(trainer: Trainer, folder: RunFolder) -> None:
+    from esp_cli.experiments.statistics import mean_and_sem
+
+    rows = []
+    for mode, values in trainer.final_returns().items():
+        rows.append((mode, console.format_mean(*mean_and_sem(values))))
+    caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
+    console.table(("policy", "episode return>"), rows, caption=caption)
     console.note(f"next: esp eval {folder.path}    esp render {folder.path} -o out.gif")
 
 

@@ -36,14 +36,15 @@ class Policy(nn.Module):
         return self.actor.initial_memory(self.num_seeds, num_envs * self.num_agents, like)
 
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the head's outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory."""
+        """Return the normalised outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory."""
         outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
-        return outputs.unflatten(1, obs.shape[1:3]), memory
+        return self.head.normalise(outputs.unflatten(1, obs.shape[1:3])), memory
 
     def unroll(self, obs: Tensor, truncation: int = 0) -> Tensor:
-        """Return the outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""
+        """Return the normalised outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""
         rows = obs.transpose(2, 3).flatten(1, 2)
-        return self.actor.unroll(rows, truncation).unflatten(1, (obs.shape[1], obs.shape[3])).transpose(2, 3)
+        outputs = self.actor.unroll(rows, truncation).unflatten(1, (obs.shape[1], obs.shape[3]))
+        return self.head.normalise(outputs.transpose(2, 3))
 
     def act(self, obs: Tensor, memory: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""

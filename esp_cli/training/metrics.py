@@ -22,8 +22,8 @@ from torch import Tensor
 
 from esp_cli.training.checkpoint import write_bytes_atomic
 
-Value = float | int | Sequence[float] | NDArray[Any] | Tensor
-"""What a row may hold under a name: a number, or one number per seed."""
+Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
+"""What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
 
 
 class MetricsError(ValueError):
@@ -205,6 +205,8 @@ def _plain(name: str, value: Value) -> float | int | list[float | int | None] | 
 def _number(name: str, value: Any) -> float | int | None:
     if isinstance(value, np.generic):
         value = value.item()
+    if value is None:
+        return None
     if not isinstance(value, bool | int | float):
         raise MetricsError(f"the metric '{name}' is no number and no list of one number per seed")
     return value if math.isfinite(value) else None

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from esp_envs.base import Environment
 from esp_envs.registry import make
+from numpy.typing import NDArray
 from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training.checkpoint import save_checkpoint
 from esp_cli.training.config import RunConfig
 from esp_cli.training.evaluation import PolicyController, play
-from esp_cli.training.metrics import MetricsWriter
+from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 
+POLICY_FORMAT = "esp-policy"
+"""Format name of a file that holds a policy alone."""
 CHECKPOINT_SECONDS = 30.0
 """A kill loses at most this much work; a checkpoint takes some milliseconds."""
 
@@ -71,8 +77,9 @@ class Trainer:
         ValueError: the checkpoint does not fit the configuration.
     """
 
-    def __init__(self, config: RunConfig, folder: RunFolder) -> None:
+    def __init__(self, config: RunConfig, folder: RunFolder, tensorboard: bool = False) -> None:
         self.config, self.folder = config, folder
+        self.tensorboard = folder.tensorboard_path if tensorboard else None
         self.learner = build_learner(config)
         self.iteration = 0
         self.stopped_seeds: dict[int, int] = {}
@@ -92,6 +99,21 @@ class Trainer:
         """Iterations of the whole run, the last one rounded up."""
         return -(-self.config.steps // self.learner.steps_per_iteration)
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.iteration >= self.total_iterations
+
+    @property
+    def convention(self) -> str:
+        """The reward convention in which returns are counted."""
+        return self.learner.collector.env.spec.convention
+
+    def final_returns(self) -> dict[str, NDArray[np.float64]]:
+        """Return the last evaluation of the run: greedy and stochastic, one return per seed (NaN where it stopped)."""
+        rows = read_metrics(self.folder.metrics_path)
+        return {mode: column(rows, f"eval/return_{mode}")[1][-1] for mode in ("greedy", "stochastic")}
+
     def run(self, listener: Listener) -> bool:
         """Train to the end or until the listener asks to stop.
 
@@ -102,25 +124,24 @@ class Trainer:
             ValueError: every seed stopped on a number that is not finite.
         """
         started, saved = time.monotonic() - self.elapsed_s, time.monotonic()
-        with MetricsWriter(self.folder.metrics_path) as writer:
+        with MetricsWriter(self.folder.metrics_path, self.tensorboard, self.step) as writer:
             if self.iteration == 0:
                 self._record(writer, self._evaluate(), listener)
-            while self.iteration < self.total_iterations:
+            while not self.is_complete:
                 tick = time.monotonic()
                 row = self._iterate()
                 row["time/steps_per_second"] = self.learner.steps_per_iteration * len(self.config.seeds) / row.pop("_s")
                 self.elapsed_s = time.monotonic() - started
                 row["time/elapsed_s"] = self.elapsed_s
                 going = self._record(writer, row, listener)
-                is_last = self.iteration == self.total_iterations
-                if is_last or not going or tick - saved > CHECKPOINT_SECONDS:
+                if self.is_complete or not going or tick - saved > CHECKPOINT_SECONDS:
                     self._checkpoint()
                     saved = time.monotonic()
                 if len(self.stopped_seeds) == len(self.config.seeds):
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
-                if not going and not is_last:
+                if not going and not self.is_complete:
                     return False
-        self.folder.write_policy(self._policy_tensors(), self._policy_meta())
+        save_checkpoint(self.folder.policy_path, self.learner.policy.state_dict(), self._policy_meta(), POLICY_FORMAT)
         return True
 
     def _iterate(self) -> dict[str, Any]:
@@ -132,7 +153,7 @@ class Trainer:
         row: dict[str, Any] = {name: value.cpu() for name, value in metrics.items()}
         self._stop_broken_seeds(row)
         row["_s"] = time.monotonic() - begun
-        if self.step // self.config.evaluation.every_steps > before or self.iteration == self.total_iterations:
+        if self.step // self.config.evaluation.every_steps > before or self.is_complete:
             row |= self._evaluate()
         return row
 
@@ -187,25 +208,22 @@ class Trainer:
     def _checkpoint(self) -> None:
         meta = {
             "iteration": self.iteration,
-            "step": self.step,
             "elapsed_s": self.elapsed_s,
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
+            "task_version": self.learner.collector.env.spec.version,
         }
-        self.folder.write_checkpoint(self.step, self.learner.state_dict(), meta)
+        self.folder.save_checkpoint(self.step, self.learner.state_dict(), meta, self.is_complete)
 
     def _restore(self) -> None:
-        """Continue from the newest good checkpoint, if there is one."""
+        """Continue from the newest good checkpoint; without one, start anew."""
         found = self.folder.latest_checkpoint()
-        if found is None:
-            return
-        tensors, meta = found
-        self.learner.load_state_dict(tensors)
-        self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
-        self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
-        self.folder.truncate_metrics(self.step)
-
-    def _policy_tensors(self) -> dict[str, Tensor]:
-        return dict(self.learner.policy.state_dict())
+        if found is not None:
+            self.learner.load_state_dict(found.tensors)
+            self.iteration, self.elapsed_s = int(found.meta["iteration"]), float(found.meta["elapsed_s"])
+            self.stopped_seeds = {int(index): int(step) for index, step in found.meta["stopped_seeds"].items()}
+            if found.note:
+                self.notes.append(found.note)
+        self.folder.truncate_metrics(self.step if found else -1)
 
     def _policy_meta(self) -> dict[str, Any]:
         """Describe the policy file so that it can be used without the run folder."""
@@ -214,5 +232,7 @@ class Trainer:
             "task_version": self.learner.collector.env.spec.version,
             "network": self.config.network.name,
             "activation": self.config.network.activation,
+            "step": self.step,
+            "greedy_returns": [None if math.isnan(x) else x for x in self.final_returns()["greedy"].tolist()],
             "config": self.config.model_dump(mode="json"),
         }

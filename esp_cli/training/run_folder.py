@@ -1,0 +1,352 @@
+"""A run's folder: its configuration, its metrics as they come, its checkpoints, and a lock that one process holds.
+
+Layout::
+
+    config.json                             the resolved configuration
+    metrics.jsonl                           a row per update, see esp_cli.training.metrics
+    checkpoints/step-000000500000.safetensors   the newest two; step-...-final.safetensors when training is done
+    policy.safetensors                      the trained policy
+    run.lock                                held by the process that trains; says which
+
+Every file but the metrics is replaced as a whole. A process may be killed at any moment: the kernel lets go of its
+lock, and the next one goes on from the newest checkpoint that is good.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import socket
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from esp_cli.training.checkpoint import (
+    TEMPORARY_PREFIX,
+    CheckpointError,
+    load_checkpoint,
+    parse_json_object,
+    save_checkpoint,
+    write_bytes_atomic,
+)
+from esp_cli.training.metrics import truncate_metrics
+
+RUN_FORMAT = "esp-run"
+RUN_VERSION = 1
+POLICY_FORMAT = "esp-policy"
+KEPT_CHECKPOINTS = 2
+"""Two, so that a damaged newest one leaves another to go on from."""
+
+_CONFIG, _METRICS, _CHECKPOINTS, _POLICY, _LOCK = (
+    "config.json",
+    "metrics.jsonl",
+    "checkpoints",
+    "policy.safetensors",
+    "run.lock",
+)
+_CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
+_MAX_CONFIG_BYTES = 4 * 2**20
+
+
+class RunFolderError(ValueError):
+    """A run folder cannot be made, opened or locked; the text is one sentence for the user."""
+
+
+class CheckpointWarning(UserWarning):
+    """A damaged checkpoint was passed over for an older one; the text is one sentence for the user."""
+
+
+def write_json_atomic(path: str | os.PathLike[str], value: Any) -> None:
+    """Write a value as indented JSON, as a whole or not at all.
+
+    Raises:
+        ValueError: the value is not JSON (NaN and infinity are not).
+        OSError: the file cannot be written; what was there is as it was.
+    """
+    try:
+        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
+        content = (text + "\n").encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"cannot write {path}: its content is not JSON ({error})") from None
+    write_bytes_atomic(path, content)
+
+
+class RunFolder:
+    """A folder that holds one run; use :meth:`create` or :meth:`open`.
+
+    Attributes:
+        path: the folder.
+        config: the resolved configuration that the run was made with.
+    """
+
+    def __init__(self, path: Path, config: dict[str, Any]) -> None:
+        self.path = path
+        self.config = config
+
+    @property
+    def metrics_path(self) -> Path:
+        """The file that a MetricsWriter appends to."""
+        return self.path / _METRICS
+
+    @property
+    def policy_path(self) -> Path:
+        """The file of the trained policy."""
+        return self.path / _POLICY
+
+    @property
+    def tensorboard_path(self) -> Path:
+        """The folder for TensorBoard, made by whoever writes there."""
+        return self.path / "tensorboard"
+
+    @classmethod
+    def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any], force: bool = False) -> RunFolder:
+        """Make a run folder; its configuration is written last, so that a folder with one is complete.
+
+        Args:
+            path: a folder that is missing, empty, or left half-made by a killed process.
+            config: resolved configuration, JSON-able; the keys ``format`` and ``version`` are the folder's own.
+            force: start an existing run anew: its metrics, checkpoints and policy go, other files stay.
+
+        Raises:
+            RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
+        """
+        path = Path(path)
+        if "format" in config or "version" in config:
+            raise RunFolderError("a configuration may not use the reserved keys 'format' and 'version'")
+        try:
+            resolved = json.loads(json.dumps(dict(config), allow_nan=False))
+        except (TypeError, ValueError, RecursionError) as error:
+            raise RunFolderError(f"the configuration of {path} is not JSON ({error})") from None
+        with _told(f"cannot make the run folder {path}"):
+            if path.exists() and not path.is_dir():
+                raise RunFolderError(f"{path} is a file; choose another --out")
+            path.mkdir(parents=True, exist_ok=True)
+            _refuse_taken(path, force)
+            folder = cls(path, resolved)
+            with folder.lock():
+                # a second time, as another process may have made a run here in between
+                _refuse_taken(path, force)
+                for file in (folder.policy_path, *folder.checkpoints(), folder.metrics_path):
+                    file.unlink(missing_ok=True)
+                (path / _CHECKPOINTS).mkdir(exist_ok=True)
+                folder.metrics_path.touch()
+                write_json_atomic(path / _CONFIG, {"format": RUN_FORMAT, "version": RUN_VERSION, **resolved})
+        return folder
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> RunFolder:
+        """Open an existing run folder.
+
+        Raises:
+            RunFolderError: it is missing, no run folder, or its configuration is damaged, foreign or newer.
+        """
+        path = Path(path)
+        if not path.is_dir():
+            what = "is a file, not a run folder" if path.exists() else "does not exist"
+            raise RunFolderError(f"{path} {what}; give the folder that esp train --out made")
+        file = path / _CONFIG
+        if not file.is_file():
+            raise RunFolderError(
+                f"{path} is no run folder: it has no {_CONFIG}; give the folder that esp train --out made"
+            )
+        with _told(f"cannot read {file}"):
+            if file.stat().st_size > _MAX_CONFIG_BYTES:
+                raise RunFolderError(f"{file} is foreign: it is larger than any run's configuration")
+            text = file.read_bytes()
+        try:
+            config = parse_json_object(text, "text")
+        except CheckpointError as error:
+            raise RunFolderError(f"{file} {error}") from None
+        version = config.pop("version", None)
+        if config.pop("format", None) != RUN_FORMAT or type(version) is not int:
+            raise RunFolderError(f"{file} is foreign: it is not the configuration of a run of esp")
+        if version > RUN_VERSION:
+            raise RunFolderError(f"{file} was written by a newer esp; update esp to use this run")
+        return cls(path, config)
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the folder, so that no second process writes to it.
+
+        The kernel lets go when the process ends, however it ends. Half-written files that a killed process left are
+        removed.
+
+        Raises:
+            RunFolderError: another process, or this one, holds it already, or the file system cannot lock.
+        """
+        with _told(f"cannot lock {self.path}"):
+            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            with _told(f"cannot lock {self.path}"):
+                try:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    holder = _holder(os.pread(descriptor, 4096, 0))
+                    raise RunFolderError(f"{self.path} is in use by {holder}; wait for it, or stop it first") from None
+                owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+                os.ftruncate(descriptor, 0)
+                os.pwrite(descriptor, owner.encode(), 0)
+                self._remove_half_written()
+            yield
+        finally:
+            # the file stays: removing it would let two processes hold two files of one name
+            os.close(descriptor)
+
+    def checkpoint_path(self, step: int, final: bool = False) -> Path:
+        """Return the file of the checkpoint at a step (env steps per seed)."""
+        return self.path / _CHECKPOINTS / f"step-{step:012d}{'-final' if final else ''}.safetensors"
+
+    def checkpoints(self) -> list[Path]:
+        """Return the checkpoint files, oldest first."""
+        folder = self.path / _CHECKPOINTS
+        if not folder.is_dir():
+            return []
+        return sorted(file for file in folder.iterdir() if _CHECKPOINT_NAME.fullmatch(file.name))
+
+    def write_checkpoint(
+        self, step: int, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], final: bool = False
+    ) -> Path:
+        """Write a checkpoint, then remove those that are not needed any more.
+
+        Write the metrics of the step first: they are flushed to the disk before the checkpoint that stands for them.
+        The newest two and the newest final one are kept. Checkpoints past ``step`` go, as the run has gone back from
+        there.
+
+        Args:
+            step: env steps per seed.
+            tensors: state by name.
+            meta: JSON-able description; ``step`` is added.
+            final: training is done.
+
+        Returns:
+            The file.
+
+        Raises:
+            RunFolderError: the file cannot be written (CheckpointError where the content cannot be stored).
+        """
+        path = self.checkpoint_path(step, final)
+        with _told(f"cannot write {path}"):
+            path.parent.mkdir(exist_ok=True)
+            if self.metrics_path.exists():
+                with self.metrics_path.open("rb+") as metrics:
+                    os.fsync(metrics.fileno())
+        save_checkpoint(path, tensors, {**meta, "step": step})
+        with _told(f"cannot remove old checkpoints beside {path}"):
+            files = self.checkpoints()
+            past = [file for file in files if _step(file) > step]
+            regular = [file for file in files if file not in past and not _is_final(file)]
+            finals = [file for file in files if file not in past and _is_final(file)]
+            for file in (*past, *regular[:-KEPT_CHECKPOINTS], *finals[:-1]):
+                file.unlink()
+        return path
+
+    def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> Path:
+        """Write the trained policy as a file of its own that needs no run folder.
+
+        Returns:
+            The file.
+
+        Raises:
+            CheckpointError: the content cannot be stored, or the file cannot be written.
+        """
+        save_checkpoint(self.policy_path, tensors, meta, format_name=POLICY_FORMAT)
+        return self.policy_path
+
+    def latest_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+        """Load the newest good checkpoint.
+
+        Passing over a damaged one gives a CheckpointWarning.
+
+        Returns:
+            Its tensors, on the CPU, and its description, with ``step``; None where the run has written none yet.
+
+        Raises:
+            RunFolderError: there are checkpoints, and all are damaged.
+        """
+        problem = None
+        for file in reversed(self.checkpoints()):
+            try:
+                tensors, meta = load_checkpoint(file)
+                if meta.get("step") != _step(file):
+                    raise CheckpointError(f"{file} does not hold the step that its name says")
+            except CheckpointError as error:
+                problem = problem or str(error)
+                continue
+            if problem:
+                warnings.warn(f"{problem}; going back to step {_step(file)}", CheckpointWarning, stacklevel=2)
+            return tensors, meta
+        if problem:
+            raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
+        return None
+
+    def truncate_metrics(self, after_step: int) -> int:
+        """Remove the rows of metrics past a checkpoint's step, and a torn last line, before a run goes on from it.
+
+        Returns:
+            The number of whole rows removed.
+
+        Raises:
+            MetricsError: the file is damaged elsewhere than at its end.
+        """
+        if not self.metrics_path.exists():
+            self.metrics_path.touch()
+        return truncate_metrics(self.metrics_path, after_step)
+
+    def _remove_half_written(self) -> None:
+        for folder in (self.path, self.path / _CHECKPOINTS):
+            for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
+                file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _told(attempt: str) -> Iterator[None]:
+    """Turn errors of the file system into one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise RunFolderError(f"{attempt}: {error.strerror or error}") from None
+
+
+def _refuse_taken(path: Path, force: bool) -> None:
+    """Refuse a folder that holds a run (unless forced) or files that no run has."""
+    if (path / _CONFIG).exists():
+        if not force:
+            raise RunFolderError(f"{path} exists: resume with esp train --resume {path} or choose another --out")
+        # forcing starts a run anew; it is no licence to write over somebody else's configuration
+        RunFolder.open(path)
+        return
+    foreign = sorted(entry.name for entry in path.iterdir() if not _is_leftover(entry))
+    if foreign:
+        raise RunFolderError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")
+
+
+def _is_leftover(entry: Path) -> bool:
+    """Return whether create(), killed before its end, may have left this; it leaves nothing with content."""
+    if entry.name == _CHECKPOINTS:
+        return entry.is_dir() and not any(entry.iterdir())
+    if entry.name == _METRICS:
+        return entry.is_file() and entry.stat().st_size == 0
+    return entry.name == _LOCK or entry.name.startswith(TEMPORARY_PREFIX)
+
+
+def _holder(content: bytes) -> str:
+    """Name the process that a lock file names."""
+    try:
+        owner = json.loads(content)
+        return f"process {int(owner['pid'])} on {str(owner['host'])[:64]!r}"
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return "another process"
+
+
+def _step(path: Path) -> int:
+    return int(path.name[len("step-") : len("step-") + 12])
+
+
+def _is_final(path: Path) -> bool:
+    return path.name.endswith("-final.safetensors")
