@@ -35,13 +35,13 @@ def test_rows_take_tensors_arrays_and_numbers(tmp_path):
                 "train/loss": torch.tensor([0.5, float("nan")]),
                 "train/kl": np.array([1.0, -math.inf]),
                 "train/count": torch.tensor(3),
-                "train/list": [1, np.float32(0.25)],
+                "train/list": [1, np.float32(0.25), None],
                 "time/seconds": 0.1,
             },
         )
     assert path.read_text() == (
         '{"step":100,"train/loss":[0.5,null],"train/kl":[1.0,null],"train/count":3,'
-        '"train/list":[1,0.25],"time/seconds":0.1}\n'
+        '"train/list":[1,0.25,null],"time/seconds":0.1}\n'
     )
 
 
@@ -54,7 +54,7 @@ def test_each_row_is_in_the_file_when_write_returns(tmp_path):
     writer.close()
 
 
-@pytest.mark.parametrize("value", ["text", [[1.0]], {"a": 1}, None, torch.zeros(2, 2)])
+@pytest.mark.parametrize("value", ["text", [[1.0]], {"a": 1}, torch.zeros(2, 2)])
 def test_what_is_no_number_is_refused(tmp_path, value):
     path = tmp_path / "m.jsonl"
     with MetricsWriter(path) as writer, pytest.raises(MetricsError, match="'train/loss' is no number"):

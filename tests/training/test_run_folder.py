@@ -1,0 +1,363 @@
+"""Run folders: made whole, never over something foreign, locked by one process, resumed from a good checkpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from esp_cli.training.checkpoint import TEMPORARY_PREFIX, CheckpointError, load_checkpoint
+from esp_cli.training.metrics import MetricsWriter, read_metrics
+from esp_cli.training.run_folder import (
+    POLICY_FORMAT,
+    CheckpointWarning,
+    RunFolder,
+    RunFolderError,
+    write_json_atomic,
+)
+
+CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+
+
+def weights(step):
+    return {"weight": torch.full((4,), float(step))}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return RunFolder.create(tmp_path / "runs" / "a", CONFIG)
+
+
+def write_checkpoints(folder, *steps):
+    for step in steps:
+        folder.write_checkpoint(step, weights(step), {"iteration": step // 100})
+
+
+def names(folder):
+    return [file.name for file in folder.checkpoints()]
+
+
+def flip_a_bit(path):
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+
+
+def test_create_then_open_gives_the_configuration_back(folder):
+    opened = RunFolder.open(folder.path)
+    assert opened.config == folder.config == CONFIG
+    assert opened.latest_checkpoint() is None
+    assert read_metrics(opened.metrics_path) == []
+    assert {entry.name for entry in folder.path.iterdir()} == {
+        "config.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "run.lock",
+    }
+    assert json.loads((folder.path / "config.json").read_text()) == {"format": "esp-run", "version": 1, **CONFIG}
+
+
+def test_the_configuration_is_kept_as_json_shows_it(tmp_path):
+    folder = RunFolder.create(tmp_path / "a", {"seeds": (0, 1)})
+    assert folder.config == RunFolder.open(tmp_path / "a").config == {"seeds": [0, 1]}
+
+
+@pytest.mark.parametrize("config", [{"version": 3}, {"x": float("nan")}, {"x": object()}])
+def test_a_configuration_that_cannot_be_kept_makes_no_folder(tmp_path, config):
+    with pytest.raises(RunFolderError, match=r"reserved|not JSON"):
+        RunFolder.create(tmp_path / "a", config)
+    assert not (tmp_path / "a").exists()
+
+
+def test_create_refuses_an_existing_run_and_leaves_it_alone(folder):
+    write_checkpoints(folder, 100)
+    with pytest.raises(RunFolderError) as caught:
+        RunFolder.create(folder.path, {"task": "other"})
+    assert str(caught.value) == (
+        f"{folder.path} exists: resume with esp train --resume {folder.path} or choose another --out"
+    )
+    assert RunFolder.open(folder.path).config == CONFIG
+    assert names(folder) == ["step-000000000100.safetensors"]
+
+
+def test_force_starts_anew_and_keeps_other_files(folder):
+    write_checkpoints(folder, 100)
+    folder.write_policy(weights(1), {"task": "navigation"})
+    folder.metrics_path.write_text('{"step": 100}\n')
+    (folder.path / "notes.txt").write_text("mine")
+    (folder.path / "checkpoints" / "best.safetensors").write_text("mine too")
+    anew = RunFolder.create(folder.path, {"task": "other"}, force=True)
+    assert RunFolder.open(folder.path).config == {"task": "other"}
+    assert anew.latest_checkpoint() is None
+    assert read_metrics(anew.metrics_path) == []
+    assert not anew.policy_path.exists()
+    assert (folder.path / "notes.txt").read_text() == "mine"
+    assert (folder.path / "checkpoints" / "best.safetensors").read_text() == "mine too"
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    "name", ["thesis.tex", "policy.safetensors", "metrics.jsonl", "checkpoints/best", "config.json"]
+)
+def test_create_never_touches_a_foreign_folder(tmp_path, name, force):
+    file = tmp_path / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text('{"model_type": "llama"}')
+    with pytest.raises(RunFolderError, match=r"not empty and no run folder|exists: resume|is foreign"):
+        RunFolder.create(tmp_path, CONFIG, force=force)
+    assert [entry for entry in tmp_path.rglob("*") if entry.is_file()] == [file]
+    assert file.read_text() == '{"model_type": "llama"}'
+
+
+def test_create_takes_an_empty_or_half_made_folder(tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "metrics.jsonl").touch()
+    (tmp_path / "run.lock").write_text("{}")
+    (tmp_path / f"{TEMPORARY_PREFIX}config.json-12").write_text("{")
+    assert RunFolder.create(tmp_path, CONFIG).config == CONFIG
+    assert not list(tmp_path.glob(f"{TEMPORARY_PREFIX}*"))
+
+
+def test_create_on_a_file_or_without_permission_is_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="is a file; choose another --out"):
+        RunFolder.create(tmp_path / "file", CONFIG)
+    with pytest.raises(RunFolderError, match=r"cannot make the run folder .*: Not a directory"):
+        RunFolder.create(tmp_path / "file" / "run", CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (None, "is no run folder: it has no config.json"),
+        (b"", "not valid JSON"),
+        (b'{"format": "esp-run", "version": 1, "ta', "not valid JSON"),
+        (b"\xff\xfe", "not valid JSON"),
+        (b"[" * 100_000, "not valid JSON"),
+        (b'{"format": "esp-run", "version": 1, "x": NaN}', "not valid JSON"),
+        (b"[]", "no JSON object"),
+        (b'{"model_type": "llama"}', "is foreign: it is not the configuration of a run of esp"),
+        (b'{"format": "esp-run", "version": "1"}', "is foreign"),
+        (b'{"format": "esp-run", "version": 2}', "written by a newer esp"),
+        (b" " * (5 * 2**20), "larger than any run's configuration"),
+    ],
+)
+def test_a_folder_that_is_no_run_is_one_sentence(tmp_path, content, text):
+    if content is not None:
+        (tmp_path / "config.json").write_bytes(content)
+    with pytest.raises(RunFolderError, match=re.escape(text)) as caught:
+        RunFolder.open(tmp_path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(tmp_path))
+
+
+def test_a_missing_folder_and_a_file_are_one_sentence(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(RunFolderError, match="does not exist; give the folder"):
+        RunFolder.open(tmp_path / "no")
+    with pytest.raises(RunFolderError, match="is a file, not a run folder"):
+        RunFolder.open(tmp_path / "file")
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a.json"
+    write_json_atomic(path, {"name": "é", "values": [1, 2.5]})
+    assert json.loads(path.read_text()) == {"name": "é", "values": [1, 2.5]}
+    with pytest.raises(ValueError, match="not JSON"):
+        write_json_atomic(path, {"values": [float("inf")]})
+    assert json.loads(path.read_text())["name"] == "é"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.json"]
+
+
+# Checkpoints
+
+
+def test_the_newest_two_checkpoints_and_the_final_one_are_kept(folder):
+    write_checkpoints(folder, 100, 200, 300)
+    assert names(folder) == ["step-000000000200.safetensors", "step-000000000300.safetensors"]
+    folder.write_checkpoint(400, weights(400), {}, final=True)
+    assert names(folder)[-1] == "step-000000000400-final.safetensors"
+    write_checkpoints(folder, 500, 600, 700)
+    assert names(folder) == [
+        "step-000000000400-final.safetensors",
+        "step-000000000600.safetensors",
+        "step-000000000700.safetensors",
+    ]
+
+
+def test_the_latest_checkpoint_is_that_of_the_highest_step(folder):
+    write_checkpoints(folder, 900, 1000)
+    tensors, meta = folder.latest_checkpoint()
+    assert meta == {"iteration": 10, "step": 1000}
+    assert tensors["weight"].tolist() == [1000.0] * 4
+
+
+@pytest.mark.parametrize("damage", ["flip", "cut", "empty", "renamed"])
+def test_a_damaged_newest_checkpoint_is_passed_over_with_a_warning(folder, damage):
+    write_checkpoints(folder, 100, 200)
+    newest = folder.checkpoint_path(200)
+    if damage == "flip":
+        flip_a_bit(newest)
+    elif damage == "renamed":
+        folder.checkpoint_path(200).rename(folder.checkpoint_path(300))
+        newest = folder.checkpoint_path(300)
+    else:
+        newest.write_bytes(newest.read_bytes()[: 50 if damage == "cut" else 0])
+    with pytest.warns(CheckpointWarning, match=rf"{newest.name} .*; going back to step 100$"):
+        tensors, meta = folder.latest_checkpoint()
+    assert meta["step"] == 100
+    assert tensors["weight"].tolist() == [100.0] * 4
+
+
+def test_only_damaged_checkpoints_are_an_error(folder):
+    write_checkpoints(folder, 100, 200)
+    for file in folder.checkpoints():
+        flip_a_bit(file)
+    with pytest.raises(RunFolderError, match=r"no good checkpoint \(.*step-000000000200.*does not match its checksum"):
+        folder.latest_checkpoint()
+
+
+def test_a_damaged_future_does_not_push_out_good_checkpoints(folder):
+    write_checkpoints(folder, 100, 300)
+    flip_a_bit(folder.checkpoint_path(300))
+    write_checkpoints(folder, 200)
+    assert names(folder) == ["step-000000000100.safetensors", "step-000000000200.safetensors"]
+
+
+def test_a_policy_file_stands_alone(folder):
+    folder.write_policy(weights(3), {"task": "navigation", "network": "mlp", "activation": "tanh"})
+    tensors, meta = load_checkpoint(folder.policy_path, POLICY_FORMAT)
+    assert meta == {"task": "navigation", "network": "mlp", "activation": "tanh"}
+    assert tensors["weight"].tolist() == [3.0] * 4
+    with pytest.raises(CheckpointError, match="'esp-checkpoint' is needed"):
+        load_checkpoint(folder.policy_path)
+
+
+def test_metrics_past_the_checkpoint_go_before_a_run_goes_on(folder):
+    with MetricsWriter(folder.metrics_path) as writer:
+        for step in (100, 200, 300):
+            writer.write(step, {"train/loss": [float(step)]})
+    write_checkpoints(folder, 200)
+    assert folder.truncate_metrics(200) == 1
+    assert [row["step"] for row in read_metrics(folder.metrics_path)] == [100, 200]
+    folder.metrics_path.unlink()
+    assert folder.truncate_metrics(200) == 0
+    assert read_metrics(folder.metrics_path) == []
+
+
+# Processes
+
+HOLDER = """
+import sys, time
+from esp_cli.training.run_folder import RunFolder
+with RunFolder.open(sys.argv[1]).lock():
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_process_is_refused_until_the_first_is_killed(folder):
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder.path)], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert holder.stdout.readline() == "held\n"
+        with (
+            pytest.raises(RunFolderError, match=rf"is in use by process {holder.pid} on '.+'; wait for it, or stop it"),
+            folder.lock(),
+        ):
+            pytest.fail("two processes hold one folder")
+        with pytest.raises(RunFolderError, match="is in use by"):
+            RunFolder.create(folder.path, CONFIG, force=True)
+    finally:
+        holder.kill()
+        holder.wait()
+        holder.stdout.close()
+    with folder.lock():
+        owner = json.loads((folder.path / "run.lock").read_text())
+    assert owner["pid"] == os.getpid()
+
+
+def test_one_process_cannot_hold_a_folder_twice_but_again(folder):
+    with folder.lock(), pytest.raises(RunFolderError, match=f"is in use by process {os.getpid()}"), folder.lock():
+        pytest.fail("held twice")
+    with folder.lock():
+        pass
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff", b"[1]", b'{"pid": "x"}', b'{"pid": 3}', b"[" * 5000])
+def test_a_damaged_lock_file_still_locks(folder, content):
+    with folder.lock():
+        (folder.path / "run.lock").write_bytes(content)
+        with pytest.raises(RunFolderError, match="is in use by another process"), folder.lock():
+            pytest.fail("held twice")
+
+
+def test_locking_removes_what_a_killed_process_left_half_written(folder):
+    rest = folder.path / "checkpoints" / f"{TEMPORARY_PREFIX}step-000000000100.safetensors-ab"
+    rest.write_bytes(b"half")
+    with folder.lock():
+        assert not rest.exists()
+
+
+# A run whose state is a number: x <- x + noise. Steps come in hundreds, and a checkpoint follows every third row.
+RUNNER = """
+import sys
+import torch
+torch.set_num_threads(1)
+from esp_cli.training.metrics import MetricsWriter
+from esp_cli.training.run_folder import RunFolder
+
+folder, last = RunFolder.open(sys.argv[1]), int(sys.argv[2])
+with folder.lock():
+    generator, step, x = torch.Generator().manual_seed(0), 0, torch.zeros(1)
+    found = folder.latest_checkpoint()
+    if found is not None:
+        tensors, meta = found
+        step, x = meta["step"], tensors["x"]
+        generator.set_state(tensors["generator"])
+    folder.truncate_metrics(step)
+    print("running", flush=True)
+    with MetricsWriter(folder.metrics_path) as writer:
+        while step < last:
+            step += 100
+            x = x + torch.rand(1, generator=generator)
+            writer.write(step, {"train/x": x})
+            if step % 300 == 0 or step == last:
+                folder.write_checkpoint(step, {"x": x, "generator": generator.get_state()}, {})
+print("done")
+"""
+
+
+def test_a_run_killed_again_and_again_equals_one_that_ran_through(tmp_path):
+    through = RunFolder.create(tmp_path / "through", CONFIG)
+    killed = RunFolder.create(tmp_path / "killed", CONFIG)
+    command = [sys.executable, "-c", RUNNER]
+    for delay in (0.03, 0.08):
+        process = subprocess.Popen(
+            [*command, str(killed.path), str(10**9)], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout.readline() == "running\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(delay)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+    rows = read_metrics(killed.metrics_path)
+    found = killed.latest_checkpoint()
+    assert rows
+    assert rows[-1]["step"] >= (found[1]["step"] if found else 0), "a checkpoint stands for rows that are not there"
+    last = rows[-1]["step"] + 1000
+    both = [subprocess.Popen([*command, str(f.path), str(last)], env=ENVIRONMENT) for f in (through, killed)]
+    assert [process.wait(60) for process in both] == [0, 0]
+    assert killed.metrics_path.read_bytes() == through.metrics_path.read_bytes()
+    assert len(read_metrics(killed.metrics_path)) == last // 100
+    assert torch.equal(killed.latest_checkpoint()[0]["x"], through.latest_checkpoint()[0]["x"])
+    assert not list(killed.path.rglob(f"{TEMPORARY_PREFIX}*"))
