@@ -290,12 +290,14 @@ class Mappo(Learner):
         values = self.critic.unroll(self._critic_input(rows.obs, rows.state), config.truncation)
 
         used = rows if prior.augments else chunk
-        learned = used.obs.shape[1]
-        log_prob, entropy = head.log_prob(outputs[:, :learned], used.action), head.entropy(outputs[:, :learned])
+        learned = outputs, values
+        if len(transforms) and not prior.augments:
+            learned = outputs[:, :count], values[:, :count]
+        log_prob, entropy = head.log_prob(learned[0], used.action), head.entropy(learned[0])
         log_ratio = log_prob - used.log_prob
         objective = clipped_surrogate(log_ratio, used.advantage, config.clip_epsilon)
         old_value = used.value if config.clip_value else None
-        value_error = value_loss(values[:, :learned], used.target, config.huber_delta, old_value, config.clip_epsilon)
+        value_error = value_loss(learned[1], used.target, config.huber_delta, old_value, config.clip_epsilon)
         loss = config.value_coef * _mean(value_error) - _mean(objective) - entropy_coef * _mean(entropy)
 
         if transforms and prior.coefficient > 0:

@@ -144,7 +144,7 @@ class _Perceptron(Function):
         grads: list[Tensor | None] = [None] * (2 * count)
         for k in reversed(range(count)):
             grads[2 * k] = torch.bmm(inputs[k].transpose(1, 2), grad).float()
-            grads[2 * k + 1] = grad.sum(1, keepdim=True, dtype=torch.float32)
+            grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
         grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None
