@@ -7,5 +7,9 @@ example.
 
 from __future__ import annotations
 
-COMMANDS: dict[str, str] = {}
+COMMANDS: dict[str, str] = {
+    "train": "esp_cli.commands.train:train",
+    "eval": "esp_cli.commands.eval:evaluate",
+    "tasks": "esp_cli.commands.tasks:tasks",
+}
 """Command name -> "module:function", in the order in which `esp --help` lists them."""
