@@ -60,23 +60,22 @@ class Network(nn.Module, ABC):
         """
 
 
-class MLP(Network):
+class MLP(SeedMLP, Network):
     """A perceptron; remembers nothing."""
 
     def __init__(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: NetworkConfig, output_gain: float
     ) -> None:
-        super().__init__()
         sizes = (inputs, *config.hidden, outputs)
-        self.body = SeedMLP(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
+        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the perceptron to one step."""
-        return self.body(x), memory
+        return self(x), memory
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the perceptron to all steps at once."""
-        return self.body(x.flatten(1, 2)).unflatten(1, x.shape[1:3])
+        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])
 
 
 class GRU(Network):

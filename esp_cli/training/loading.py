@@ -14,9 +14,9 @@ from torch import Tensor
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import RunConfig, one_sentence
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.run_folder import POLICY_FORMAT, RunFolder
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import POLICY_FORMAT, build_environment
+from esp_cli.training.trainer import build_environment
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,9 @@ def load_policy(path: Path) -> TrainedPolicy:
     found = folder.latest_checkpoint()
     if found is None:
         raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {path}")
-    own = {name.removeprefix("policy."): t for name, t in found.tensors.items() if name.startswith("policy.")}
-    return _build(path, parse_config(folder.config, path), own, found.meta)
+    tensors, meta = found
+    own = {name.removeprefix("policy."): t for name, t in tensors.items() if name.startswith("policy.")}
+    return _build(path, parse_config(folder.config, path), own, meta)
 
 
 def _build(path: Path, config: RunConfig, tensors: dict[str, Tensor], meta: Mapping[str, Any]) -> TrainedPolicy:

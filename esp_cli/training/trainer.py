@@ -17,15 +17,12 @@ from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.training.checkpoint import save_checkpoint
 from esp_cli.training.config import RunConfig
 from esp_cli.training.evaluation import PolicyController, play
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 
-POLICY_FORMAT = "esp-policy"
-"""Format name of a file that holds a policy alone."""
 CHECKPOINT_SECONDS = 30.0
 """A kill loses at most this much work; a checkpoint takes some milliseconds."""
 
@@ -141,7 +138,7 @@ class Trainer:
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
                 if not going and not self.is_complete:
                     return False
-        save_checkpoint(self.folder.policy_path, self.learner.policy.state_dict(), self._policy_meta(), POLICY_FORMAT)
+        self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
         return True
 
     def _iterate(self) -> dict[str, Any]:
@@ -212,17 +209,16 @@ class Trainer:
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
             "task_version": self.learner.collector.env.spec.version,
         }
-        self.folder.save_checkpoint(self.step, self.learner.state_dict(), meta, self.is_complete)
+        self.folder.write_checkpoint(self.step, self.learner.state_dict(), meta, self.is_complete)
 
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start anew."""
         found = self.folder.latest_checkpoint()
         if found is not None:
-            self.learner.load_state_dict(found.tensors)
-            self.iteration, self.elapsed_s = int(found.meta["iteration"]), float(found.meta["elapsed_s"])
-            self.stopped_seeds = {int(index): int(step) for index, step in found.meta["stopped_seeds"].items()}
-            if found.note:
-                self.notes.append(found.note)
+            tensors, meta = found
+            self.learner.load_state_dict(tensors)
+            self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
+            self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
         self.folder.truncate_metrics(self.step if found else -1)
 
     def _policy_meta(self) -> dict[str, Any]:

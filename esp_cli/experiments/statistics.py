@@ -1,0 +1,313 @@
+"""Statistics over seeds: means with intervals, comparisons of two groups of seeds, numbers read off learning curves.
+
+A sample is one number per seed, never one per episode: episodes of one seed share its policy and say nothing about how
+another seed would turn out. Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so
+that the same numbers give the same interval; with few seeds they are a little too narrow (of ten seeds drawn from a
+normal distribution, 90 % of the intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or
+resamples that all agree.
+
+Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
+(interquartile mean, stratified bootstrap, probability of improvement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+from scipy.integrate import trapezoid
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+_CURVE_RESAMPLES = 2_000
+_GENERATOR_SEED = 0
+
+Floats = NDArray[np.float64]
+Interval = tuple[float, float]
+Band = Literal["ci95", "sem"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and how far it can be trusted.
+
+    Attributes:
+        value: the number on the seeds at hand.
+        ci95: its 95 % bootstrap interval over seeds, or None where the bootstrap cannot tell.
+    """
+
+    value: float
+    ci95: Interval | None
+
+
+@dataclass(frozen=True)
+class StepsToThreshold:
+    """Env steps per seed at which a threshold is reached first.
+
+    Attributes:
+        of_mean: by the mean over seeds, or None where it never is.
+        per_seed: by each seed, likewise.
+    """
+
+    of_mean: int | None
+    per_seed: tuple[int | None, ...]
+
+
+def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
+    """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        ValueError: no value, or one that is not finite.
+    """
+    sample = _sample(values)
+    return float(sample.mean()), float(stats.sem(sample)) if sample.size > 1 else None
+
+
+def bootstrap_interval(values: ArrayLike) -> Interval | None:
+    """Return the 95 % bootstrap interval of the mean over seeds, or None where the bootstrap cannot tell.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        ValueError: no value, or one that is not finite.
+    """
+    return _interval((_sample(values),), np.mean)
+
+
+def interquartile_mean(values: ArrayLike) -> Estimate:
+    """Return the mean of the middle half: a quarter of the seeds, rounded down, is left out at either end.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        ValueError: no value, or one that is not finite.
+    """
+    sample = _sample(values)
+    return Estimate(float(_iqm(sample)), _interval((sample,), _iqm))
+
+
+def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"] = "iqm") -> Estimate:
+    """Return one number over several tasks, with a bootstrap that is stratified: seeds are redrawn within each task.
+
+    Args:
+        scores: by task, one finite number per seed [S]; normalise() makes tasks comparable.
+        statistic: of all seeds of all tasks together.
+
+    Raises:
+        ValueError: no task, no value, or one that is not finite.
+    """
+    if not scores:
+        raise ValueError("there is no task to aggregate over")
+    samples = tuple(_sample(values, f"of {task}") for task, values in scores.items())
+    inner = _iqm if statistic == "iqm" else np.mean
+
+    def pooled(*drawn: Floats, axis: int = -1) -> Any:
+        return inner(np.concatenate(drawn, axis=axis), axis=axis)
+
+    return Estimate(float(pooled(*samples)), _interval(samples, pooled))
+
+
+def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
+    """Return mean(x) - mean(y) with its interval.
+
+    Args:
+        x: one finite number per seed [S].
+        y: likewise [S'], of the group that x is compared with.
+        paired: seed k of x and seed k of y belong together (S = S'), as where they share their worlds.
+
+    Raises:
+        ValueError: no value, one that is not finite, or paired groups that differ in size.
+    """
+    first, second = _pair(x, y, paired)
+    value = float(first.mean() - second.mean())
+    if paired:
+        return Estimate(value, _interval((first - second,), np.mean))
+    return Estimate(value, _interval((first, second), _mean_difference))
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
+    """Return the probability that a seed of x beats a seed of y, P(X > Y) + P(X = Y) / 2.
+
+    Unpaired, all S * S' pairs count: the Mann-Whitney U of x over S * S'. Paired, seed k meets seed k only.
+
+    Args:
+        x: one finite number per seed [S]; higher is better.
+        y: likewise [S'].
+        paired: as in difference().
+
+    Raises:
+        ValueError: no value, one that is not finite, or paired groups that differ in size.
+    """
+    first, second = _pair(x, y, paired)
+    if paired:
+        wins = _wins(first, second)
+        return Estimate(float(wins.mean()), _interval((wins,), np.mean))
+    u = stats.mannwhitneyu(first, second).statistic
+    return Estimate(float(u) / (first.size * second.size), _interval((first, second), _share_of_wins))
+
+
+def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> StepsToThreshold:
+    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
+
+    A value that is not finite, as of a seed that was stopped, reaches nothing.
+
+    Args:
+        steps: env steps per seed, ascending [K].
+        values: [K, S]; higher is better.
+        threshold: e.g. a return.
+
+    Raises:
+        ValueError: shapes that do not fit, or steps that do not ascend.
+    """
+    at, curves = _curves(steps, values)
+    curves = np.where(np.isfinite(curves), curves, np.nan)
+
+    def first(reached: NDArray[np.bool_]) -> int | None:
+        return int(at[np.argmax(reached)]) if reached.any() else None
+
+    per_seed = tuple(first(curve >= threshold) for curve in curves.T)
+    return StepsToThreshold(first(curves.mean(axis=1) >= threshold), per_seed)
+
+
+def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
+    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S].
+
+    Args:
+        steps: env steps per seed, ascending [K], K > 1.
+        values: [K, S]; NaN gives that seed NaN.
+
+    Raises:
+        ValueError: shapes that do not fit, steps that do not ascend, or fewer than two of them.
+    """
+    at, curves = _curves(steps, values)
+    if at.size < 2:
+        raise ValueError("the area under a curve needs two evaluations or more")
+    return np.asarray(trapezoid(curves, at, axis=0) / (at[-1] - at[0]), dtype=np.float64)
+
+
+def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
+    """Return (value - random) / (heuristic - random): 0 is the random policy, 1 the heuristic one.
+
+    Args:
+        values: returns of any shape.
+        random: return of the random policy under the same convention.
+        heuristic: return of the heuristic policy.
+
+    Raises:
+        ValueError: the anchors agree, or are not finite.
+    """
+    if not np.isfinite([random, heuristic]).all() or random == heuristic:
+        raise ValueError(
+            f"the anchors random = {random} and heuristic = {heuristic} give no scale; they have to differ"
+        )
+    return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
+
+
+def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, Floats]:
+    """Return mean, lower and upper edge of a learning curve over seeds, each [K].
+
+    The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
+    is not finite all three are NaN, so that a stopped seed leaves a gap instead of a mean over the survivors.
+
+    Args:
+        values: [K, S].
+        band: 95 % bootstrap interval, or mean -+ one standard error.
+
+    Raises:
+        ValueError: values that are no [K, S].
+    """
+    curves = np.asarray(values, dtype=np.float64)
+    if curves.ndim != 2 or curves.shape[1] == 0:
+        raise ValueError(f"learning curves are evaluations by seeds [K, S], not of shape {list(curves.shape)}")
+    whole = np.isfinite(curves).all(axis=1)
+    mean = np.full(len(curves), np.nan)
+    mean[whole] = curves[whole].mean(axis=1)
+    low, high = mean.copy(), mean.copy()
+    if curves.shape[1] > 1 and whole.any():
+        if band == "sem":
+            sem = stats.sem(curves[whole], axis=1)
+            low[whole], high[whole] = mean[whole] - sem, mean[whole] + sem
+        else:
+            interval = _bootstrap((curves[whole],), np.mean, _CURVE_RESAMPLES)
+            low[whole], high[whole] = interval.low, interval.high
+    return mean, low, high
+
+
+def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Interval | None:
+    """Return the percentile bootstrap interval of a statistic of independent samples, or None where it cannot tell."""
+    if any(sample.size < 2 for sample in samples):
+        return None
+    interval = _bootstrap(samples, statistic, RESAMPLES)
+    low, high = float(interval.low), float(interval.high)
+    return (low, high) if low < high else None
+
+
+def _bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamples: int) -> Any:
+    return stats.bootstrap(
+        samples,
+        statistic,
+        n_resamples=resamples,
+        batch=500,
+        vectorized=True,
+        axis=-1,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(_GENERATOR_SEED),
+    ).confidence_interval
+
+
+def _iqm(values: Floats, axis: int = -1) -> Any:
+    return stats.trim_mean(values, 0.25, axis=axis)
+
+
+def _mean_difference(x: Floats, y: Floats, axis: int = -1) -> Any:
+    return x.mean(axis=axis) - y.mean(axis=axis)
+
+
+def _wins(x: Floats, y: Floats) -> Floats:
+    """Return 1 where x beats y, 1/2 where they tie, 0 elsewhere."""
+    return (x > y) + 0.5 * (x == y)
+
+
+def _share_of_wins(x: Floats, y: Floats, axis: int = -1) -> Any:
+    """Return the mean over all pairs; the samples' axis has to be the last."""
+    del axis
+    return _wins(x[..., :, None], y[..., None, :]).mean(axis=(-2, -1))
+
+
+def _sample(values: ArrayLike, where: str = "") -> Floats:
+    sample = np.asarray(values, dtype=np.float64)
+    label = f"the values {where}".strip()
+    if sample.ndim != 1 or sample.size == 0:
+        raise ValueError(f"{label} have to be one number per seed, not of shape {list(sample.shape)}")
+    bad = np.flatnonzero(~np.isfinite(sample)).tolist()
+    if bad:
+        raise ValueError(f"{label} are not finite at index {bad}; leave those seeds out and say so beside the result")
+    return sample
+
+
+def _pair(x: ArrayLike, y: ArrayLike, paired: bool) -> tuple[Floats, Floats]:
+    first, second = _sample(x), _sample(y)
+    if paired and first.size != second.size:
+        raise ValueError(f"paired groups have to have the same seeds, not {first.size} and {second.size} of them")
+    return first, second
+
+
+def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
+    at, curves = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    if at.ndim != 1 or curves.ndim != 2 or curves.shape[0] != at.size or curves.size == 0:
+        raise ValueError(
+            f"a learning curve is steps [K] and values [K, S], not {list(at.shape)} and {list(curves.shape)}"
+        )
+    if not (np.diff(at) > 0).all():
+        raise ValueError("the steps of a learning curve have to ascend")
+    return at, curves
