@@ -1,6 +1,16 @@
 """Batched, device-agnostic multi-agent environments whose numbers say what they are."""
 
-from esp_envs.base import Body, Environment, Observation, Scene, Step, TaskSettings, generators_for
+from esp_envs.base import (
+    Body,
+    Environment,
+    Observation,
+    Scene,
+    Step,
+    TaskSettings,
+    generator_states,
+    generators_for,
+    restore_generators,
+)
 from esp_envs.registry import make, task_class, task_names
 from esp_envs.spec import (
     Continuous,
@@ -28,10 +38,12 @@ __all__ = [
     "Step",
     "TaskSettings",
     "TaskSpec",
+    "generator_states",
     "generators_for",
     "joint_layout",
     "layout",
     "make",
+    "restore_generators",
     "task_class",
     "task_names",
 ]

@@ -58,6 +58,24 @@ def generators_for(seeds: Sequence[int], device: torch.device | str = "cpu") -> 
     return [torch.Generator(device=device).manual_seed(int(seed)) for seed in seeds]
 
 
+def generator_states(generators: Sequence[torch.Generator]) -> Tensor:
+    """Return the states of several generators, one row of bytes each."""
+    return torch.stack([generator.get_state() for generator in generators])
+
+
+def restore_generators(generators: Sequence[torch.Generator], states: Tensor) -> None:
+    """Put generators into the states that `generator_states` returned.
+
+    Raises:
+        ValueError: another number of generators, or no states.
+    """
+    if len(states) != len(generators):
+        raise ValueError(f"{len(states)} generator states are given for {len(generators)} generators")
+    for generator, state in zip(generators, states, strict=True):
+        # A copy: torch 2.13 reads a row of a larger tensor at the wrong place, and crashes.
+        generator.set_state(state.cpu().clone())
+
+
 class TaskSettings(BaseModel):
     """What a user may change of a task; each field has its default, unit and bounds here and nowhere else."""
 

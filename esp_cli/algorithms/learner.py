@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
+from esp_envs.base import generator_states, restore_generators
 from torch import Tensor, nn
 
 from esp_cli.algorithms.rollout import Collector
@@ -53,7 +54,7 @@ class Learner(ABC):
             for index, entry in optimiser.state_dict()["state"].items():
                 out |= {f"optimiser.{name}.{index}.{key}": value for key, value in entry.items()}
         for name, generators in self.generators.items():
-            out[f"generators.{name}"] = torch.stack([g.get_state() for g in generators])
+            out[f"generators.{name}"] = generator_states(generators)
         return out | {f"collector.{key}": value for key, value in self.collector.state_dict().items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -68,8 +69,7 @@ class Learner(ABC):
             for name, optimiser in self.optimisers.items():
                 _load_optimiser(optimiser, _below(tensors, f"optimiser.{name}"))
             for name, generators in self.generators.items():
-                for generator, state in zip(generators, tensors[f"generators.{name}"], strict=True):
-                    generator.set_state(state.cpu())
+                restore_generators(generators, tensors[f"generators.{name}"])
             self.collector.load_state_dict(_below(tensors, "collector"))
         except (KeyError, RuntimeError, IndexError, TypeError) as error:
             reason = str(error).split("\n")[0]

@@ -223,8 +223,7 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
     description = _description(header, format_name, version)
     _check_tensors(header, len(content) - _LENGTH_BYTES - header_bytes)
     try:
-        # Copies, since the loader's tensors lie wherever they lay in the file, and a random generator that is given
-        # its state from an unaligned address crashes the process.
+        # Copies, since the loader's tensors lie unaligned, wherever they lay in the file.
         tensors = {name: tensor.clone() for name, tensor in safetensors_torch.load(content).items()}
     except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
         raise CheckpointError(f"is damaged: {_short(error)}") from None

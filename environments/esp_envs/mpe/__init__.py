@@ -1,0 +1,1 @@
+"""The tasks of the multi-agent particle environment (MPE): navigation and predator-prey."""

@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
@@ -32,7 +33,7 @@ class FrozenPrey:
         if widths != [num_inputs, num_actions]:
             raise ValueError(
                 f"the prey policy {path} maps {widths[0]} observations to {widths[1]} actions, this task's prey has "
-                f"{num_inputs} and {num_actions}; train a prey with the same predators and obstacles and discrete actions"
+                f"{num_inputs} and {num_actions}; train a prey with the same predators, obstacles and discrete actions"
             )
 
     def moves(self, observation: Tensor) -> Tensor:
@@ -54,19 +55,18 @@ class FrozenPrey:
 
 def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
     """Return the JSON header and the actor's tensors of a policy file."""
-    from safetensors import SafetensorError, safe_open
-
     if not Path(path).is_file():
         raise ValueError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys() if name.startswith("actor.layers.")}
+            names = [name for name in file.keys() if name.startswith("actor.layers.")]  # noqa: SIM118 - no iterator
+            tensors = {name: file.get_tensor(name) for name in names}
         header = json.loads(metadata.get("esp", "null"))
     except (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ValueError(f"the prey policy {path} is damaged or no safetensors file ({error}); export it again") from error
+        raise ValueError(f"the prey policy {path} is no intact safetensors file ({error}); export it again") from error
     if not isinstance(header, dict):
-        raise ValueError(f"the file {path} is no policy of this project (no 'esp' entry); give an exported prey policy")
+        raise ValueError(f"the file {path} has no 'esp' entry, so it is no policy of this project; export a prey")
     return header, tensors
 
 
@@ -97,7 +97,7 @@ def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tens
                 f"{bias_name} {tuple(bias.shape)}); export it again"
             )
         if not 0 <= seed < len(weight):
-            raise ValueError(f"the prey policy {path} holds {len(weight)} seeds; prey_policy_seed {seed} is not among them")
+            raise ValueError(f"the prey policy {path} holds {len(weight)} seeds; there is no prey_policy_seed {seed}")
         layers.append((weight[seed].float(), bias[seed].float()))
     if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
         raise ValueError(f"the prey policy {path} holds numbers that are not finite; export it again")

@@ -33,7 +33,7 @@ class NavigationSettings(ParticleSettings):
         None,
         ge=1,
         le=8,
-        description="L, landmarks; by default as many as agents, but 3 for 2 agents, which is what the paper's row fits",
+        description="L, landmarks; by default as many as agents, but 3 for 2 agents, which the paper's row fits",
     )
     landmark_extent: float | None = Setting(
         None,
@@ -188,10 +188,11 @@ def _spec(settings: NavigationSettings) -> TaskSpec:
     agents, landmarks = settings.num_agents, settings.landmarks
     discrete = settings.actions == "discrete"
     esp = settings.convention == "esp"
+    reward = "team sum, self-collision counted" if esp else f"local_ratio {settings.local_ratio:g}"
     return TaskSpec(
         name="navigation",
         version=1,
-        convention="esp: team sum, self-collision counted" if esp else f"pettingzoo: local_ratio {settings.local_ratio}",
+        convention=f"{settings.convention}: {reward}",
         num_agents=agents,
         horizon=settings.horizon,
         observation=_observation_layout(agents, landmarks),

@@ -10,10 +10,10 @@ One step of MPE (Lowe et al. 2017, `multiagent/core.py`), which is what papers o
     velocity <- velocity * min(1, max_speed / |velocity|)
     position <- position + DT_S * velocity
 
-The packages that keep MPE alive (PettingZoo since 1.23, mpe2) move the position first, by the old velocity, so an action
-shows one step later; `velocity_first=False` does the same. Two bodies that collide push each other apart along the
-line between their centres with CONTACT_FORCE * CONTACT_MARGIN * softplus(-gap / CONTACT_MARGIN), where `gap` is the
-distance between their rims.
+The package that keeps MPE alive (mpe2) moves the position first, by the old velocity, so that an action shows one step
+later; `velocity_first=False` does the same. Two bodies that collide push each other apart along the line between their
+centres with CONTACT_FORCE * CONTACT_MARGIN * softplus(-gap / CONTACT_MARGIN), where `gap` is the distance between their
+rims.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ CONTACT_MARGIN = 1e-3
 LANE_MULTIPLE = 64
 """The worlds axis is padded to a multiple of this, so that vector code never runs a scalar tail: the numbers of a world
 do not depend on how many worlds stand beside it."""
-_SOFTPLUS_LINEAR = 20.0
-"""Above this softplus(x) equals x in float32."""
+_SOFTPLUS_RANGE = (-60.0, 20.0)
+"""Above it softplus(x) is x in float32; below it the push is some 1e-26, and exp would lose time by underflowing."""
 _SMALLEST_SQUARED_DISTANCE = 1e-24
 """Keeps the direction of a contact finite when two centres coincide (the force is then zero)."""
 
@@ -139,7 +139,7 @@ class ParticleWorlds:
         distance = self.squared_distance[:pairs].clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
         overlap = torch.add(self._touching, distance, alpha=-1 / CONTACT_MARGIN)
         # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.
-        softplus = overlap.clamp_max(_SOFTPLUS_LINEAR).exp_().log1p_()
+        softplus = overlap.clamp(*_SOFTPLUS_RANGE).exp_().log1p_()
         torch.maximum(softplus, overlap, out=softplus)
         strength = softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
         push = self._offset[:pairs] * strength.unsqueeze(1)
@@ -152,11 +152,18 @@ def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
     A learner may have switched on TF32, bfloat16 products or autocast for its networks; physics and observations must
     not be rounded by that, so the product is then taken in float64.
     """
-    kind = left.device.type
-    backend = torch.backends.cuda.matmul if kind == "cuda" else torch.backends.mkldnn.matmul
-    if backend.fp32_precision in ("none", "ieee") and not torch.is_autocast_enabled(kind):
-        return left @ right
-    return (left.double() @ right.double()).float()
+    if _products_are_rounded(left.device.type):
+        return (left.double() @ right.double()).float()
+    return left @ right
+
+
+def _products_are_rounded(device: str) -> bool:
+    """Return whether PyTorch may compute float32 products on a kind of device with fewer bits."""
+    backend = torch.backends.cuda.matmul if device == "cuda" else getattr(torch.backends.mkldnn, "matmul", None)
+    precision = getattr(backend, "fp32_precision", None)
+    if precision is None:  # before PyTorch 2.9 one switch covered all devices
+        return torch.get_float32_matmul_precision() != "highest" or torch.is_autocast_enabled(device)
+    return precision not in ("none", "ieee") or torch.is_autocast_enabled(device)
 
 
 def linear_matrix(function: Callable[[Tensor], Tensor], num_inputs: int) -> Tensor:

@@ -72,7 +72,7 @@ class PredatorPrey(ParticleTask):
         | 12..13               | prey          | prey minus own position                            | length   |
         | 14..15               | prey_velocity | velocity of the prey                               | length/s |
 
-    Observation of the prey: own velocity, own position, obstacles and predators relative to it; no velocities of others.
+    Observation of the prey: own velocity, own position, obstacles and predators relative to it; no other velocities.
 
     State: velocities of predators and of the prey, positions of predators and of the prey, positions of the obstacles.
 
@@ -81,13 +81,15 @@ class PredatorPrey(ParticleTask):
         prey (`control="prey"`): -10 x touches - bound(|x|) - bound(|y|), with bound(u) = 0 below 0.9, 10 (u - 0.9)
             below 1, then min(exp(2u - 2), 10).
 
-    Prey, when the predators learn: `random` draws one of the five moves each step (with continuous actions: no-op with
-    probability 1/5, else full force in a uniform direction; both leave the game symmetric), `fleeing` runs from the
-    nearest predator, and back towards the origin when farther than 0.9 from it, `still` exerts no force (it can be pushed), `policy` is a frozen
-    learned prey. The random prey's moves are drawn at the start of an episode: `prey_moves`.
+    Prey, when the predators learn:
+        random: one of the five moves drawn anew each step; with continuous actions no-op with probability 1/5, else
+            full force in a uniform direction. All are drawn at the start of an episode: `prey_moves`.
+        fleeing: runs from the nearest predator, and back to the origin when farther than 0.9 from it.
+        still: exerts no force (it can be pushed).
+        policy: a frozen learned prey, read from a file.
 
-    Start: velocities zero, all agents uniform in [-1, 1]^2, obstacles uniform in [-0.9, 0.9]^2. Conventions differ in the
-    order of integration only: `esp` updates the velocity first (original MPE), `pettingzoo` the position (mpe2).
+    Start: velocities zero, all agents uniform in [-1, 1]^2, obstacles uniform in [-0.9, 0.9]^2. Conventions differ in
+    the order of integration only: `esp` updates the velocity first (original MPE), `pettingzoo` the position (mpe2).
 
     Terminated: never. Truncated: after `horizon` = 25 steps; bootstrap there.
 

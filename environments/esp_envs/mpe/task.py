@@ -14,7 +14,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.base import Environment, Observation, Step, TaskSettings
+from esp_envs.base import Environment, Observation, Step, TaskSettings, generator_states, restore_generators
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
 
@@ -63,10 +63,8 @@ class ParticleTask(Environment):
         lanes = self.worlds.num_lanes
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
         self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
-        backward = [MOVES.points.index(LEFT), MOVES.points.index(DOWN)]
-        forward = [MOVES.points.index(RIGHT), MOVES.points.index(UP)]
-        self._backward = torch.tensor(backward, dtype=torch.int8, device=self.device).view(1, 2, 1)
-        self._forward = torch.tensor(forward, dtype=torch.int8, device=self.device).view(1, 2, 1)
+        directions = [MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP)]
+        self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
         self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
 
     @abstractmethod
@@ -136,7 +134,7 @@ class ParticleTask(Environment):
         return {
             "physics": self.worlds.physics.clone(),
             "time": torch.tensor(self._time),
-            "generators": torch.stack([g.get_state() for g in self.generators]),
+            "generators": generator_states(self.generators),
         }
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -150,8 +148,7 @@ class ParticleTask(Environment):
             raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
         self.worlds.physics.copy_(physics)
         self._time = int(tensors["time"])
-        for generator, state in zip(self.generators, states, strict=True):
-            generator.set_state(state.cpu())
+        restore_generators(self.generators, states)
         self.worlds.measure()
 
     def _observe(self) -> Observation:
@@ -166,8 +163,8 @@ class ParticleTask(Environment):
         control = self._control[self._learners]
         if self.settings.actions == "discrete":
             self._moves[:, 0, :worlds] = action.reshape(worlds, learners).t()
-            steps = (self._moves == self._forward).view(torch.int8) - (self._moves == self._backward).view(torch.int8)
-            control.copy_(steps)
+            chosen = (self._moves == self._directions).view(torch.int8)
+            control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
         else:
             force = action.reshape(worlds, learners, 2)
             length = force.norm(dim=-1, keepdim=True).clamp_min(1.0)
