@@ -145,7 +145,7 @@ class Environment(ABC):
 
     def random_action(self) -> Tensor:
         """Return a uniformly random joint action, drawn from each seed's own generator."""
-        shape = (self.num_envs, self.spec.num_agents)
+        shape: tuple[int, ...] = (self.num_envs, self.spec.num_agents)
         if isinstance(self.spec.action, Continuous):
             shape += (self.spec.action.width,)
             draws = [torch.rand(shape, generator=g, device=self.device) * 2 - 1 for g in self.generators]

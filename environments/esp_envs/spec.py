@@ -108,9 +108,7 @@ def layout(*fields: Field) -> Layout:
 
 def joint_layout(observation: Layout, num_agents: int) -> Layout:
     """Return the layout of all agents' observations one after the other (width N * D)."""
-    return Layout(
-        tuple(replace(f, name=f"agent{i}.{f.name}") for i in range(num_agents) for f in observation.fields)
-    )
+    return Layout(tuple(replace(f, name=f"agent{i}.{f.name}") for i in range(num_agents) for f in observation.fields))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, plac
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
 
 AGENT_RADIUS = 0.15
+_LANDMARK_RADIUS = 0.05
+"""For drawing only: landmarks touch nothing."""
 SENSITIVITY = 5.0
 """Acceleration of a full force, length / s^2."""
 OCCUPIED_WITHIN = 0.1
@@ -112,7 +114,7 @@ class Navigation(ParticleTask):
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
         bodies = Bodies(
-            radius=(AGENT_RADIUS,) * agents + (0.05,) * landmarks,
+            radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
             gain=(SENSITIVITY,) * agents,
             max_speed=None,
             contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
@@ -151,15 +153,15 @@ class Navigation(ParticleTask):
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return landmarks and agents of one world."""
+        """Return agents, and landmarks on top of them, of one world."""
         lane = world[0] * self.num_envs + world[1]
         places = self.worlds.entity[:, :, lane].tolist()
         agents = self.settings.num_agents
-        bodies = [Body((x, y), 0.05, _LANDMARK_COLOR, shape="cross") for x, y in places[agents:]]
-        bodies += [
+        bodies = [
             Body((x, y), AGENT_RADIUS, color, trail=True)
             for (x, y), color in zip(places[:agents], _AGENT_COLORS, strict=False)
         ]
+        bodies += [Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, shape="cross") for x, y in places[agents:]]
         return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4))
 
     def _start(self, seed: int, lanes: slice) -> None:

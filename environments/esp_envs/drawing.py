@@ -1,0 +1,133 @@
+"""Pictures of a scene, drawn with Pillow: no display and no graphics library needed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw
+
+from esp_envs.base import Body, Scene
+
+_OVERSAMPLING = 3
+"""Everything is drawn this much larger and averaged down, which smooths the edges."""
+_BACKGROUND = "#fafaf7"
+_GRID = "#e4e4de"
+_FRAME = "#c8c8c0"
+_GRID_SPACING = 0.5
+_RIM_DARKENING = 0.7
+_TRAIL_WIDTH = 0.3
+"""Width of a trail against the body's radius."""
+_TRAIL_STRENGTH = 0.8
+"""How much of the body's colour the newest end of a trail has; the oldest has almost none."""
+_SHAPES = ("disc", "ring", "cross", "square")
+
+_Color = tuple[int, ...]
+_Point = tuple[float, float]
+
+
+def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
+    """Draw one scene.
+
+    Args:
+        scene: what to draw.
+        size: pixels of the longer side; the other follows from the scene's window.
+        trail: earlier scenes of the same world, oldest first; bodies that leave a trail get one.
+
+    Shape:
+        [H, W, 3] uint8, red, green and blue; the first row is the top.
+
+    Raises:
+        ValueError: the size is below 16 pixels, the window is empty, or a body has an unknown shape.
+    """
+    x_min, x_max, y_min, y_max = scene.window
+    if size < 16 or x_max <= x_min or y_max <= y_min:
+        raise ValueError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
+    canvas = _Canvas(scene.window, size)
+    canvas.grid()
+    for index, body in enumerate(scene.bodies):
+        if body.trail:
+            path = [earlier.bodies[index].position for earlier in trail if index < len(earlier.bodies)]
+            canvas.trail([*path, body.position], body)
+    for body in scene.bodies:
+        canvas.body(body)
+    return canvas.pixels()
+
+
+class _Canvas:
+    """An oversampled picture with world coordinates."""
+
+    def __init__(self, window: tuple[float, float, float, float], size: int) -> None:
+        self._window = window
+        x_min, x_max, y_min, y_max = window
+        per_unit = size / max(x_max - x_min, y_max - y_min)
+        self._size = (max(1, round((x_max - x_min) * per_unit)), max(1, round((y_max - y_min) * per_unit)))
+        self._scale = per_unit * _OVERSAMPLING
+        width, height = (side * _OVERSAMPLING for side in self._size)
+        self._image = Image.new("RGB", (width, height), _BACKGROUND)
+        self._draw = ImageDraw.Draw(self._image)
+
+    def grid(self) -> None:
+        """Draw grid lines every half unit and a frame."""
+        x_min, x_max, y_min, y_max = self._window
+        for k in range(math.ceil(x_min / _GRID_SPACING), math.floor(x_max / _GRID_SPACING) + 1):
+            self._line([(k * _GRID_SPACING, y_min), (k * _GRID_SPACING, y_max)], _GRID, _OVERSAMPLING)
+        for k in range(math.ceil(y_min / _GRID_SPACING), math.floor(y_max / _GRID_SPACING) + 1):
+            self._line([(x_min, k * _GRID_SPACING), (x_max, k * _GRID_SPACING)], _GRID, _OVERSAMPLING)
+        width, height = self._image.size
+        self._draw.rectangle((0, 0, width - 1, height - 1), outline=_FRAME, width=_OVERSAMPLING)
+
+    def trail(self, path: Sequence[_Point], body: Body) -> None:
+        """Draw the way a body has come, fading towards its beginning."""
+        color, background = ImageColor.getrgb(body.color), ImageColor.getrgb(_BACKGROUND)
+        width = max(1, round(body.radius * _TRAIL_WIDTH * self._scale))
+        pieces = len(path) - 1
+        for k in range(pieces):
+            share = _TRAIL_STRENGTH * (k + 1) / pieces
+            self._line([path[k], path[k + 1]], _mix(background, color, share), width)
+            x, y = self._at(path[k + 1])
+            self._draw.ellipse(_box(x, y, width / 2), fill=_mix(background, color, share))
+
+    def body(self, body: Body) -> None:
+        """Draw a body with its rim and, where it has a heading, a nose mark."""
+        if body.shape not in _SHAPES:
+            raise ValueError(f"cannot draw a body of shape '{body.shape}'; the shapes are {', '.join(_SHAPES)}")
+        x, y = self._at(body.position)
+        radius = body.radius * self._scale
+        color = ImageColor.getrgb(body.color)
+        rim, thin = _mix((0, 0, 0), color, _RIM_DARKENING), _OVERSAMPLING
+        thick = max(thin, round(radius * 0.35))
+        if body.shape == "disc":
+            self._draw.ellipse(_box(x, y, radius), fill=color, outline=rim, width=thin)
+        elif body.shape == "ring":
+            self._draw.ellipse(_box(x, y, radius), outline=color, width=thick)
+        elif body.shape == "square":
+            self._draw.rectangle(_box(x, y, radius), fill=color, outline=rim, width=thin)
+        else:
+            for dy in (-radius, radius):
+                self._draw.line([(x - radius, y - dy), (x + radius, y + dy)], fill=color, width=thick)
+        if body.heading is not None:
+            tip = (x + radius * math.cos(body.heading), y - radius * math.sin(body.heading))
+            self._draw.line([(x, y), tip], fill=rim, width=thick)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """Return the picture at its final size."""
+        return np.asarray(self._image.resize(self._size, Image.Resampling.BOX), dtype=np.uint8).copy()
+
+    def _line(self, points: Sequence[_Point], color: str | _Color, width: int) -> None:
+        self._draw.line([self._at(point) for point in points], fill=color, width=width)
+
+    def _at(self, point: _Point) -> _Point:
+        """Return the pixel of a world point; y points up in the world and down in the picture."""
+        return (point[0] - self._window[0]) * self._scale, (self._window[3] - point[1]) * self._scale
+
+
+def _box(x: float, y: float, radius: float) -> tuple[float, float, float, float]:
+    return x - radius, y - radius, x + radius, y + radius
+
+
+def _mix(first: _Color, second: _Color, share: float) -> _Color:
+    """Return a colour `share` of the way from the first to the second."""
+    return tuple(round(a + (b - a) * share) for a, b in zip(first[:3], second[:3], strict=True))

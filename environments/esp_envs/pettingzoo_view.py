@@ -1,0 +1,150 @@
+"""Every task as a PettingZoo parallel environment: one world, NumPy in and out.
+
+    from esp_envs.pettingzoo_view import ParallelView
+    env = ParallelView("navigation", seed=0, num_agents=4)
+
+Needs the optional extra `pettingzoo` (pip install "esp-marl[pettingzoo]").
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from esp_envs.base import Observation
+from esp_envs.drawing import draw
+from esp_envs.registry import make
+from esp_envs.spec import Continuous
+
+try:
+    from gymnasium import spaces
+    from pettingzoo import ParallelEnv
+except ImportError as error:
+    raise ImportError(
+        f"the PettingZoo view needs a package that is missing ({error.name}); "
+        'install it with: pip install "esp-marl[pettingzoo]"'
+    ) from error
+
+_Array = NDArray[Any]
+
+
+class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be missing, its base is then unknown
+    """One world of a registered task as a `pettingzoo.ParallelEnv`.
+
+    Agents are named `agent_0`, `agent_1`, ...; observations are float32 vectors laid out as the task's card says,
+    actions are integers or float32 vectors, `state()` is the global state. Every agent's info holds the task's metrics.
+
+    Args:
+        task_name: registered name.
+        seed: of the first episode; `reset(seed=...)` sets another.
+        render_mode: None or "rgb_array".
+        **settings: task settings that differ from the defaults.
+
+    Raises:
+        ValueError: unknown task, unknown setting, or a value out of range.
+    """
+
+    def __init__(self, task_name: str, seed: int = 0, render_mode: str | None = None, **settings: object) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"unknown render mode '{render_mode}'; use 'rgb_array' or none")
+        self._env = make(task_name, 1, [seed], settings)
+        spec = self._env.spec
+        self.metadata: dict[str, Any] = {
+            "name": f"{spec.name}_v{spec.version}",
+            "render_modes": ["rgb_array"],
+            "is_parallelizable": True,
+            "render_fps": round(1 / spec.control_period_s),
+        }
+        self.render_mode = render_mode
+        self.possible_agents = [f"agent_{i}" for i in range(spec.num_agents)]
+        self.agents: list[str] = []
+        self.state_space = spaces.Box(-np.inf, np.inf, (spec.state.width,), np.float32)
+        self._state = np.zeros(spec.state.width, np.float32)
+        # one space object per agent: each has its own random generator
+        self.observation_spaces = {
+            agent: spaces.Box(-np.inf, np.inf, (spec.observation.width,), np.float32) for agent in self.possible_agents
+        }
+        self.action_spaces = {agent: self._new_action_space() for agent in self.possible_agents}
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Return the observation space of an agent, always the same object."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """Return the action space of an agent, always the same object."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, _Array], dict[str, dict[str, Any]]]:
+        """Start a new episode, of `seed` where one is given.
+
+        Args:
+            seed: restarts the task's random numbers.
+            options: none are known.
+        """
+        if seed is not None:
+            self._env.generators[0].manual_seed(int(seed))
+        self.agents = list(self.possible_agents)
+        observation = self._take(self._env.reset())
+        return observation, {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[dict[str, _Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Advance by one step; after the last one of an episode no agents are left until `reset`."""
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        step = self._env.step(self._joint(actions))
+        terminated, truncated = bool(step.terminated[0, 0]), bool(step.truncated[0, 0])
+        ended = terminated or truncated
+        observation = self._take(step.final if ended and step.final is not None else step.next)
+        reward = step.reward[0, 0].tolist()
+        info = {name: float(value[0, 0]) for name, value in step.metrics.items()}
+        agents = self.agents
+        if ended:
+            self.agents = []
+        return (
+            observation,
+            dict(zip(agents, reward, strict=True)),
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            {agent: dict(info) for agent in agents},
+        )
+
+    def state(self) -> _Array:
+        """Return the global state [state width]."""
+        return self._state.copy()
+
+    def render(self) -> _Array | None:
+        """Return a picture [H, W, 3] uint8, or nothing without a render mode."""
+        return None if self.render_mode is None else draw(self._env.scene())
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _new_action_space(self) -> spaces.Space[Any]:
+        action = self._env.spec.action
+        if isinstance(action, Continuous):
+            return spaces.Box(-1.0, 1.0, (action.width,), np.float32)
+        return spaces.Discrete(action.count)
+
+    def _joint(self, actions: dict[str, Any]) -> torch.Tensor:
+        """Return the joint action [1, 1, N] or [1, 1, N, width] of a dictionary of actions."""
+        missing = [agent for agent in self.agents if agent not in actions]
+        if missing:
+            raise ValueError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
+        for agent in self.agents:
+            if not self.action_spaces[agent].contains(actions[agent]):
+                raise ValueError(f"{agent}'s action {actions[agent]!r} is outside {self.action_spaces[agent]}")
+        joint = torch.as_tensor(np.stack([np.asarray(actions[agent]) for agent in self.agents]))
+        return joint.unsqueeze(0).unsqueeze(0)
+
+    def _take(self, observation: Observation) -> dict[str, _Array]:
+        """Keep the global state and return each agent's observation."""
+        self._state = observation.state[0, 0].numpy().copy()
+        rows = observation.obs[0, 0].numpy()
+        return {agent: rows[i].copy() for i, agent in enumerate(self.possible_agents)}
