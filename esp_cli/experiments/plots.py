@@ -10,7 +10,9 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -24,9 +26,10 @@ from esp_cli.experiments.statistics import Band, bootstrap_interval, curve_band,
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito, "Color Universal Design", 2008, without the yellow, which is too light for lines on white."""
 
-_LINE_STYLES = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
-_ANCHOR_COLOUR, _REFERENCE_COLOUR = "#777777", "#333333"
-_STYLE = {
+LineStyle = str | tuple[int, tuple[int, ...]]
+
+_LINE_STYLES: tuple[LineStyle, ...] = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+_STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": 150,
     "font.family": ["DejaVu Sans"],
@@ -37,10 +40,12 @@ _STYLE = {
     "grid.color": "#E5E5E5",
     "axes.axisbelow": True,
     "legend.frameon": False,
+    # names are not mathematics: a dollar sign stays one
+    "text.parse_math": False,
     # identifiers in SVG files are drawn at random unless salted
     "svg.hashsalt": "esp",
 }
-_LABEL_GAP = 0.045
+_LABEL_GAP = 0.045  # of the height of the axes
 _BAND_NAMES = {"ci95": "95 % bootstrap interval", "sem": "standard error"}
 
 
@@ -72,6 +77,16 @@ class Bar:
     values: ArrayLike
 
 
+@dataclass(frozen=True)
+class _Line:
+    """A value drawn across the axes, dotted for an anchor, dashed for a reference."""
+
+    name: str
+    value: float
+    style: LineStyle
+    colour: str
+
+
 def learning_curves(
     curves: Sequence[Curve],
     path: str | os.PathLike[str],
@@ -80,17 +95,19 @@ def learning_curves(
     anchors: Mapping[str, float] | None = None,
     references: Mapping[str, float] | None = None,
     band: Band = "ci95",
+    ylim: tuple[float, float] | None = None,
 ) -> tuple[Path, Path]:
     """Draw means over seeds with a band, beside horizontal lines for anchors and for numbers of others.
 
     Args:
         curves: at least one.
-        path: where to; its ending is replaced by ``.png`` and ``.svg``.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         title: heading.
         ylabel: what is plotted, with its convention.
         anchors: dotted lines: name -> value, as of the random and the heuristic policy.
         references: dashed lines: name -> value, as of a paper.
         band: what the shade is.
+        ylim: lowest and highest value in view; by default all of the curves and lines.
 
     Returns:
         The PNG and the SVG file.
@@ -114,9 +131,11 @@ def learning_curves(
             axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=label)
             if num_seeds > 1:
                 axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
-        lines = {**(anchors or {}), **(references or {})}
-        for name, value in lines.items():
-            _horizontal(axes, value, is_anchor=name in (anchors or {}))
+        if ylim is not None:
+            axes.set_ylim(*ylim)
+        lines = _lines(anchors, references)
+        for line in lines:
+            axes.axhline(line.value, linestyle=line.style, color=line.colour, linewidth=1.0, zorder=1)
         _label_lines(axes, lines)
         axes.set_xlabel("environment steps per seed")
         axes.set_ylabel(ylabel)
@@ -143,7 +162,7 @@ def bars(
 
     Args:
         groups: at least one, drawn from top to bottom.
-        path: where to; its ending is replaced by ``.png`` and ``.svg``.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         title: heading.
         xlabel: what is plotted, with its convention.
         baseline: where bars begin. The random policy's return makes a bar's length what was learned.
@@ -175,9 +194,9 @@ def bars(
         axes.set_yticks(range(len(groups)), [f"{group.label}\n({_seeds(np.size(group.values))})" for group in groups])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        for style, colour, lines in ((":", _ANCHOR_COLOUR, anchors), ("--", _REFERENCE_COLOUR, references)):
-            for name, value in (lines or {}).items():
-                axes.axvline(value, linestyle=style, color=colour, linewidth=1.2, label=name)
+        for line in _lines(anchors, references):
+            label = f"{line.name} {line.value:g}"
+            axes.axvline(line.value, linestyle=line.style, color=line.colour, linewidth=1.2, label=label)
         if baseline:
             axes.axvline(baseline, color="black", linewidth=0.8)
         caption = _caption(band, [np.size(group.values) for group in groups])
@@ -192,7 +211,9 @@ def _figure(
     path: str | os.PathLike[str], title: str, height: float = 4.6
 ) -> Iterator[tuple[Figure, Axes, tuple[Path, Path]]]:
     """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched."""
-    png, svg = Path(path).with_suffix(".png"), Path(path).with_suffix(".svg")
+    path = Path(path)
+    stem = path.stem if path.suffix in {".png", ".svg"} else path.name
+    png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(7.2, height), layout="constrained")
         axes = figure.add_subplot()
@@ -206,18 +227,20 @@ def _figure(
             raise ValueError(f"cannot write the figure {path}: {error.strerror or error}") from None
 
 
-def _horizontal(axes: Axes, value: float, is_anchor: bool) -> None:
-    style, colour = (":", _ANCHOR_COLOUR) if is_anchor else ("--", _REFERENCE_COLOUR)
-    axes.axhline(value, linestyle=style, color=colour, linewidth=1.2, zorder=1)
+def _lines(anchors: Mapping[str, float] | None, references: Mapping[str, float] | None) -> list[_Line]:
+    dotted = [_Line(name, value, ":", "#777777") for name, value in (anchors or {}).items()]
+    dashed = [_Line(name, value, (0, (8, 4)), "#333333") for name, value in (references or {}).items()]
+    return dotted + dashed
 
 
-def _label_lines(axes: Axes, lines: Mapping[str, float]) -> None:
-    """Write the names of horizontal lines at the right, pushed apart where values are close."""
+def _label_lines(axes: Axes, lines: Sequence[_Line]) -> None:
+    """Write the names of the horizontal lines in view at the right, pushed apart where values are close."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
-    heights = _spread([(value - low) / (high - low) for value in lines.values()])
-    for (name, value), height in zip(lines.items(), heights, strict=True):
-        axes.text(1.01, height, f"{name} {value:g}", transform=axes.transAxes, va="center", fontsize=8)
+    shown = [line for line in lines if low <= line.value <= high]
+    heights = _spread([(line.value - low) / (high - low) for line in shown])
+    for line, height in zip(shown, heights, strict=True):
+        axes.text(1.01, height, f"{line.name} {line.value:g}", transform=axes.transAxes, va="center", fontsize=8)
 
 
 def _spread(heights: Sequence[float]) -> list[float]:
@@ -226,7 +249,7 @@ def _spread(heights: Sequence[float]) -> list[float]:
     placed = np.array(heights, dtype=np.float64)
     for _ in range(50):
         moved = False
-        for below, above in zip(order[:-1], order[1:], strict=True):
+        for below, above in pairwise(order):
             missing = _LABEL_GAP - (placed[above] - placed[below])
             if missing > 1e-9:
                 placed[below] -= missing / 2
