@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -17,6 +16,7 @@ from esp_envs.spec import TaskSpec
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from esp_cli.algorithms.batch import Batch
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.losses import (
     clip_gradients_per_seed,
@@ -76,35 +76,8 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
 """What a preset changes; "paper" is supplement table 2 with the MAPPO paper's defaults where it is silent."""
 
 
-@dataclass
-class Batch:
-    """Experience ready for gradient steps: B sequences of tau steps (tau = 1 unless the network is recurrent).
-
-    Shape:
-        obs [S, B, tau, N, D], state [S, B, tau, state width], action [S, B, tau, N(, width)],
-        log_prob and advantage [S, B, tau, N], target and value [S, B, tau, C] in normalised units.
-    """
-
-    obs: Tensor
-    state: Tensor
-    action: Tensor
-    log_prob: Tensor
-    advantage: Tensor
-    target: Tensor
-    value: Tensor
-
-    def select(self, rows: Tensor) -> Batch:
-        """Return the sequences `rows`: [S, m]."""
-        num_seeds, count = self.obs.shape[:2]
-        flat = (rows + count * torch.arange(num_seeds, device=rows.device).unsqueeze(1)).flatten()
-        return self._map(lambda x: x.flatten(0, 1).index_select(0, flat).unflatten(0, rows.shape))
-
-    def chunks(self, size: int) -> list[Batch]:
-        """Cut the batch axis into pieces of at most `size`; views, no copies."""
-        return [self._map(lambda x, a=a: x[:, a : a + size]) for a in range(0, self.obs.shape[1], size)]  # type: ignore[misc]
-
-    def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
-        return Batch(**{name: function(tensor) for name, tensor in vars(self).items()})
+PROBE_STEPS = 100
+"""Environment steps per seed on which the symmetry errors are measured after every update."""
 
 
 class Mappo(Learner):
@@ -189,9 +162,8 @@ class Mappo(Learner):
             for minibatch in self._minibatches(batch):
                 self._gradient_step(minibatch, entropy_coef, sums if is_last else None)
         metrics |= {f"train/{name}": value / config.num_minibatches for name, value in sums.items()}
-        share = self.prior.num_copies / (1 + self.prior.num_copies) if self.prior.config.augments else 0.0
-        metrics["train/augmented_share"] = torch.full((batch.obs.shape[0],), share)
-        return metrics
+        metrics["train/augmented_share"] = torch.full((batch.obs.shape[0],), self.prior.augmented_share)
+        return metrics | self._symmetry_errors(batch)
 
     def _prepare(self, rollout: Rollout) -> tuple[Batch, dict[str, Tensor]]:
         """Value every state, estimate advantages, and shape the rollout into sequences."""
@@ -304,8 +276,6 @@ class Mappo(Learner):
             originals = outputs[:, :count], values[:, :count]
             policy_gap, value_gap = self._consistency(originals, outputs[:, count:], values[:, count:], transforms)
             loss = loss + prior.coefficient * (policy_gap + value_gap)
-            if sums is not None:
-                _add(sums, weight, policy_symmetry_error=policy_gap, value_symmetry_error=value_gap)
         if sums is not None:
             ratio_gap = log_ratio.detach()[:, :count]
             ratio = ratio_gap.exp()
@@ -324,8 +294,7 @@ class Mappo(Learner):
         """Return the chunk with its transformed copies behind it along the batch axis."""
         if not transforms:
             return chunk
-        parts = [chunk, *(self._transformed(chunk, g) for g in transforms)]
-        return Batch(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(chunk)})
+        return Batch.concatenate([chunk, *(self._transformed(chunk, g) for g in transforms)])
 
     def _transformed(self, chunk: Batch, g: Transform) -> Batch:
         """Return (L_g s, K_g a) with advantage and target of the original (Prop. 1).
@@ -334,7 +303,10 @@ class Mappo(Learner):
         value clipping reads, is always evaluated anew. Recurrent networks are unrolled over the transformed history.
         """
         obs, state, action = g.obs(chunk.obs), g.state(chunk.state), g.action(chunk.action)
-        log_prob, value = g.per_agent(chunk.log_prob), g.per_agent(chunk.value)
+        log_prob, advantage = g.per_agent(chunk.log_prob), g.per_agent(chunk.advantage)
+        target, value = chunk.target, chunk.value
+        if self.num_values > 1:
+            target, value = g.per_agent(target), g.per_agent(value)
         if self._old is not None:
             old_policy, old_critic = self._old
             with torch.no_grad():
@@ -342,7 +314,21 @@ class Mappo(Learner):
                     log_prob = old_policy.head.log_prob(old_policy.unroll(obs), action)
                 if self.config.clip_value:
                     value = old_critic.unroll(self._critic_input(obs, state))  # type: ignore[operator]
-        return Batch(obs, state, action, log_prob, g.per_agent(chunk.advantage), g.per_agent(chunk.target), value)
+        return Batch(obs, state, action, log_prob, advantage, target, value)
+
+    @torch.no_grad()
+    def _symmetry_errors(self, batch: Batch) -> dict[str, Tensor]:
+        """Measure how far policy and critic are from symmetry, prior or not: Eq. 8 and 9 on fixed elements."""
+        probe = self.prior.probe
+        if not probe:
+            return {}
+        originals = batch.chunks(max(1, PROBE_STEPS // batch.obs.shape[2]))[0]
+        rows = Batch.concatenate([originals, *(self._transformed(originals, g) for g in probe)])
+        outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(self._critic_input(rows.obs, rows.state))
+        count = originals.obs.shape[1]
+        base = outputs[:, :count], values[:, :count]
+        policy_gap, value_gap = self._consistency(base, outputs[:, count:], values[:, count:], probe)
+        return {"train/policy_symmetry_error": policy_gap, "train/value_symmetry_error": value_gap}
 
     def _consistency(
         self, originals: tuple[Tensor, Tensor], outputs: Tensor, values: Tensor, transforms: list[Transform]

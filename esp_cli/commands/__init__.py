@@ -10,6 +10,9 @@ from __future__ import annotations
 COMMANDS: dict[str, str] = {
     "train": "esp_cli.commands.train:train",
     "eval": "esp_cli.commands.eval:evaluate",
+    "render": "esp_cli.commands.render:render",
+    "render": "esp_cli.commands.render:render",
+    "report": "esp_cli.commands.report:report",
     "tasks": "esp_cli.commands.tasks:tasks",
 }
 """Command name -> "module:function", in the order in which `esp --help` lists them."""

@@ -80,14 +80,15 @@ class BoundedGaussian(nn.Module):
         super().__init__()
         self.num_outputs = space.width
         items = [f.kind for f in space.layout.fields for _ in range(f.count)]
-        self.log_std = nn.Parameter(torch.full((num_seeds, 1, 1, len(items)), math.log(initial_std)))
+        self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(initial_std)))
         self.item: Tensor
         self.register_buffer("item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False)
         self.disc: Tensor
         self.register_buffer("disc", _same_disc(items), False)
 
-    def _log_std(self) -> Tensor:
-        return self.log_std[..., self.item]
+    def _log_std(self, like: Tensor) -> Tensor:
+        """Return the log deviation of each number, shaped to stand beside `like`: [S, ..., width]."""
+        return self.log_std[:, self.item].view(-1, *[1] * (like.dim() - 2), self.num_outputs)
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
@@ -100,7 +101,7 @@ class BoundedGaussian(nn.Module):
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the latent action mean + std * noise."""
-        return outputs + self._log_std().exp() * noise
+        return outputs + self._log_std(outputs).exp() * noise
 
     def mode(self, outputs: Tensor) -> Tensor:
         """Return the mean."""
@@ -108,18 +109,18 @@ class BoundedGaussian(nn.Module):
 
     def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
         """Return the latent Gaussian's log density: [S, B, N]."""
-        log_std = self._log_std()
+        log_std = self._log_std(outputs)
         z = (action - outputs) * (-log_std).exp()
         return -(0.5 * z.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def entropy(self, outputs: Tensor) -> Tensor:
         """Return the latent Gaussian's entropy: [S, B, N]."""
-        entropy = (self._log_std() + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+        entropy = (self._log_std(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
         return entropy.expand(outputs.shape[:-1])
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
-        return (0.5 * ((p - q) * (-self._log_std()).exp()).square()).sum(-1)
+        return (0.5 * ((p - q) * (-self._log_std(p)).exp()).square()).sum(-1)
 
     def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
         """Return K_g^{-1} applied to the means."""

@@ -8,11 +8,13 @@ import torch
 from esp_envs.spec import TaskSpec
 
 from esp_cli.prior.config import PriorConfig
-from esp_cli.symmetry import Transform, transform_set
+from esp_cli.symmetry import Transform, carried_groups, transform_set
 
 
 class SymmetryPrior:
     """A task's known symmetry, ready for use in a learner's update.
+
+    `probe` holds the fixed elements on which symmetry errors are measured, with a prior or without.
 
     Args:
         config: what the user chose.
@@ -30,12 +32,19 @@ class SymmetryPrior:
         if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
 
+        self.probe = _probe(spec, device)
+
     @property
     def num_copies(self) -> int:
         """Transformed copies of every row of a minibatch."""
         if self.transforms is None:
             return 0
         return self.transforms.size if self.config.copies == "all" else 1
+
+    @property
+    def augmented_share(self) -> float:
+        """Share of the rows in a learner's own loss that are copies."""
+        return self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
 
     def for_minibatch(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         """Return the transforms of the next minibatch, each one element per seed.
@@ -48,3 +57,10 @@ class SymmetryPrior:
         if self.config.copies == "all" or self.transforms.size == 1:
             return self.transforms.each()
         return [self.transforms.draw(generators)]
+
+
+def _probe(spec: TaskSpec, device: torch.device | str) -> list[Transform]:
+    """Return a quarter turn and a mirror, as far as the task carries them, for measuring symmetry errors."""
+    carried = carried_groups(spec)
+    elements = ",".join(name for name, group in (("rot90", "c4"), ("flip-x", "d4")) if group in carried)
+    return transform_set(elements, spec, device).each() if elements else []
