@@ -223,15 +223,17 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
     description = _description(header, format_name, version)
     _check_tensors(header, len(content) - _LENGTH_BYTES - header_bytes)
     try:
-        # Copies, since the loader's tensors lie unaligned, wherever they lay in the file.
-        tensors = {name: tensor.clone() for name, tensor in safetensors_torch.load(content).items()}
+        tensors = safetensors_torch.load(content)
     except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
         raise CheckpointError(f"is damaged: {_short(error)}") from None
     _check_bools(tensors)
     expected = description.pop("sha256")
     if _digest(tensors, description) != expected:
         raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
-    return tensors, {key: value for key, value in description.items() if key not in _RESERVED}
+    # Copies, since the loader's tensors lie unaligned, wherever they lay in the file; only now, since the copy of a
+    # damaged truth value is a sound one.
+    aligned = {name: tensor.clone() for name, tensor in tensors.items()}
+    return aligned, {key: value for key, value in description.items() if key not in _RESERVED}
 
 
 def parse_json_object(text: bytes | str, what: str) -> dict[str, Any]:

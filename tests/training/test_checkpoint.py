@@ -86,6 +86,14 @@ def test_loaded_tensors_are_writable_and_apart(tmp_path):
     assert loaded["right"].tolist() == [6.0, 7.0, 8.0, 9.0, 10.0, 11.0]
 
 
+def test_loaded_tensors_are_aligned(tmp_path):
+    # an odd number of bytes before each next tensor
+    odd = {f"{index}": torch.arange(index, dtype=torch.uint8) for index in range(1, 30, 2)}
+    save_checkpoint(tmp_path / "a", odd, {})
+    for tensor in load_checkpoint(tmp_path / "a")[0].values():
+        assert tensor.data_ptr() % 16 == 0
+
+
 def test_other_safetensors_readers_read_the_file(tmp_path):
     save_checkpoint(tmp_path / "a", tensors(), META)
     assert_same(safetensors.torch.load_file(tmp_path / "a"), tensors())
