@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
-from esp_envs.base import generator_states, restore_generators
 from torch import Tensor, nn
 
 from esp_cli.algorithms.rollout import Collector
 from esp_cli.networks.policy import Policy
+from esp_envs.base import generator_states, restore_generators
 
 
 class Learner(ABC):

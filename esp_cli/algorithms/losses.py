@@ -21,23 +21,23 @@ def gae(
     A_t = delta_t + gamma lambda (1 - ended_t) A_{t+1}
 
     Args:
-        reward: [S, T, E, C], C = 1 for a shared reward, else N.
-        value: [S, T, E, C] V(s_t).
-        next_value: [S, T, E, C] V of the state that really followed, the final one where an episode ended.
-        terminated: [S, T, E, 1]; no value lies beyond.
-        ended: [S, T, E, 1] terminated or truncated; the next row belongs to another episode.
+        reward: [S, E, T, C], C = 1 for a shared reward, else N.
+        value: [S, E, T, C] V(s_t).
+        next_value: [S, E, T, C] V of the state that really followed, the final one where an episode ended.
+        terminated: [S, E, T, 1]; no value lies beyond.
+        ended: [S, E, T, 1] terminated or truncated; the next row belongs to another episode.
         gamma: discount factor.
         gae_lambda: 0 is one-step temporal difference, 1 Monte Carlo.
 
     Returns:
-        [S, T, E, C].
+        [S, E, T, C].
     """
     delta = torch.where(terminated, reward, reward + gamma * next_value) - value
     decay = gamma * gae_lambda * (~ended).to(delta.dtype)
-    advantage, carry = torch.empty_like(delta), torch.zeros_like(delta[:, 0])
-    for t in reversed(range(delta.shape[1])):
-        carry = delta[:, t] + decay[:, t] * carry
-        advantage[:, t] = carry
+    advantage, carry = torch.empty_like(delta), torch.zeros_like(delta[:, :, 0])
+    for t in reversed(range(delta.shape[2])):
+        carry = delta[:, :, t] + decay[:, :, t] * carry
+        advantage[:, :, t] = carry
     return advantage
 
 

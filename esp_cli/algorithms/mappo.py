@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from esp_envs.base import Environment, Observation
-from esp_envs.spec import TaskSpec
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
@@ -32,6 +30,8 @@ from esp_cli.networks.bodies import NetworkConfig, build_network
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import Transform
+from esp_envs.base import Environment, Observation
+from esp_envs.spec import TaskSpec
 
 
 class MappoConfig(BaseModel):
@@ -174,8 +174,7 @@ class Mappo(Learner):
         value, next_value = self.normaliser.denormalise(raw_value), self.normaliser.denormalise(raw_next)
         ended = rollout.ended.unsqueeze(-1)
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
-        axes = [x.transpose(1, 2) for x in (reward, value, next_value, terminated, ended)]
-        advantage = gae(*axes, config.gamma, config.gae_lambda).transpose(1, 2)
+        advantage = gae(reward, value, next_value, terminated, ended, config.gamma, config.gae_lambda)
         target = advantage + value
         self.normaliser.update(target)
         per_agent = normalise_per_seed(advantage).expand(rollout.log_prob.shape)
@@ -252,7 +251,12 @@ class Mappo(Learner):
         self.optimiser.step()
 
     def _loss(
-        self, chunk: Batch, transforms: list[Transform], entropy_coef: float, weight: float, sums: dict | None
+        self,
+        chunk: Batch,
+        transforms: list[Transform],
+        entropy_coef: float,
+        weight: float,
+        sums: dict[str, Tensor] | None,
     ) -> Tensor:
         """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S]."""
         config, prior, head = self.config, self.prior.config, self.policy.head
@@ -360,4 +364,4 @@ def _mean(x: Tensor) -> Tensor:
 
 def _add(sums: dict[str, Tensor], weight: float, **values: Tensor) -> None:
     for name, value in values.items():
-        sums[name] = sums.get(name, 0.0) + weight * value.detach()  # type: ignore[arg-type]
+        sums[name] = sums.get(name, 0.0) + weight * value.detach()

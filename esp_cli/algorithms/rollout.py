@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
-from esp_envs.base import Environment, Observation
 from torch import Tensor
 
 from esp_cli.networks.policy import Policy
+from esp_envs.base import Environment, Observation
 
 
 @dataclass

@@ -11,7 +11,6 @@ COMMANDS: dict[str, str] = {
     "train": "esp_cli.commands.train:train",
     "eval": "esp_cli.commands.eval:evaluate",
     "render": "esp_cli.commands.render:render",
-    "render": "esp_cli.commands.render:render",
     "report": "esp_cli.commands.report:report",
     "tasks": "esp_cli.commands.tasks:tasks",
 }

@@ -32,8 +32,8 @@ def _print(result: dict[str, Any]) -> None:
         rows.append((mode, console.format_mean(verdict["mean"], verdict["sem"]), interval))
     rows += [(f"anchor: {name}", f"{value:.2f}", "-") for name, value in result["anchors"].items()]
     title = (
-        f"{result['task']} version {result['task_version']}, {len(result['seeds'])} seed(s) x {result['episodes']} episodes,"
-        f" after {console.format_count(result['step'])} steps"
+        f"{result['task']} version {result['task_version']} after {console.format_count(result['step'])} steps, "
+        f"{len(result['seeds'])} seed(s) x {result['episodes']} episodes"
     )
     caption = f"convention {result['convention']}; mean ± s.e.m. and 95 % bootstrap interval over seeds"
     console.table(("policy", "episode return>", "95 % interval>"), rows, title=title, caption=caption)

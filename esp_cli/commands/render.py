@@ -17,7 +17,9 @@ EPILOG = """Examples:\n
 def render(
     policy: PolicyArgument,
     out: OutOption,
-    episodes: Annotated[int, typer.Option("--episodes", "-e", min=1, max=100, help="Episodes, one after the other.")] = 3,
+    episodes: Annotated[
+        int, typer.Option("--episodes", "-e", min=1, max=100, help="Episodes, one after the other.")
+    ] = 3,
     seed: Annotated[int | None, typer.Option("--seed", help="Which seed's policy acts; by default the first.")] = None,
     size: Annotated[int, typer.Option("--size", min=32, max=2048, help="Longer side in pixels.")] = 320,
     speed: Annotated[float, typer.Option("--speed", min=0.01, max=100, help="Times real time.")] = 1.0,

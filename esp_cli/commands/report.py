@@ -26,9 +26,7 @@ def report(
         typer.Option("--reference", help="Draw a line at somebody else's number.", metavar="NAME=VALUE"),
     ] = None,
     mode: Annotated[Literal["greedy", "stochastic"], typer.Option("--mode", help="Which evaluations.")] = "greedy",
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")
-    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")] = None,
     json: JsonOption = None,
 ) -> None:
     """Compare runs of one task: returns with intervals, differences from the first run, steps to thresholds."""
@@ -72,9 +70,13 @@ def _print(result: dict[str, Any]) -> None:
     caption = f"convention {result['convention']}; mean ± s.e.m. over seeds; difference from the first run"
     headings = ("run", "steps>", "seeds>", "return>", "95 % interval>", "difference>", "95 % interval>")
     console.table(headings, rows, title=title, caption=caption)
-    limits = [(run["label"], limit, passed["mean"]) for run in result["runs"] for limit, passed in run["steps_to"].items()]
+    limits = [
+        (run["label"], limit, passed["mean"]) for run in result["runs"] for limit, passed in run["steps_to"].items()
+    ]
     if limits:
-        cells = [(label, limit, console.format_count(step) if step is not None else "-") for label, limit, step in limits]
+        cells = [
+            (label, limit, console.format_count(step) if step is not None else "-") for label, limit, step in limits
+        ]
         console.table(("run", "return>", "first reached at>"), cells)
 
 

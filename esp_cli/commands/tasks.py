@@ -20,10 +20,9 @@ def tasks(
     json: JsonOption = None,
 ) -> None:
     """List the tasks and the symmetries that each carries, or print the card of one task."""
+    from esp_cli.symmetry import carried_groups
     from esp_envs.registry import make, task_class, task_names
     from esp_envs.spec import describe_action
-
-    from esp_cli.symmetry import carried_groups
 
     found = []
     for name in (task,) if task else task_names():
@@ -36,7 +35,9 @@ def tasks(
                 "convention": spec.convention,
                 "agents": spec.num_agents,
                 "horizon": spec.horizon,
-                "observation": [dict(zip(("index", "field", "kind", "unit"), r, strict=True)) for r in spec.observation.table()],
+                "observation": [
+                    dict(zip(("index", "field", "kind", "unit"), r, strict=True)) for r in spec.observation.table()
+                ],
                 "actions": [" ".join(pair) for pair in describe_action(spec.action)],
                 "symmetries": list(carried_groups(spec)),
                 "heuristics": list(cls.heuristics),

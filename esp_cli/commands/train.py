@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Iterator
@@ -116,14 +117,18 @@ def _run(folder: RunFolder, tensorboard: bool) -> None:
 
             complete = trainer.run(listen)
     if not complete:
-        console.note(f"stopped at {console.format_count(trainer.step)} steps; go on with: esp train --resume {folder.path}")
+        console.note(
+            f"stopped at {console.format_count(trainer.step)} steps; go on with: esp train --resume {folder.path}"
+        )
         raise typer.Exit(130)
     _report(trainer, folder)
 
 
 def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
     prior = config.prior
-    symmetry = "no prior" if prior.kind == "none" else f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
+    symmetry = (
+        "no prior" if prior.kind == "none" else f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
+    )
     verb = f"resuming at {console.format_count(step)}" if step else "training"
     console.note(
         f"{verb}: {config.algorithm} on {config.task}, {symmetry}, {len(config.seeds)} seed(s), "
@@ -136,7 +141,7 @@ def _shown(news: Progress) -> dict[str, float]:
     names = {"greedy": "eval/return_greedy", "return": "train/return", "entropy": "train/entropy"}
     out = {}
     for label, name in names.items():
-        values = [x for x in news.metrics.get(name, []) if x is not None and x == x]
+        values = [x for x in news.metrics.get(name, []) if x is not None and not math.isnan(x)]
         if values:
             out[label] = sum(values) / len(values)
     return out
@@ -158,7 +163,7 @@ def _stop_requests() -> Iterator[list[int]]:
     """Turn the first Ctrl-C (or termination signal) into a request; a second one interrupts at once."""
     requests: list[int] = []
 
-    def handler(number: int, frame: FrameType | None) -> None:
+    def handler(number: int, _frame: FrameType | None) -> None:
         if requests:
             raise KeyboardInterrupt
         requests.append(number)

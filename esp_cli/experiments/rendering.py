@@ -7,7 +7,6 @@ from pathlib import Path
 import imageio.v3 as imageio
 import numpy as np
 import torch
-from esp_envs.drawing import draw
 from numpy.typing import NDArray
 
 from esp_cli.training.checkpoint import write_bytes_atomic
@@ -15,6 +14,7 @@ from esp_cli.training.evaluation import PolicyController
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
+from esp_envs.drawing import draw
 
 Frame = NDArray[np.uint8]
 

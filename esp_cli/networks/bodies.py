@@ -27,7 +27,6 @@ class NetworkConfig(BaseModel):
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
 
-
     @property
     def dtype(self) -> torch.dtype:
         """The precision as torch names it."""
@@ -64,7 +63,12 @@ class MLP(SeedMLP, Network):
     """A perceptron; remembers nothing."""
 
     def __init__(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: NetworkConfig, output_gain: float
+        self,
+        generators: Sequence[torch.Generator],
+        inputs: int,
+        outputs: int,
+        config: NetworkConfig,
+        output_gain: float,
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
@@ -82,7 +86,12 @@ class GRU(Network):
     """Hidden layers, a gated recurrent unit, a linear head: the recurrent network of the MAPPO paper."""
 
     def __init__(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: NetworkConfig, output_gain: float
+        self,
+        generators: Sequence[torch.Generator],
+        inputs: int,
+        outputs: int,
+        config: NetworkConfig,
+        output_gain: float,
     ) -> None:
         super().__init__()
         width = config.hidden[-1]

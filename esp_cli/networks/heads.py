@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 
 import torch
-from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind
 from torch import Tensor, nn
 
 from esp_cli.symmetry import Transform
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind
 
 
 class Categorical(nn.Module):
@@ -82,7 +82,9 @@ class BoundedGaussian(nn.Module):
         items = [f.kind for f in space.layout.fields for _ in range(f.count)]
         self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(initial_std)))
         self.item: Tensor
-        self.register_buffer("item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False)
+        self.register_buffer(
+            "item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False
+        )
         self.disc: Tensor
         self.register_buffer("disc", _same_disc(items), False)
 
@@ -133,7 +135,7 @@ class BoundedGaussian(nn.Module):
 
 
 def _same_disc(items: Sequence[Kind]) -> Tensor:
-    """Return the [width, width] 0/1 matrix that is 1 where two numbers belong to one planar vector, and on the diagonal."""
+    """Return the [width, width] 0/1 matrix that is 1 between numbers of one planar vector, and on the diagonal."""
     blocks = [torch.ones(2, 2) if kind is Kind.VECTOR else torch.eye(kind.width) for kind in items]
     return torch.block_diag(*blocks)
 

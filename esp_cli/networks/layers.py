@@ -100,7 +100,9 @@ class SeedMLP(nn.Module):
         if self.norms is not None:
             return self._forward_normed(x)
         parameters = [p for layer in self.layers for p in (layer.weight, layer.bias)]
-        return _Perceptron.apply(x, self.activation, self.activate_output, self.precision, *parameters)
+        return _Perceptron.apply(  # type: ignore[no-untyped-call]
+            x, self.activation, self.activate_output, self.precision, *parameters
+        )
 
     def _forward_normed(self, x: Tensor) -> Tensor:
         assert self.norms is not None

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from esp_envs.spec import TaskSpec
 from torch import Tensor, nn
 
 from esp_cli.networks.bodies import NetworkConfig, build_network
 from esp_cli.networks.heads import build_head
+from esp_envs.spec import TaskSpec
 
 POLICY_GAIN = 0.01
 """Orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)."""

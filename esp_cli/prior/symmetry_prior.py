@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from esp_envs.spec import TaskSpec
 
 from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import Transform, carried_groups, transform_set
+from esp_envs.spec import TaskSpec
 
 
 class SymmetryPrior:

@@ -6,12 +6,12 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from esp_envs.registry import task_class
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from esp_cli.algorithms.registry import ALGORITHMS, PRESETS
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
+from esp_envs.registry import task_class
 
 
 class EvaluationConfig(BaseModel):

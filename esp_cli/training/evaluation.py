@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from esp_envs.base import Environment, Observation
 from torch import Tensor
 
 from esp_cli.networks.policy import Policy
+from esp_envs.base import Environment, Observation
 
 
 class Controller(Protocol):
@@ -102,7 +102,7 @@ def play(env: Environment, controller: Controller) -> Episodes:
         returns += torch.where(running, step.reward.mean(-1), 0.0)
         lengths += running
         for name, value in step.metrics.items():
-            sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)  # type: ignore[arg-type]
+            sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
         running &= ~(step.terminated | step.truncated)
         observation = step.next
     return Episodes(returns, lengths, {name: value / lengths for name, value in sums.items()})

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from esp_envs.spec import TaskSpec
 from pydantic import ValidationError
 from torch import Tensor
 
@@ -17,6 +16,7 @@ from esp_cli.training.config import RunConfig, one_sentence
 from esp_cli.training.run_folder import POLICY_FORMAT, RunFolder
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
+from esp_envs.spec import TaskSpec
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from esp_envs.base import Environment
-from esp_envs.registry import make
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,6 +20,8 @@ from esp_cli.training.evaluation import PolicyController, play
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
+from esp_envs.base import Environment
+from esp_envs.registry import make
 
 CHECKPOINT_SECONDS = 30.0
 """A kill loses at most this much work; a checkpoint takes some milliseconds."""
@@ -59,7 +59,12 @@ def build_learner(config: RunConfig) -> Learner:
     settings = cls.config_class(**config.algorithm_settings)
     env = build_environment(config, settings.num_envs, "training worlds")
     return cls(
-        env, settings, config.network, config.prior, generators(config.seeds, "learner"), generators(config.seeds, "prior")
+        env,
+        settings,
+        config.network,
+        config.prior,
+        generators(config.seeds, "learner"),
+        generators(config.seeds, "prior"),
     )
 
 
