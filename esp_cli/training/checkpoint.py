@@ -230,7 +230,7 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
     expected = description.pop("sha256")
     if _digest(tensors, description) != expected:
         raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
-    # Copies, since the loader's tensors lie unaligned, wherever they lay in the file; only now, since the copy of a
+    # Copies, since the loader's tensors are not aligned to 64 bytes as torch's own are; only now, since the copy of a
     # damaged truth value is a sound one.
     aligned = {name: tensor.clone() for name, tensor in tensors.items()}
     return aligned, {key: value for key, value in description.items() if key not in _RESERVED}
