@@ -15,9 +15,10 @@ import time
 from pathlib import Path
 
 import torch
-from esp_envs import Environment, make
 from rich.console import Console
 from rich.table import Table
+
+from esp_envs import Environment, make
 
 DEFAULT_TASKS = ("navigation", "predator-prey")
 DEFAULT_WORLDS = (1024, 4096)
@@ -68,7 +69,10 @@ def show(records: list[dict[str, object]], title: str) -> None:
         low, high = float(str(record["least"])), float(str(record["most"]))
         median = float(str(record["steps_per_second"]))
         table.add_row(
-            str(record["task"]), str(record["worlds"]), f"{median / 1e6:.2f} M", f"{low / 1e6:.2f} to {high / 1e6:.2f} M"
+            str(record["task"]),
+            str(record["worlds"]),
+            f"{median / 1e6:.2f} M",
+            f"{low / 1e6:.2f} to {high / 1e6:.2f} M",
         )
     Console().print(table)
 

@@ -109,9 +109,7 @@ class ParticleWorlds:
 
     def measure(self) -> None:
         """Compute the pair offsets and distances of the present positions."""
-        self._offset = exact_matmul(self._differences, self.entity.view(-1, 2 * self.num_lanes)).view(
-            -1, 2, self.num_lanes
-        )
+        self._offset = exact_matmul(self._differences, self.entity.flatten(1)).unflatten(1, (2, self.num_lanes))
         square = self._offset.square()
         self.squared_distance = square[:, 0] + square[:, 1]
 
@@ -143,7 +141,7 @@ class ParticleWorlds:
         torch.maximum(softplus, overlap, out=softplus)
         strength = softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
         push = self._offset[:pairs] * strength.unsqueeze(1)
-        return exact_matmul(self._pushes, push.view(pairs, -1)).view(-1, 2, self.num_lanes)
+        return exact_matmul(self._pushes, push.flatten(1)).view_as(self.velocity)
 
 
 def exact_matmul(left: Tensor, right: Tensor) -> Tensor:

@@ -60,6 +60,8 @@ class ParticleTask(Environment):
         self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
         self._learners = slice(first_learner, first_learner + spec.num_agents)
         self._time = 0
+        lead = (self.num_seeds, self.num_envs, spec.num_agents)
+        self._action_shape = lead if isinstance(spec.action, Discrete) else (*lead, spec.action.width)
         lanes = self.worlds.num_lanes
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
         self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
@@ -99,7 +101,13 @@ class ParticleTask(Environment):
         return self._observe()
 
     def step(self, action: Tensor) -> Step:
-        """Advance every world by one step; see the class for the action."""
+        """Advance every world by one step; see the class for the action.
+
+        Raises:
+            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, 2] (continuous).
+        """
+        if action.shape != self._action_shape:
+            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {self._action_shape}")
         self._act(action)
         self._drive()
         self.worlds.advance(self._control)
@@ -132,7 +140,7 @@ class ParticleTask(Environment):
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock and generators."""
         return {
-            "physics": self.worlds.physics.clone(),
+            "physics": self.worlds.rows().clone(memory_format=torch.contiguous_format),
             "time": torch.tensor(self._time),
             "generators": generator_states(self.generators),
         }
@@ -144,9 +152,9 @@ class ParticleTask(Environment):
             ValueError: the tensors belong to an environment of another size.
         """
         physics, states = tensors["physics"], tensors["generators"]
-        if physics.shape != self.worlds.physics.shape or len(states) != self.num_seeds:
+        if physics.shape != self.worlds.rows().shape or len(states) != self.num_seeds:
             raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
-        self.worlds.physics.copy_(physics)
+        self.worlds.rows().copy_(physics)
         self._time = int(tensors["time"])
         restore_generators(self.generators, states)
         self.worlds.measure()

@@ -1,0 +1,169 @@
+"""Navigation: reward, metrics and start by hand, and the anchors that its numbers are read against."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from esp_envs import Discrete, make
+from esp_envs.mpe import covering
+from esp_envs.mpe.navigation import Navigation
+from tests.envs.playing import episode_return
+
+
+def still_after(env: Navigation, positions: list[list[float]]) -> tuple[torch.Tensor, dict[str, float]]:
+    """Put bodies at rest, let everybody do nothing for a step, and return the reward [N] and the metrics."""
+    flat = torch.tensor(positions).flatten()
+    env.set_state(torch.cat([torch.zeros(2 * env.spec.num_agents), flat]).view(1, 1, -1))
+    step = env.step(torch.zeros(1, 1, env.spec.num_agents, dtype=torch.int64))
+    return step.reward[0, 0], {name: value.item() for name, value in step.metrics.items()}
+
+
+APART = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.5], [1.05, 0.0], [0.6, 0.8]]
+"""Agents, then landmarks: nearest distances 0.5 (either), 0.05 (second), and that of (0.6, 0.8)."""
+LAST = math.dist((0.6, 0.8), (0.0, 1.0))
+
+
+def test_esp_reward_by_hand() -> None:
+    reward, metrics = still_after(make("navigation", 1, [0]), APART)
+    # each agent: -(0.5 + 0.05 + LAST) and -1 for itself; everybody gets the sum over the three
+    torch.testing.assert_close(reward, torch.full((3,), -3 * (0.55 + LAST) - 3))
+    assert metrics["collisions"] == 0
+    assert metrics["landmark_distance"] == pytest.approx((0.55 + LAST) / 3)
+    assert metrics["coverage"] == pytest.approx(1 / 3)
+
+
+def test_pettingzoo_reward_by_hand() -> None:
+    env = make("navigation", 1, [0], {"convention": "pettingzoo", "local_ratio": 0.25})
+    reward, _ = still_after(env, APART)
+    torch.testing.assert_close(reward, torch.full((3,), -0.75 * (0.55 + LAST)))
+    assert env.spec.shared_reward is False
+    # at rest in mpe2's order nothing moves in the first step, so 0.2 apart is still a collision, of two agents
+    close = [[0.0, 0.0], [0.2, 0.0], [0.0, 1.0], [0.0, 0.0], [0.2, 0.0], [0.0, 1.0]]
+    reward, metrics = still_after(env, close)
+    torch.testing.assert_close(reward, torch.tensor([-0.25, -0.25, 0.0]))
+    assert metrics["collisions"] == 1
+    assert metrics["coverage"] == 1
+
+
+def test_esp_collisions_count_for_both_and_for_everybody() -> None:
+    env = make("navigation", 1, [0])
+    # two agents 0.5 apart run at each other, and meet in the second step
+    state = torch.tensor([1.0, 0, -1.0, 0, 0, 0, -0.25, 0, 0.25, 0, 0, 1.0, -0.15, 0, 0.15, 0, 0, 1.0]).view(1, 1, -1)
+    env.set_state(state)
+    step = env.step(torch.zeros(1, 1, 3, dtype=torch.int64))
+    # velocities 0.75 towards each other, 0.075 each: 0.35 apart, no contact yet
+    assert step.metrics["collisions"].item() == 0
+    step = env.step(torch.zeros(1, 1, 3, dtype=torch.int64))
+    # 0.5625 each, 0.05625 each: 0.2375 apart; the landmarks at +-0.15 are 0.03125 away, the third at 0
+    assert step.metrics["collisions"].item() == 1
+    torch.testing.assert_close(step.reward[0, 0], torch.full((3,), -3 * 2 * 0.03125 - 2 - 3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("agents", "landmarks"), [(2, 3), (3, 3), (4, 4)])
+def test_default_landmarks_are_the_papers(agents: int, landmarks: int) -> None:
+    spec = make("navigation", 1, [0], {"num_agents": agents}).spec
+    assert spec.observation.width == 2 * (2 + landmarks + agents - 1)
+    assert spec.settings["num_landmarks"] == landmarks
+
+
+def test_spec_names_the_symmetry_that_the_actions_carry() -> None:
+    discrete, continuous = make("navigation", 1, [0]).spec, make("navigation", 1, [0], {"actions": "continuous"}).spec
+    assert (discrete.symmetry, continuous.symmetry) == ("d4", "o2")
+    assert isinstance(discrete.action, Discrete)
+    assert discrete.action.names == ("no-op", "left", "right", "down", "up")
+
+
+def test_starts_fill_their_squares() -> None:
+    for convention, extent in (("esp", 0.8), ("pettingzoo", 1.0)):
+        state = make("navigation", 4000, [0], {"convention": convention}).reset().state[0]
+        velocity, position, landmark = state.split([6, 6, 6], dim=-1)
+        assert velocity.abs().max() == 0
+        for places, side in ((position, 1.0), (landmark, extent)):
+            assert 0.995 * side < places.abs().max() <= side
+            assert places.mean().abs() < 0.02
+            assert places.square().mean().item() == pytest.approx(side**2 / 3, rel=0.03)
+
+
+def test_long_forces_are_scaled_back_to_the_unit_disc() -> None:
+    env = make("navigation", 1, [0], {"actions": "continuous"})
+    env.set_state(torch.tensor([0.0] * 6 + [-1.0, 0, 0, 0, 1.0, 0] + [0.0] * 6).view(1, 1, -1))
+    force = torch.tensor([[3.0, 4.0], [0.3, -0.4], [0.0, 0.0]]).view(1, 1, 3, 2)
+    velocity = env.step(force).next.state[0, 0, :6]
+    torch.testing.assert_close(velocity, torch.tensor([0.3, 0.4, 0.15, -0.2, 0.0, 0.0]), atol=1e-6, rtol=0)
+
+
+ANCHORS = [  # settings, policy, mean return of one agent over 40,000 episodes (10,000 for cover)
+    ({}, "random", -218.35),
+    ({}, "greedy", -112.25),
+    ({}, "cover", -108.65),
+    ({"num_agents": 2}, "random", -165.46),
+    ({"num_agents": 2}, "greedy", -98.22),
+    ({"num_agents": 2}, "cover", -92.05),
+    ({"num_agents": 4}, "random", -322.12),
+    ({"num_agents": 4}, "greedy", -161.11),
+    ({"num_agents": 4, "num_landmarks": 3}, "random", -267.20),
+    ({"num_agents": 4, "num_landmarks": 3}, "greedy", -140.22),
+    ({"convention": "pettingzoo"}, "random", -26.47),
+    ({"actions": "continuous"}, "greedy", -108.85),
+]
+
+
+@pytest.mark.parametrize(("settings", "policy", "expected"), ANCHORS)
+def test_anchors(settings: dict[str, object], policy: str, expected: float) -> None:
+    mean, sem = episode_return(make("navigation", 4000 if policy == "random" else 1500, [1], settings), policy)
+    assert sem < 0.01 * abs(expected)
+    assert mean == pytest.approx(expected, abs=4.5 * sem)
+
+
+def test_the_papers_learners_lie_between_chance_and_the_best_heuristic() -> None:
+    """The paper's best rows, -110.22 for N = 3 and -87.54 for N = 2, are near what hand-written policies reach."""
+    for agents, paper in ((3, -110.22), (2, -87.54)):
+        env = make("navigation", 1000, [2], {"num_agents": agents})
+        chance, best = (episode_return(env, policy)[0] for policy in ("random", "cover"))
+        assert chance < paper < best + 6
+
+
+def test_continuous_heuristics_do_better_than_discrete_ones() -> None:
+    discrete, _ = episode_return(make("navigation", 1000, [1]), "greedy")
+    continuous, _ = episode_return(make("navigation", 1000, [1], {"actions": "continuous"}), "greedy")
+    assert continuous > discrete + 2
+
+
+def goals_of_one_world(agents: list[list[float]], landmarks: list[list[float]]) -> list[list[float]]:
+    goals = covering.one_each(torch.tensor(agents).unsqueeze(-1), torch.tensor(landmarks).unsqueeze(-1))
+    return goals[..., 0].tolist()
+
+
+def test_one_each_takes_the_nearest_free_pair_first() -> None:
+    assert goals_of_one_world([[-1, 0.0], [0, 0]], [[0.5, 0], [-1.25, 0]]) == [[-1.25, 0.0], [0.5, 0.0]]
+    # agent 1 takes the nearer of two, agent 0 gets the third choice rather than nothing
+    assert goals_of_one_world([[0.0, 3.0], [0, 0]], [[0.0, 0.5], [0, 5], [1, 0]]) == [[0.0, 5.0], [0.0, 0.5]]
+
+
+def test_one_each_swaps_where_that_is_shorter() -> None:
+    # the nearest pair (agent 1, first landmark) would cost 0.125 + 2.0 in all, the other way round 0.875 + 1.0
+    assert goals_of_one_world([[0.0, 1.0], [0, 0]], [[0.0, 0.125], [0, -1]]) == [[0.0, 0.125], [0.0, -1.0]]
+
+
+def test_agents_without_a_landmark_stay() -> None:
+    position = torch.tensor([[[0.0], [0.0]], [[1.0], [0.0]], [[2.0], [0.0]]])
+    goals = covering.one_each(position, torch.tensor([[[1.1], [0.0]]]))
+    torch.testing.assert_close(goals[:, 0, 0], torch.tensor([0.0, 1.1, 2.0]))
+
+
+def test_cover_stands_between_two_landmarks() -> None:
+    # agent 0 near the pair (0, 0), (0, 1) at x = 0.5; agent 1 beside the third landmark
+    position = torch.tensor([[[0.5], [0.5]], [[5.0], [0.0]]])
+    landmark = torch.tensor([[[0.0], [0.0]], [[0.0], [1.0]], [[5.0], [0.2]]])
+    goals = covering.shared_out(position, landmark)
+    torch.testing.assert_close(goals[..., 0], torch.tensor([[0.0, 0.5], [5.0, 0.2]]))
+
+
+def test_cover_refuses_what_it_cannot_enumerate() -> None:
+    env = make("navigation", 1, [0], {"num_agents": 8, "num_landmarks": 8})
+    env.reset()
+    with pytest.raises(ValueError, match="use 'greedy'"):
+        env.heuristic("cover")
