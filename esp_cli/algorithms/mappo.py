@@ -43,8 +43,8 @@ class MappoConfig(BaseModel):
     num_steps: int = Field(25, ge=1, description="steps per world and update")
     num_epochs: int = Field(10, ge=1)
     num_minibatches: int = Field(4, ge=1, description="paper: 1")
-    learning_rate: float = Field(7e-4, gt=0)
-    anneal_learning_rate: bool = Field(False, description="linearly to 0 over the run")
+    learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
+    anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run")
     adam_epsilon: float = Field(1e-5, gt=0)
     max_grad_norm: float = Field(10.0, gt=0)
     gamma: float = Field(0.99, ge=0, le=1)
@@ -54,13 +54,13 @@ class MappoConfig(BaseModel):
     huber_delta: float = Field(10.0, gt=0)
     value_coef: float = Field(1.0, gt=0)
     entropy_coef: float = Field(0.01, ge=0)
-    anneal_entropy: bool = Field(False, description="linearly to 0 over the run")
+    anneal_entropy: bool = Field(True, description="linearly to 0 over the run")
     bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
     value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
     critic_input: Literal["state", "observations"] = Field(
-        "state", description="the task's global state, or all agents' observations in a row"
+        "observations", description="the task's global state, or all agents' observations in a row"
     )
-    critic_activation: Literal["relu", "tanh"] | None = Field(None, description="by default the network's")
+    critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
     chunk_steps: int = Field(800, ge=1, description="environment steps per seed and forward pass; speed only")
 
@@ -68,8 +68,16 @@ class MappoConfig(BaseModel):
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "default": {},
     "paper": {
-        "mappo": {"num_minibatches": 1, "clip_value": True, "value_decay": 0.99999, "num_envs": 128},
-        "network": {"name": "gru", "layer_norm": True, "hidden": (64, 64)},
+        "mappo": {
+            "num_envs": 128,
+            "num_minibatches": 1,
+            "learning_rate": 7e-4,
+            "anneal_learning_rate": False,
+            "anneal_entropy": False,
+            "clip_value": True,
+            "value_decay": 0.99999,
+        },
+        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
         "prior": {"transforms": "rot90", "consistency_coef": 0.5},
     },
 }
@@ -112,7 +120,7 @@ class Mappo(Learner):
         self.prior = SymmetryPrior(prior, spec, device)
         self.policy = Policy(spec, network, generators).to(device)
         self.num_values = 1 if spec.shared_reward else spec.num_agents
-        critic_network = network.model_copy(update={"activation": config.critic_activation or network.activation})
+        critic_network = network.model_copy(update={"activation": config.critic_activation})
         critic_width = _critic_width(spec, config)
         self.critic = build_network(generators, critic_width, self.num_values, critic_network, 1.0).to(device)
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)

@@ -23,7 +23,7 @@ class NetworkConfig(BaseModel):
 
     name: Literal["mlp", "gru"] = "mlp"
     hidden: tuple[int, ...] = Field((64, 64), min_length=1, description="hidden widths; MAPPO paper: two of 64")
-    activation: Literal["relu", "tanh"] = "relu"
+    activation: Literal["relu", "tanh"] = Field("tanh", description="of the actor; MAPPO paper: relu")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
 

@@ -1,0 +1,113 @@
+"""The learners' equations against numbers worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from esp_cli.algorithms.losses import (
+    clip_gradients_per_seed,
+    clipped_surrogate,
+    explained_variance,
+    gae,
+    huber,
+    normalise_per_seed,
+    value_loss,
+)
+
+
+def row(*numbers):
+    """One seed, one world, T steps, one value: [1, 1, T, 1]."""
+    return torch.tensor(numbers, dtype=torch.float64).view(1, 1, -1, 1)
+
+
+def flags(*values):
+    return torch.tensor(values).view(1, 1, -1, 1)
+
+
+def test_gae_by_hand():
+    # gamma = 0.5, lambda = 0.5: delta_0 = 1 + 0.5 * 3 - 2 = 0.5, delta_1 = 2 + 0.5 * 4 - 3 = 1, delta_2 = 3 + 0.5 * 5 - 4 = 1.5
+    # A_2 = 1.5, A_1 = 1 + 0.25 * 1.5 = 1.375, A_0 = 0.5 + 0.25 * 1.375 = 0.84375
+    no = flags(False, False, False)
+    advantage = gae(row(1, 2, 3), row(2, 3, 4), row(3, 4, 5), no, no, 0.5, 0.5)
+    assert advantage.flatten().tolist() == [0.84375, 1.375, 1.5]
+
+
+def test_gae_stops_at_a_terminal_state_and_uses_no_value_beyond_it():
+    # step 1 terminates: delta_1 = 2 - 3 = -1 and nothing flows back from step 2
+    ends = flags(False, True, False)
+    advantage = gae(row(1, 2, 3), row(2, 3, 4), row(3, 100, 5), ends, ends, 0.5, 0.5)
+    assert advantage.flatten().tolist() == [0.5 + 0.25 * -1, -1.0, 1.5]
+
+
+def test_gae_bootstraps_a_truncated_episode_from_its_final_state():
+    # step 1 is cut by the horizon: delta_1 = 2 + 0.5 * 100 - 3 = 49, and nothing flows back from step 2
+    no, cut = flags(False, False, False), flags(False, True, False)
+    advantage = gae(row(1, 2, 3), row(2, 3, 4), row(3, 100, 5), no, cut, 0.5, 0.5)
+    assert advantage.flatten().tolist() == [0.5 + 0.25 * 49, 49.0, 1.5]
+
+
+def test_gae_with_lambda_one_is_the_discounted_return_minus_the_value():
+    torch.manual_seed(0)
+    reward, value = torch.randn(2, 3, 6, 1).double(), torch.randn(2, 3, 7, 1).double()
+    no = torch.zeros(2, 3, 6, 1, dtype=torch.bool)
+    advantage = gae(reward, value[:, :, :-1], value[:, :, 1:], no, no, 0.9, 1.0)
+    discounts = 0.9 ** torch.arange(6, dtype=torch.float64)
+    expected = (reward[:, :, :, 0] * discounts).sum(-1) + 0.9**6 * value[:, :, 6, 0] - value[:, :, 0, 0]
+    torch.testing.assert_close(advantage[:, :, 0, 0], expected)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "expected"),
+    [
+        (1.1, 2.0, 2.2),  # inside the clip range
+        (1.5, 2.0, 2.4),  # gain is capped at 1.2 A
+        (0.5, 2.0, 1.0),  # a loss of probability is not capped for a good action
+        (0.5, -2.0, -1.6),  # gain is capped at 0.8 A
+        (1.5, -2.0, -3.0),  # a bad action made likelier counts in full
+    ],
+)
+def test_clipped_surrogate_by_hand(ratio, advantage, expected):
+    value = clipped_surrogate(torch.tensor(math.log(ratio)), torch.tensor(advantage), 0.2)
+    assert value.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_huber_is_quadratic_inside_and_linear_outside():
+    # delta = 10: 3^2 / 2 = 4.5; at 12: 10 * (12 - 5) = 70; both meet at 10: 50
+    assert huber(torch.tensor([3.0, -3.0, 10.0, 12.0, -12.0]), 10.0).tolist() == [4.5, 4.5, 50.0, 70.0, 70.0]
+
+
+def test_clipped_value_loss_takes_the_larger_error():
+    value, target, old = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 3.0]), torch.tensor([0.0, 0.0])
+    # clipped predictions are 0.2 and 0.1; errors 1 against 2.8, and 2.9 against 2.9
+    expected = torch.tensor([0.5 * 2.8**2, 0.5 * 2.9**2])
+    torch.testing.assert_close(value_loss(value, target, 10.0, old, 0.2), expected)
+    torch.testing.assert_close(value_loss(value, target, 10.0), torch.tensor([0.5, 0.5 * 2.9**2]))
+
+
+def test_explained_variance_of_perfect_constant_and_opposite_predictions():
+    target = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]])
+    value = torch.tensor([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0], [3.0, 2.0, 1.0]])
+    # residuals of the last: -2, 0, 2 with variance 8/3 against 2/3
+    torch.testing.assert_close(explained_variance(value, target), torch.tensor([1.0, 0.0, -3.0]))
+
+
+def test_normalisation_is_per_seed():
+    x = torch.tensor([[1.0, 3.0], [10.0, 30.0]])
+    torch.testing.assert_close(normalise_per_seed(x, 0.0), torch.tensor([[-1.0, 1.0], [-1.0, 1.0]]))
+
+
+def test_gradients_are_clipped_by_the_norm_of_their_own_seed():
+    # seed 0 has norm 5 over both tensors, seed 1 has 0.5
+    first, second = torch.tensor([[3.0], [0.3]]), torch.tensor([[[4.0]], [[0.4]]])
+    norm = clip_gradients_per_seed([first, second], 1.0)
+    torch.testing.assert_close(norm, torch.tensor([5.0, 0.5]))
+    torch.testing.assert_close(first, torch.tensor([[0.6], [0.3]]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(second, torch.tensor([[[0.8]], [[0.4]]]), atol=1e-5, rtol=0)
+
+
+def test_a_broken_seed_does_not_spoil_the_others_gradients():
+    gradient = torch.tensor([[3.0, 4.0], [math.nan, 1.0]])
+    clip_gradients_per_seed([gradient], 1.0)
+    torch.testing.assert_close(gradient[0], torch.tensor([0.6, 0.8]), atol=1e-5, rtol=0)
+    assert gradient[1].isnan().all()

@@ -1,0 +1,103 @@
+"""Seed-batched layers: right gradients, one seed independent of the others."""
+
+import pytest
+import torch
+
+from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.layers import SeedGRU, SeedMLP, orthogonal
+
+
+def generators(*seeds):
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+def reference(mlp, x):
+    """The perceptron by torch's own operations."""
+    for k, layer in enumerate(mlp.layers):
+        x = torch.baddbmm(layer.bias, x, layer.weight)
+        if k < len(mlp.layers) - 1 or mlp.activate_output:
+            x = torch.relu(x) if mlp.activation == "relu" else torch.tanh(x)
+    return x
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("activate_output", [False, True])
+def test_hand_written_backward_equals_autograd(activation, activate_output):
+    mlp = SeedMLP(generators(0, 1, 2), (7, 16, 8, 5), activation, 1.0, activate_output=activate_output)
+    x = torch.randn(3, 11, 7, requires_grad=True)
+    weight = torch.randn(3, 11, 5)
+    ours, theirs = mlp(x), reference(mlp, x)
+    torch.testing.assert_close(ours, theirs)
+    inputs = [x, *mlp.parameters()]
+    for a, b in zip(
+        torch.autograd.grad((ours * weight).sum(), inputs),
+        torch.autograd.grad((theirs * weight).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_bfloat16_products_stay_near_float32_and_keep_float32_gradients():
+    full = SeedMLP(generators(0, 1), (7, 64, 64, 5), "tanh", 1.0)
+    half = SeedMLP(generators(0, 1), (7, 64, 64, 5), "tanh", 1.0, precision=torch.bfloat16)
+    x = torch.randn(2, 50, 7)
+    assert half(x).dtype == torch.float32
+    assert (full(x) - half(x)).abs().max() < 0.1
+    assert not torch.equal(full(x), half(x)), "negative control: the products really were rounded"
+    half(x).sum().backward()
+    assert all(p.grad.dtype == torch.float32 for p in half.parameters())
+
+
+def test_weights_are_orthogonal_and_a_seed_draws_the_same_alone_and_among_others():
+    weights = orthogonal(generators(3, 4), 10, 6, 2.0)
+    identity = weights.transpose(1, 2) @ weights / 4.0
+    torch.testing.assert_close(identity, torch.eye(6).expand(2, 6, 6), rtol=0, atol=1e-5)
+    assert torch.equal(weights[1:], orthogonal(generators(4), 10, 6, 2.0))
+    assert not torch.allclose(weights[0], weights[1])
+
+
+@pytest.mark.parametrize("name", ["mlp", "gru"])
+def test_a_seed_neither_sees_nor_moves_another(name):
+    network = build_network(generators(0, 1), 6, 3, NetworkConfig(name=name, hidden=(8,), layer_norm=True), 1.0)
+    x = torch.randn(2, 4, 5, 6)
+    before = network.unroll(x)
+    x[1] += torch.randn(4, 5, 6)
+    after = network.unroll(x)
+    assert torch.equal(before[0], after[0])
+    assert not torch.allclose(before[1], after[1])
+    (gradient,) = torch.autograd.grad(after[0].sum(), [next(network.parameters())])
+    assert gradient[1].abs().max() == 0
+
+
+def test_gru_by_hand():
+    gru = SeedGRU(generators(0), 1, 1)
+    with torch.no_grad():
+        for parameter in gru.parameters():
+            parameter.zero_()
+        gru.input.weight[..., 2] = 1.0  # candidate = tanh(x); both gates stay sigmoid(0) = 1/2
+    h = gru(torch.tensor([[[0.5]]]), torch.tensor([[[0.8]]]))
+    assert h.item() == pytest.approx(0.5 * torch.tanh(torch.tensor(0.5)).item() + 0.5 * 0.8)
+
+
+@pytest.mark.parametrize("name", ["mlp", "gru"])
+def test_unrolling_an_episode_equals_stepping_through_it(name):
+    network = build_network(generators(0, 1), 6, 3, NetworkConfig(name=name, hidden=(8, 8)), 1.0)
+    x = torch.randn(2, 4, 5, 6)
+    memory = network.initial_memory(2, 4, x)
+    steps = []
+    for t in range(5):
+        y, memory = network.step(x[:, :, t], memory)
+        steps.append(y)
+    torch.testing.assert_close(network.unroll(x), torch.stack(steps, 2))
+
+
+def test_truncation_cuts_gradients_but_not_values():
+    network = build_network(generators(0), 2, 1, NetworkConfig(name="gru", hidden=(4,)), 1.0)
+    x = torch.randn(1, 1, 6, 2, requires_grad=True)
+    full, cut = network.unroll(x), network.unroll(x, truncation=3)
+    torch.testing.assert_close(full, cut)
+    (whole,) = torch.autograd.grad(full[:, :, 5].sum(), [x])
+    (part,) = torch.autograd.grad(cut[:, :, 5].sum(), [x])
+    assert whole[:, :, :3].abs().max() > 0
+    assert part[:, :, :3].abs().max() == 0
+    assert part[:, :, 3:].abs().min() > 0

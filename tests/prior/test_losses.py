@@ -1,0 +1,98 @@
+"""Eq. 8 and 9 by hand, their direction and their stop-gradients."""
+
+import math
+
+import pytest
+import torch
+
+from esp_cli.networks.heads import Categorical
+from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
+from esp_cli.symmetry import transform_set
+from esp_envs import make
+
+SPEC = make("navigation", 1, [0]).spec
+
+
+def log_probs(*weights):
+    return torch.tensor(weights).log().view(1, 1, 1, -1)
+
+
+def test_policy_consistency_is_the_divergence_of_the_pulled_back_policy_from_the_original():
+    head = Categorical(SPEC.action)
+    pulled, original = log_probs(0.5, 0.5), log_probs(0.25, 0.75)
+    forward = 0.5 * math.log(0.5 / 0.25) + 0.5 * math.log(0.5 / 0.75)
+    backward = 0.25 * math.log(0.25 / 0.5) + 0.75 * math.log(0.75 / 0.5)
+    assert policy_consistency_loss(head.divergence, pulled, original).item() == pytest.approx(forward, rel=1e-5)
+    assert forward != pytest.approx(backward, rel=1e-3), "the direction matters"
+
+
+def test_policy_consistency_vanishes_exactly_where_the_policy_turns_with_the_world():
+    """A policy that goes up in s must go left in rot90(s)."""
+    head, g = Categorical(SPEC.action), transform_set("rot90", SPEC, "cpu").each()[0]
+    names = SPEC.action.names
+    here, turned = torch.full((1, 1, 3, 5), 0.05), torch.full((1, 1, 3, 5), 0.05)
+    here[..., names.index("up")] = turned[..., names.index("left")] = 0.8
+    loss = policy_consistency_loss(head.divergence, head.pull_back(turned.log(), g), here.log())
+    torch.testing.assert_close(loss, torch.zeros(1, 1, 3), atol=1e-6, rtol=0)
+    stubborn = policy_consistency_loss(head.divergence, head.pull_back(here.log(), g), here.log())
+    # negative control: 0.75 log 16 for the two swapped probabilities
+    torch.testing.assert_close(stubborn, torch.full((1, 1, 3), 0.75 * math.log(16)))
+
+
+def test_value_consistency_is_the_squared_gap():
+    assert value_consistency_loss(torch.tensor([1.0]), torch.tensor([3.0])).item() == 4.0
+
+
+@pytest.mark.parametrize(
+    ("stop", "moves"), [("none", (True, True)), ("original", (True, False)), ("transformed", (False, True))]
+)
+def test_stop_gradient_holds_the_side_that_it_names(stop, moves):
+    transformed, original = torch.tensor([1.0], requires_grad=True), torch.tensor([3.0], requires_grad=True)
+    value_consistency_loss(transformed, original, stop).sum().backward()
+    assert tuple(x.grad is not None for x in (transformed, original)) == moves
+
+
+@pytest.mark.parametrize(
+    ("kind", "augments", "coefficient", "active"),
+    [
+        ("esp", True, 0.5, True),
+        ("augment", True, 0, True),
+        ("consistency", False, 0.5, True),
+        ("none", False, 0, False),
+    ],
+)
+def test_kinds_switch_the_two_means(kind, augments, coefficient, active):
+    config = PriorConfig(kind=kind)
+    assert (config.augments, config.coefficient) == (augments, coefficient)
+    assert SymmetryPrior(config, SPEC).active is active
+
+
+def test_copies_and_their_share():
+    def prior(**choice):
+        return SymmetryPrior(PriorConfig(**choice), SPEC)
+
+    assert prior(transforms="d4", copies="all").num_copies == 7
+    assert prior(transforms="d4", copies="all").augmented_share == 7 / 8
+    assert prior(transforms="d4").augmented_share == 1 / 2
+    assert prior(transforms="d4", kind="consistency").augmented_share == 0
+    assert prior(kind="none").num_copies == 0
+
+
+def test_a_task_refuses_what_its_actions_cannot_carry():
+    with pytest.raises(ValueError, match="c8"):
+        SymmetryPrior(PriorConfig(transforms="c8"), SPEC)
+    continuous = make("navigation", 1, [0], {"actions": "continuous"}).spec
+    with pytest.raises(ValueError, match="all"):
+        SymmetryPrior(PriorConfig(transforms="so2", copies="all"), continuous)
+
+
+def test_a_seed_draws_the_same_elements_alone_and_among_others():
+    prior = SymmetryPrior(PriorConfig(transforms="d4"), SPEC)
+
+    def drawn(*seeds):
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return [[g.elements for g in prior.for_minibatch(generators)][0] for _ in range(20)]
+
+    together, alone = drawn(3, 4), drawn(4)
+    assert [pair[1] for pair in together] == [single[0] for single in alone]
+    assert [pair[0] for pair in together] != [pair[1] for pair in together]
