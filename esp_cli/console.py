@@ -62,13 +62,19 @@ def table(
         title: line above, such as what was measured.
         caption: line below, such as the reward convention.
     """
-    grid = Table(title=title, caption=caption, title_justify="left", caption_justify="left", header_style="bold")
+    grid = Table(header_style="bold")
     for heading in columns:
         grid.add_column(heading.removesuffix(">"), justify="right" if heading.endswith(">") else "left")
     for row in rows:
         grid.add_row(*(Text(str(cell)) for cell in row))
     target = out if out.is_terminal else Console(highlight=False, width=PIPE_WIDTH)
+    if title:
+        target.print(
+            Text(title, style="bold"), soft_wrap=True
+        )  # outside the grid, which would wrap it to its own width
     target.print(grid)
+    if caption:
+        target.print(Text(caption, style="dim"), soft_wrap=True)
 
 
 def write_json(path: str | Path, value: object) -> None:
