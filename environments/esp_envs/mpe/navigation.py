@@ -123,6 +123,7 @@ class Navigation(ParticleTask):
         )
         self._extents = (1.0,) * agents + (settings.extent,) * landmarks
         self._build(_spec(settings), bodies)
+        self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
         # [N, pairs]: which agents take part in which pair
         self._takes_part = torch.zeros(agents, len(bodies.contacts), device=self.device)
         for pair, (a, b) in enumerate(bodies.contacts):
@@ -170,11 +171,9 @@ class Navigation(ParticleTask):
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
-        pairs = len(self.worlds.bodies.contacts)
-        squared = self.worlds.squared_distance
-        bumps = (squared[:pairs] < (2 * AGENT_RADIUS) ** 2).float()
+        bumps = (self.worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
         collisions = bumps.sum(0)
-        nearest = squared[pairs:].view(agents, landmarks, -1).amin(0).sqrt_()
+        nearest = self._to_landmarks.amin(0).sqrt_()
         distance = nearest.sum(0)
         if self.settings.convention == "esp":
             reward = (distance * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)

@@ -77,9 +77,11 @@ class ParticleWorlds:
     Attributes:
         physics: [2A + L, 2, W'] float32; rows are the agents' velocities, the agents' positions, the landmarks'
             positions; W' is W padded up (see LANE_MULTIPLE). `velocity`, `position` and `entity` are views of it.
-        squared_distance: [P, W'] of the pairs in `contacts` and `watched`, in that order, for the present positions.
+        squared_contact_distance: [contacts, W'] of the pairs in `bodies.contacts`, for the present positions.
+        squared_watched_distance: [watched, W'] of the pairs in `bodies.watched`.
 
-    Whoever writes to `physics` calls `measure` afterwards.
+    All of these stay the same memory for good, so that a task may keep views of them. Whoever writes to `physics` calls
+    `measure` afterwards.
     """
 
     def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:
@@ -92,10 +94,15 @@ class ParticleWorlds:
         self.velocity = self.physics[:agents]
         self.position = self.physics[agents : 2 * agents]
         self.entity = self.physics[agents:]
-        self._num_contacts = len(bodies.contacts)
-        self._differences = _difference_matrix([*bodies.contacts, *bodies.watched], len(bodies.radius)).to(device)
-        pushes = self._differences[: self._num_contacts, :agents].t()
-        self._pushes = pushes.contiguous()
+        pairs, contacts = [*bodies.contacts, *bodies.watched], len(bodies.contacts)
+        self._differences = _difference_matrix(pairs, len(bodies.radius)).to(device)
+        self._pushes = self._differences[:contacts, :agents].t().contiguous()
+        self._offset = torch.zeros(len(pairs), 2, lanes, device=device)
+        self._contact_offset = self._offset[:contacts]
+        self._square = torch.zeros_like(self._offset)
+        self._squared_distance = torch.zeros(len(pairs), lanes, device=device)
+        self.squared_contact_distance = self._squared_distance[:contacts]
+        self.squared_watched_distance = self._squared_distance[contacts:]
         touching = torch.tensor([bodies.radius[a] + bodies.radius[b] for a, b in bodies.contacts])
         self._touching = _rows(touching / CONTACT_MARGIN, lanes).to(device)
         self._gain = _rows(torch.tensor(bodies.gain) * DT_S, lanes).unsqueeze(1).repeat(1, 2, 1).to(device)
@@ -109,9 +116,9 @@ class ParticleWorlds:
 
     def measure(self) -> None:
         """Compute the pair offsets and distances of the present positions."""
-        self._offset = exact_matmul(self._differences, self.entity.flatten(1)).unflatten(1, (2, self.num_lanes))
-        square = self._offset.square()
-        self.squared_distance = square[:, 0] + square[:, 1]
+        exact_matmul(self._differences, self.entity.flatten(1), out=self._offset.flatten(1))
+        torch.mul(self._offset, self._offset, out=self._square)
+        torch.add(self._square[:, 0], self._square[:, 1], out=self._squared_distance)
 
     def advance(self, control: Tensor) -> None:
         """Advance all worlds by DT_S.
@@ -133,26 +140,26 @@ class ParticleWorlds:
 
     def _contact_impulses(self) -> Tensor:
         """Return the velocity change [A, 2, W'] that contacts cause in one step, from the measured pairs."""
-        pairs = self._num_contacts
-        distance = self.squared_distance[:pairs].clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
+        distance = self.squared_contact_distance.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
         overlap = torch.add(self._touching, distance, alpha=-1 / CONTACT_MARGIN)
         # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.
         softplus = overlap.clamp(*_SOFTPLUS_RANGE).exp_().log1p_()
         torch.maximum(softplus, overlap, out=softplus)
         strength = softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
-        push = self._offset[:pairs] * strength.unsqueeze(1)
+        push = self._contact_offset * strength.unsqueeze(1)
         return exact_matmul(self._pushes, push.flatten(1)).view_as(self.velocity)
 
 
-def exact_matmul(left: Tensor, right: Tensor) -> Tensor:
+def exact_matmul(left: Tensor, right: Tensor, out: Tensor | None = None) -> Tensor:
     """Multiply float32 matrices in full float32, even where PyTorch was told to round matrix products.
 
     A learner may have switched on TF32, bfloat16 products or autocast for its networks; physics and observations must
     not be rounded by that, so the product is then taken in float64.
     """
     if _products_are_rounded(left.device.type):
-        return (left.double() @ right.double()).float()
-    return left @ right
+        product = (left.double() @ right.double()).float()
+        return product if out is None else out.copy_(product)
+    return torch.mm(left, right, out=out)
 
 
 def _products_are_rounded(device: str) -> bool:

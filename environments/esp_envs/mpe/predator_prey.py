@@ -15,7 +15,7 @@ from esp_envs.base import Body, Scene
 from esp_envs.mpe.chase import chase, flee
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, move_control, nearest_move, place, unit_disc
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, nearest_move, place, unit_disc
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
@@ -206,7 +206,7 @@ class PredatorPrey(ParticleTask):
         shape, device = (self.settings.horizon, self.num_envs), self.device
         move = torch.randint(MOVES.count, shape, generator=generator, device=device)
         if self.settings.actions == "discrete":
-            plan = move_control(move)
+            plan = self._move_control(move)
         else:
             angle = torch.rand(shape, generator=generator, device=device) * (2 * math.pi)
             plan = torch.stack([angle.cos(), angle.sin()], dim=1) * (move != 0).unsqueeze(1)
@@ -223,10 +223,10 @@ class PredatorPrey(ParticleTask):
             self._control[predators:] = self._as_control(self._flight())
         elif self._frozen is not None:
             moves = self._frozen.moves(self.prey_observation_of(self.worlds.rows().t()))
-            self._control[predators:, :, : self.worlds.num_worlds] = move_control(moves.unsqueeze(0))
+            self._control[predators:, :, : self.worlds.num_worlds] = self._move_control(moves.unsqueeze(0))
 
     def _as_control(self, wish: Tensor) -> Tensor:
-        return move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)
+        return self._move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)
 
     def _chase(self) -> Tensor:
         predators, worlds = self.settings.num_predators, self.worlds
@@ -239,7 +239,7 @@ class PredatorPrey(ParticleTask):
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         predators = self.settings.num_predators
-        touching = self.worlds.squared_distance[:predators] < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
+        touching = self.worlds.squared_contact_distance[:predators] < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
         touches = touching.float().sum(0)
         metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
         reward = touches * TOUCH_REWARD

@@ -58,15 +58,16 @@ class ParticleTask(Environment):
         self.spec = spec
         velocity_first = self.settings.convention == "esp"
         self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
-        self._learners = slice(first_learner, first_learner + spec.num_agents)
         self._time = 0
         lead = (self.num_seeds, self.num_envs, spec.num_agents)
         self._action_shape = lead if isinstance(spec.action, Discrete) else (*lead, spec.action.width)
         lanes = self.worlds.num_lanes
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
+        self._learner_control = self._control[first_learner : first_learner + spec.num_agents]
         self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
         directions = [MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP)]
         self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
+        self._points = torch.tensor(MOVES.points, device=self.device)
         self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
 
     @abstractmethod
@@ -168,15 +169,14 @@ class ParticleTask(Environment):
     def _act(self, action: Tensor) -> None:
         """Write the learners' actions into the controls."""
         learners, worlds = self.spec.num_agents, self.worlds.num_worlds
-        control = self._control[self._learners]
         if self.settings.actions == "discrete":
             self._moves[:, 0, :worlds] = action.reshape(worlds, learners).t()
             chosen = (self._moves == self._directions).view(torch.int8)
-            control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
+            self._learner_control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
         else:
             force = action.reshape(worlds, learners, 2)
             length = force.norm(dim=-1, keepdim=True).clamp_min(1.0)
-            control[:, :, :worlds] = (force / length).permute(1, 2, 0)
+            self._learner_control[:, :, :worlds] = (force / length).permute(1, 2, 0)
 
     def _to_action(self, wish: Tensor) -> Tensor:
         """Turn wishes [N, 2, W'] (1 is a full force) into a joint action of this task's kind."""
@@ -186,14 +186,13 @@ class ParticleTask(Environment):
             return nearest_move(wish).t().reshape(lead)
         return unit_disc(wish).permute(2, 0, 1).reshape(*lead, 2)
 
+    def _move_control(self, moves: Tensor) -> Tensor:
+        """Return the controls [N, 2, W] of discrete moves [N, W]."""
+        return self._points[moves].movedim(-1, 1)
+
     def _per_world(self, values: Tensor) -> Tensor:
         """Return [S, E, ...] of the real worlds from [W', ...], as memory of its own."""
         return values[: self.worlds.num_worlds].contiguous().view(self.num_seeds, self.num_envs, *values.shape[1:])
-
-
-def move_control(moves: Tensor) -> Tensor:
-    """Return the unit controls [N, 2, W] of discrete moves [N, W]."""
-    return torch.tensor(MOVES.points, device=moves.device)[moves].movedim(-1, 1)
 
 
 MOVE_THRESHOLD = 0.25
