@@ -62,7 +62,7 @@ class MappoConfig(BaseModel):
     )
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
-    chunk_steps: int = Field(800, ge=1, description="environment steps per seed and forward pass; speed only")
+    chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
 
 
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
@@ -245,8 +245,8 @@ class Mappo(Learner):
     def _gradient_step(self, minibatch: Batch, entropy_coef: float, sums: dict[str, Tensor] | None) -> None:
         """Take one gradient step, accumulated over chunks small enough for the processor's cache."""
         transforms = self.prior.for_minibatch(self.generators["prior"])
-        size = max(1, self.config.chunk_steps // minibatch.obs.shape[2])
-        total = minibatch.obs.shape[1]
+        num_seeds, total, length = minibatch.obs.shape[:3]
+        size = max(1, self.config.chunk_steps // (num_seeds * length))
         self.optimiser.zero_grad(set_to_none=True)
         for chunk in minibatch.chunks(size):
             weight = chunk.obs.shape[1] / total

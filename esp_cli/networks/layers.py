@@ -127,7 +127,7 @@ class _Perceptron(Function):
         x = x.to(precision)
         inputs, weights, last = [x], [w.to(precision) for w in parameters[::2]], len(parameters) // 2 - 1
         for k in range(last + 1):
-            x = torch.baddbmm(parameters[2 * k + 1].to(precision), x, weights[k])
+            x = _affine(parameters[2 * k + 1].to(precision), x, weights[k])
             if k < last or activate_output:
                 x = torch.relu_(x) if activation == "relu" else torch.tanh_(x)
                 inputs.append(x)
@@ -145,12 +145,30 @@ class _Perceptron(Function):
             grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
         grads: list[Tensor | None] = [None] * (2 * count)
         for k in reversed(range(count)):
-            grads[2 * k] = torch.bmm(inputs[k].transpose(1, 2), grad).float()
+            grads[2 * k] = _outer(inputs[k], grad).float()
             grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
         grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None
         return grad_x, None, None, None, *grads
+
+
+THIN = 16
+"""Outputs below which a batched product runs several times faster with rows and columns exchanged (MKL, measured)."""
+
+
+def _affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
+    """Return x W + b [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost in memory."""
+    if weight.shape[-1] >= THIN:
+        return torch.baddbmm(bias, x, weight)
+    return torch.baddbmm(bias.transpose(1, 2), weight.transpose(1, 2), x.transpose(1, 2)).transpose(1, 2)
+
+
+def _outer(x: Tensor, grad: Tensor) -> Tensor:
+    """Return x' grad, the gradient [S, in, out] of a weight."""
+    if grad.shape[-1] >= THIN:
+        return torch.bmm(x.transpose(1, 2), grad)
+    return torch.bmm(grad.transpose(1, 2), x).transpose(1, 2)
 
 
 def _activation_backward(grad: Tensor, output: Tensor, activation: str) -> Tensor:

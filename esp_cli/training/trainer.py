@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,13 +20,13 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
 from esp_cli.training.evaluation import PolicyController, play
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.registry import make
 
-CHECKPOINT_SECONDS = 30.0
-"""A kill loses at most this much work; a checkpoint takes some milliseconds."""
+CHECKPOINT_SECONDS = float(os.environ.get("ESP_CHECKPOINT_SECONDS", "30"))
+"""A kill loses at most this much work; a checkpoint takes some milliseconds. Set by ESP_CHECKPOINT_SECONDS."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +138,11 @@ class Trainer:
                 self.elapsed_s = time.monotonic() - started
                 row["time/elapsed_s"] = self.elapsed_s
                 going = self._record(writer, row, listener)
-                if self.is_complete or not going or tick - saved > CHECKPOINT_SECONDS:
+                all_broken = len(self.stopped_seeds) == len(self.config.seeds)
+                if self.is_complete or not going or all_broken or tick - saved > CHECKPOINT_SECONDS:
                     self._checkpoint()
                     saved = time.monotonic()
-                if len(self.stopped_seeds) == len(self.config.seeds):
+                if all_broken:
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
                 if not going and not self.is_complete:
                     return False
@@ -218,7 +221,10 @@ class Trainer:
 
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start anew."""
-        found = self.folder.latest_checkpoint()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", CheckpointWarning)
+            found = self.folder.latest_checkpoint()
+        self.notes += [str(warning.message) for warning in caught]
         if found is not None:
             tensors, meta = found
             self.learner.load_state_dict(tensors)

@@ -115,7 +115,7 @@ def test_every_update_logs_what_the_page_promises():
 
 
 def test_chunks_change_speed_only():
-    whole, _ = after(mappo__chunk_steps=800)
+    whole, _ = after()
     cut, _ = after(mappo__chunk_steps=13)
     for name, tensor in whole.items():
         torch.testing.assert_close(tensor, cut[name], rtol=1e-3, atol=1e-5)

@@ -1,0 +1,24 @@
+"""Tiny runs for the tests of training."""
+
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.run_folder import RunFolder
+
+TINY = {
+    "mappo.num_envs": 2,
+    "mappo.num_epochs": 1,
+    "mappo.num_minibatches": 1,
+    "network.hidden": [8],
+    "evaluation.episodes": 2,
+    "evaluation.every_steps": 100,
+}
+
+
+def tiny_config(steps=300, seeds=(0, 1), task="navigation", **overrides) -> RunConfig:
+    """A run of 50 steps an iteration that takes milliseconds."""
+    settings = TINY | {name.replace("__", "."): value for name, value in overrides.items()}
+    return resolve_config(task, steps=steps, seeds=seeds, overrides=settings)
+
+
+def tiny_folder(path, **choice) -> RunFolder:
+    """A new run folder for a tiny run."""
+    return RunFolder.create(path, tiny_config(**choice).model_dump(mode="json"))

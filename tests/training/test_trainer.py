@@ -1,0 +1,201 @@
+"""The training loop: resumed bit for bit, stopped cleanly, broken seeds set aside."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.loading import load_policy, parse_config
+from esp_cli.training.metrics import read_metrics
+from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.trainer import Trainer
+from tests.training.runs import tiny_config, tiny_folder
+
+ESP = "from esp_cli.app import main; main()"
+
+
+def trainer(folder):
+    return Trainer(parse_config(folder.config, folder.path), folder)
+
+
+def untimed(folder):
+    """The metrics without what depends on the clock."""
+    return [
+        {name: value for name, value in row.items() if not name.startswith("time/")}
+        for row in read_metrics(folder.metrics_path)
+    ]
+
+
+def stop_after(iterations):
+    seen = []
+    return lambda news: seen.append(news) or len(seen) <= iterations
+
+
+def final_state(folder):
+    tensors, meta = folder.latest_checkpoint()
+    return tensors, meta["iteration"]
+
+
+def same(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("choice", [{}, {"network__name": "gru"}, {"task": "predator-prey", "prior__kind": "none"}])
+def test_a_run_stopped_and_resumed_equals_one_run_through(tmp_path, choice):
+    straight, halted = tiny_folder(tmp_path / "a", **choice), tiny_folder(tmp_path / "b", **choice)
+    assert trainer(straight).run(lambda news: True)
+    assert not trainer(halted).run(stop_after(3))
+    assert len(read_metrics(halted.metrics_path)) < len(read_metrics(straight.metrics_path))
+    assert trainer(halted).run(lambda news: True)
+    assert same(final_state(straight)[0], final_state(halted)[0])
+    assert untimed(straight) == untimed(halted)
+    assert straight.policy_path.is_file()
+    assert halted.policy_path.is_file()
+
+
+def test_metrics_past_the_checkpoint_are_dropped_on_resume(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(stop_after(3))
+    kept = untimed(folder)
+    with folder.metrics_path.open("a") as file:
+        file.write('{"step":100000,"train/return":[1.0,1.0]}\n{"step":1000')
+    resumed = trainer(folder)
+    assert untimed(folder) == kept
+    assert resumed.step == kept[-1]["step"]
+
+
+def test_evaluations_do_not_depend_on_when_a_run_was_stopped_and_differ_between_steps(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(lambda news: True)
+    rows = [row for row in read_metrics(folder.metrics_path) if "eval/return_greedy" in row]
+    assert [row["step"] for row in rows] == [0, 100, 200, 300]
+    assert all(len(row["eval/return_stochastic"]) == 2 for row in rows)
+    assert rows[0]["eval/return_greedy"] != rows[1]["eval/return_greedy"]
+
+
+def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    broken = trainer(folder)
+    iterate, notes = broken.learner.iterate, []
+    good = []
+
+    def break_seed_one_in_the_third_iteration(progress):
+        if broken.iteration == 2:
+            good.append(broken.learner.policy.actor.layers[0].weight[1].detach().clone())
+            with torch.no_grad():
+                broken.learner.critic.layers[0].weight[1, 0, 0] = torch.nan
+        return iterate(progress)
+
+    broken.learner.iterate = break_seed_one_in_the_third_iteration
+    assert broken.run(lambda news: notes.extend(news.notes) or True)
+    assert broken.stopped_seeds == {1: 150}
+    assert any("seed 1 stopped at step 150" in note for note in notes)
+    tensors, _ = final_state(folder)
+    assert torch.equal(tensors["policy.actor.layers.0.weight"][1], good[0])
+    assert all(t.isfinite().all() for name, t in tensors.items() if name.startswith(("policy", "critic")))
+    last = read_metrics(folder.metrics_path)[-1]
+    assert last["train/policy_loss"][0] is not None
+    assert last["train/policy_loss"][1] is None
+    whole = tiny_folder(tmp_path / "whole")
+    trainer(whole).run(lambda news: True)
+    theirs = final_state(whole)[0]["policy.actor.layers.0.weight"]
+    assert torch.equal(tensors["policy.actor.layers.0.weight"][0], theirs[0]), "seed 0 never noticed"
+    assert not torch.equal(tensors["policy.actor.layers.0.weight"][1], theirs[1])
+
+
+def test_a_run_whose_every_seed_breaks_ends_with_a_sentence_and_a_good_checkpoint(tmp_path):
+    folder = tiny_folder(tmp_path / "run", mappo__learning_rate=1e30, mappo__max_grad_norm=1e30)
+    with pytest.raises(ValueError, match="every seed stopped"):
+        trainer(folder).run(lambda news: True)
+    tensors, _ = final_state(folder)
+    assert all(t.isfinite().all() for name, t in tensors.items() if name.startswith(("policy.", "critic.")))
+
+
+def test_another_configuration_cannot_continue_a_checkpoint(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(stop_after(2))
+    with pytest.raises(ValueError, match="does not fit this configuration"):
+        Trainer(tiny_config(network__hidden=[9]), folder)
+
+
+def _start(folder):
+    command = [sys.executable, "-c", ESP, "train", "--resume", str(folder)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "ESP_CHECKPOINT_SECONDS": "0.1"}
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment, text=True)
+
+
+def _wait_for_steps(folder, steps, process):
+    """Wait until a process has written a checkpoint past `steps`."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        files = sorted((folder / "checkpoints").glob("step-*"))
+        if files and int(files[-1].name[5:17]) > steps:
+            return int(files[-1].name[5:17])
+        assert process.poll() is None, f"it ended too early: {process.stderr.read()}"
+        time.sleep(0.01)
+    raise AssertionError("no checkpoint within a minute")
+
+
+def test_a_killed_process_is_resumed_bit_for_bit_and_a_second_one_is_refused(tmp_path):
+    steps = 20_000
+    straight, killed = tiny_folder(tmp_path / "a", steps=steps), tiny_folder(tmp_path / "b", steps=steps)
+    reached = 0
+    for _ in range(2):
+        process = _start(killed.path)
+        reached = _wait_for_steps(killed.path, reached, process)
+        second = subprocess.run(
+            [sys.executable, "-c", ESP, "train", "--resume", str(killed.path)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert second.returncode == 2
+        assert f"{process.pid}" in second.stderr
+        assert "Traceback" not in second.stderr
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert trainer(killed).step < steps, "it was killed on the way"
+    torch.set_num_threads(1)
+    trainer(straight).run(lambda news: True)
+    process = _start(killed.path)
+    assert process.wait(timeout=120) == 0, process.stderr.read()
+    assert same(final_state(straight)[0], final_state(RunFolder.open(killed.path))[0])
+    assert untimed(straight) == untimed(killed)
+
+
+def test_an_interrupt_stops_cleanly_with_the_command_to_go_on(tmp_path):
+    folder = tiny_folder(tmp_path / "run", steps=10_000_000)
+    process = _start(folder.path)
+    _wait_for_steps(folder.path, 0, process)
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"esp train --resume {folder.path}" in stderr
+    assert "Traceback" not in stderr
+    tensors, meta = load_checkpoint(folder.checkpoints()[-1])
+    assert meta["step"] == read_metrics(folder.metrics_path)[-1]["step"]
+    assert tensors
+
+
+def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(lambda news: True)
+    run, alone = load_policy(folder.path), load_policy(folder.policy_path)
+    obs = torch.randn(2, 5, 3, run.spec.observation.width)
+    memory = run.policy.initial_memory(5, obs)
+    assert torch.equal(run.policy.act(obs, memory)[0], alone.policy.act(obs, memory)[0])
+    assert alone.config == run.config
+    _, meta = load_checkpoint(folder.policy_path, format_name="esp-policy")
+    assert {name: meta[name] for name in ("task", "task_version", "network", "activation")} == {
+        "task": "navigation",
+        "task_version": 1,
+        "network": "mlp",
+        "activation": "tanh",
+    }
+    assert len(meta["greedy_returns"]) == 2
+    assert run.step == alone.step == 300
