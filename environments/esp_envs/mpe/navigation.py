@@ -61,7 +61,7 @@ class Navigation(ParticleTask):
     """Cooperative navigation, MPE's `simple_spread`.
 
     N agents (discs of radius 0.15, mass 1) shall between them stand on L landmarks and not touch each other. The plane
-    is unbounded; lengths have no physical unit, a step is 0.1 s. `physics` is in `particles.py`.
+    is unbounded; lengths have no physical unit, a step is 0.1 s. The physics stands in `esp_envs.mpe.particles`.
 
     Actions:
         discrete: 0 no-op, 1 left, 2 right, 3 down, 4 up: a force of acceleration 5.0 length/s^2 in that direction.
