@@ -91,8 +91,8 @@ def clip_gradients_per_seed(gradients: list[Tensor], max_norm: float) -> Tensor:
     Returns:
         [S] norms before clipping.
     """
-    flat = [g.flatten(1) for g in gradients]
-    squares = torch.stack([torch.linalg.vecdot(g, g) for g in flat])
+    flat = [g.view(g.shape[0], -1) for g in gradients]
+    squares = torch.stack([g.square().sum(1) for g in flat])
     norm = squares.sum(0).sqrt()
     scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).unsqueeze(1)
     torch._foreach_mul_(flat, [scale] * len(flat))

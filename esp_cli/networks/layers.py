@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.autograd import Function
+from torch.nn.functional import pad
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
 """Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
@@ -41,7 +42,7 @@ class SeedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer."""
-        return torch.baddbmm(self.bias, x, self.weight)
+        return _affine(self.bias, x, self.weight)
 
 
 class SeedLayerNorm(nn.Module):
@@ -157,10 +158,16 @@ THIN = 16
 """Outputs below which a batched product runs several times faster with rows and columns exchanged (MKL, measured)."""
 
 
+# A single column is computed as two: for one seed and one column torch would take a matrix-vector routine, which rounds
+# differently, and a seed would no longer learn bit for bit the same alone and among others.
+
+
 def _affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
     """Return x W + b [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost in memory."""
     if weight.shape[-1] >= THIN:
         return torch.baddbmm(bias, x, weight)
+    if weight.shape[-1] == 1:
+        return _affine(pad(bias, (0, 1)), x, pad(weight, (0, 1)))[..., :1]
     return torch.baddbmm(bias.transpose(1, 2), weight.transpose(1, 2), x.transpose(1, 2)).transpose(1, 2)
 
 
@@ -168,6 +175,8 @@ def _outer(x: Tensor, grad: Tensor) -> Tensor:
     """Return x' grad, the gradient [S, in, out] of a weight."""
     if grad.shape[-1] >= THIN:
         return torch.bmm(x.transpose(1, 2), grad)
+    if grad.shape[-1] == 1:
+        return _outer(x, pad(grad, (0, 1)))[..., :1]
     return torch.bmm(grad.transpose(1, 2), x).transpose(1, 2)
 
 
