@@ -17,7 +17,10 @@ def evaluate(policy: PolicyArgument, episodes: EpisodesOption = 320, json: JsonO
     from esp_cli.experiments.judgement import judge
     from esp_cli.training.loading import load_policy
 
-    result = judge(load_policy(policy), episodes)
+    trained = load_policy(policy)
+    for text in trained.notes:
+        console.note(text)
+    result = judge(trained, episodes)
     if json != "-":
         _print(result)
     if json is not None:

@@ -32,6 +32,8 @@ def render(
     from esp_cli.training.loading import load_policy
 
     trained = load_policy(policy)
+    for text in trained.notes:
+        console.note(text)
     frames = film(trained, trained.config.seeds[0] if seed is None else seed, episodes, size, not stochastic)
     write_gif(out, frames, speed / trained.spec.control_period_s)
     console.note(f"{len(frames)} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")

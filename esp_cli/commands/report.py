@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -46,6 +47,8 @@ def report(
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:
+    if Path(text).exists():  # a folder may have "=" in its own name
+        return None, Path(text)
     label, equals, path = text.rpartition("=")
     return (label, Path(path)) if equals else (None, Path(text))
 
@@ -57,7 +60,9 @@ def _references(items: list[str]) -> dict[str, float]:
         try:
             out[name] = float(value)
         except ValueError:
-            raise ValueError(f"--reference {item} is no line to draw; write --reference NAME=VALUE") from None
+            name = ""
+        if not name or not math.isfinite(out[name]):
+            raise ValueError(f"--reference {item} is no line to draw; write --reference NAME=VALUE")
     return out
 
 
@@ -65,7 +70,8 @@ def _print(result: dict[str, Any]) -> None:
     rows = []
     for run in result["runs"]:
         for step, verdict in run["returns"].items():
-            rows.append((run["label"], console.format_count(int(step)), len(run["seeds"]), *_cells(verdict)))
+            seeds = sum(x is not None for x in verdict["per_seed"]) if verdict else 0
+            rows.append((run["label"], console.format_count(int(step)), seeds, *_cells(verdict)))
     title = f"{result['task']} version {result['task_version']}, {result['episodes_per_evaluation']} episodes a seed"
     caption = f"convention {result['convention']}; mean ± s.e.m. over seeds; difference from the first run"
     headings = ("run", "steps>", "seeds>", "return>", "95 % interval>", "difference>", "95 % interval>")

@@ -39,6 +39,7 @@ DEFAULT_STEPS = 1_000_000
 
 
 def train(
+    context: typer.Context,
     task: TaskOption = "navigation",
     algo: AlgoOption = "mappo",
     preset: Annotated[
@@ -68,22 +69,39 @@ def train(
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     from esp_cli.training.config import resolve_config
     from esp_cli.training.run_folder import RunFolder
+    from esp_cli.training.trainer import build_learner
 
     if resume is not None:
+        _refuse_beside_resume(context)
         folder = RunFolder.open(resume)
     else:
-        overrides = parse_assignments(settings or [])
         chosen = {
             "prior.kind": prior,
             "prior.transforms": transforms,
             "prior.consistency_coef": consistency_coef,
             "network.name": network,
         }
-        overrides |= {name: value for name, value in chosen.items() if value is not None}
+        given = {name: value for name, value in chosen.items() if value is not None}
+        overrides = {**given, **parse_assignments(settings or [])}
         config = resolve_config(task, algo, preset, steps, seeds, _device(device), overrides)
+        build_learner(config)  # refuses what does not go together while there is no run folder yet
         name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
     _run(folder, tensorboard)
+
+
+def _refuse_beside_resume(context: typer.Context) -> None:
+    """Refuse options that a resumed run, which keeps its own configuration, would silently ignore."""
+    given = [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name not in ("resume", "tensorboard")
+        and getattr(context.get_parameter_source(str(parameter.name)), "name", "") == "COMMANDLINE"
+    ]
+    if given:
+        raise ValueError(
+            f"--resume goes on with a run just as it was; leave out {', '.join(given)}, or start a new run"
+        )
 
 
 def _device(wanted: str) -> str:
@@ -101,9 +119,10 @@ def _run(folder: RunFolder, tensorboard: bool) -> None:
     from esp_cli.training.trainer import Trainer
 
     config = parse_config(folder.config, folder.path)
+    _device(config.device)
     with folder.lock(), _stop_requests() as requests:
         trainer = Trainer(config, folder, tensorboard)
-        if trainer.is_complete:
+        if trainer.is_complete and folder.policy_path.is_file():
             console.note(f"{folder.path} is complete at {console.format_count(trainer.step)} steps")
             return
         _announce(config, folder, trainer.step)
@@ -148,13 +167,16 @@ def _shown(news: Progress) -> dict[str, float]:
 
 
 def _report(trainer: Trainer, folder: RunFolder) -> None:
+    import numpy as np
+
     from esp_cli.experiments.statistics import mean_and_sem
 
     rows = []
     for mode, values in trainer.final_returns().items():
-        rows.append((mode, console.format_mean(*mean_and_sem(values))))
+        good = values[np.isfinite(values)]  # a seed that stopped has none
+        rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
-    console.table(("policy", "episode return>"), rows, caption=caption)
+    console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
     console.note(f"next: esp eval {folder.path}    esp render {folder.path} -o out.gif")
 
 

@@ -48,10 +48,9 @@ class RunCurve:
 
     def at(self, step: int) -> NDArray[np.float64] | None:
         """Return the returns [S] of the evaluation nearest to a step, or None where the run did not get there."""
-        nearest = int(np.abs(self.steps - step).argmin())
-        if step - self.steps[nearest] > self.config.evaluation.every_steps:
+        if step - self.steps[-1] > self.config.evaluation.every_steps:
             return None
-        return self.values[nearest]
+        return self.values[int(np.abs(self.steps - step).argmin())]
 
 
 def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
@@ -63,8 +62,14 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     folder = RunFolder.open(path)
     rows = read_metrics(folder.metrics_path)
     steps, values = column(rows, f"eval/return_{mode}")
-    seconds = max((row["time/elapsed_s"] for row in rows if "time/elapsed_s" in row), default=0.0)
-    return RunCurve(label or path.name, parse_config(folder.config, path), steps, values, seconds)
+    config = parse_config(folder.config, path)
+    if values.shape[1] != len(config.seeds):
+        raise ValueError(
+            f"{path} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
+        )
+    times = (row.get("time/elapsed_s") for row in rows)
+    seconds = max((time for time in times if isinstance(time, int | float)), default=0.0)
+    return RunCurve(label or path.name, config, steps, values, seconds)
 
 
 def compare(curves: Sequence[RunCurve], at: Sequence[int], thresholds: Sequence[float]) -> dict[str, Any]:
@@ -86,7 +91,7 @@ def compare(curves: Sequence[RunCurve], at: Sequence[int], thresholds: Sequence[
     if len(conventions) > 1:
         raise ValueError("these runs have different tasks or task settings, so their returns do not compare")
     at = at or [int(min(curve.steps[-1] for curve in curves))]
-    spec = build_environment(curves[0].config, 1, "shape").spec
+    spec = build_environment(curves[0].config.model_copy(update={"device": "cpu"}), 1, "shape").spec
     return {
         "task": spec.name,
         "task_version": spec.version,

@@ -51,9 +51,12 @@ def film(trained: TrainedPolicy, seed: int, episodes: int, size: int, greedy: bo
         for _ in range(env.spec.horizon):
             step = env.step(controller.act(env, observation))
             observation = step.next
-            if bool((step.terminated | step.truncated)[world]):
-                break
+            ended = bool((step.terminated | step.truncated)[world])
+            if ended and step.final is not None:
+                env.set_state(step.final.state)  # the world has begun anew by itself; show how it ended
             scenes.append(env.scene(world))
+            if ended:
+                break
         frames += [draw(scene, size, trail=scenes[:k]) for k, scene in enumerate(scenes)]
     return frames
 

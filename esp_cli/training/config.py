@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -32,13 +33,13 @@ class RunConfig(BaseModel):
     algorithm: str
     preset: str = "default"
     steps: int = Field(ge=1, description="environment steps per seed")
-    seeds: tuple[int, ...] = Field((0,), min_length=1)
+    seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=1000, description="as many as --seeds takes")
     task_settings: dict[str, Any] = Field(default_factory=dict)
     algorithm_settings: dict[str, Any] = Field(default_factory=dict)
     network: NetworkConfig = NetworkConfig()
     prior: PriorConfig = PriorConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
-    device: str = "cpu"
+    device: Literal["cpu", "cuda"] = "cpu"
 
 
 def resolve_config(
@@ -77,23 +78,26 @@ def resolve_config(
         section, dot, key = dotted.partition(".")
         if not dot or section not in sections:
             raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {', '.join(names)}")
-        sections[section][key] = _read(value)
+        sections[section][key] = read = _read(value)
+        if isinstance(read, float) and not math.isfinite(read):
+            raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
 
     task_settings = _validated(task_class(task).Settings, sections["task"], "task")
     algorithm_settings = _validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
-    return RunConfig(
-        task=task,
-        algorithm=algorithm,
-        preset=preset,
-        steps=steps,
-        seeds=tuple(seeds),
-        task_settings=task_settings.model_dump(),
-        algorithm_settings=algorithm_settings.model_dump(),
-        network=_validated(NetworkConfig, sections["network"], "network"),
-        prior=_validated(PriorConfig, sections["prior"], "prior"),
-        evaluation=_validated(EvaluationConfig, sections["evaluation"], "evaluation"),
-        device=device,
-    )
+    values = {
+        "task": task,
+        "algorithm": algorithm,
+        "preset": preset,
+        "steps": steps,
+        "seeds": tuple(seeds),
+        "task_settings": task_settings.model_dump(),
+        "algorithm_settings": algorithm_settings.model_dump(),
+        "network": _validated(NetworkConfig, sections["network"], "network"),
+        "prior": _validated(PriorConfig, sections["prior"], "prior"),
+        "evaluation": _validated(EvaluationConfig, sections["evaluation"], "evaluation"),
+        "device": device,
+    }
+    return _validated(RunConfig, values, "run")
 
 
 def _read(value: object) -> object:
@@ -120,5 +124,7 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str) -
     name = ".".join([section, *(str(part) for part in first["loc"])])
     if first["type"] == "extra_forbidden":
         return f"unknown setting '{name}'; {section} has {', '.join(model.model_fields)}"
+    if first["type"] == "missing":
+        return f"the setting '{name}' is missing"
     message = first["msg"].removeprefix("Value error, ")
     return f"bad value {first['input']!r} for '{name}': {message[0].lower()}{message[1:]}"

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import torch
 from pydantic import ValidationError
 from torch import Tensor
 
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import RunConfig, one_sentence
-from esp_cli.training.run_folder import POLICY_FORMAT, RunFolder
+from esp_cli.training.run_folder import POLICY_FORMAT, CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
 from esp_envs.spec import TaskSpec
@@ -24,11 +28,12 @@ class TrainedPolicy:
     """A policy and what it was trained for.
 
     Attributes:
-        config: of the run.
+        config: of the run; its device is the CPU where there is no GPU.
         policy: S policies, in evaluation mode.
         spec: of the task it was trained on.
         step: environment steps per seed behind it.
         source: the run folder or file.
+        notes: sentences for the user (a damaged checkpoint was passed over).
     """
 
     config: RunConfig
@@ -36,18 +41,22 @@ class TrainedPolicy:
     spec: TaskSpec
     step: int
     source: Path
+    notes: tuple[str, ...] = ()
 
 
-def parse_config(data: Mapping[str, Any], source: Path) -> RunConfig:
+def parse_config(data: object, source: Path) -> RunConfig:
     """Read a stored configuration.
 
     Raises:
         ValueError: it is damaged or of another version.
     """
     try:
-        return RunConfig.model_validate(dict(data))
+        config = RunConfig.model_validate(data)
     except ValidationError as error:
         raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}") from None
+    if config.algorithm not in ALGORITHMS:
+        raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    return config
 
 
 def load_policy(path: Path) -> TrainedPolicy:
@@ -58,25 +67,41 @@ def load_policy(path: Path) -> TrainedPolicy:
     """
     if path.is_file():
         tensors, meta = load_checkpoint(path, format_name=POLICY_FORMAT)
-        return _build(path, parse_config(meta.get("config", {}), path), tensors, meta)
+        return _build(path, parse_config(meta.get("config"), path), tensors, meta)
     folder = RunFolder.open(path)
-    found = folder.latest_checkpoint()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CheckpointWarning)
+        found = folder.latest_checkpoint()
     if found is None:
         raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {path}")
     tensors, meta = found
     own = {name.removeprefix("policy."): t for name, t in tensors.items() if name.startswith("policy.")}
-    return _build(path, parse_config(folder.config, path), own, meta)
+    notes = tuple(str(warning.message) for warning in caught)
+    return _build(path, parse_config(folder.config, path), own, meta, notes)
 
 
-def _build(path: Path, config: RunConfig, tensors: dict[str, Tensor], meta: Mapping[str, Any]) -> TrainedPolicy:
+def _build(
+    path: Path, config: RunConfig, tensors: dict[str, Tensor], meta: Mapping[str, Any], notes: tuple[str, ...] = ()
+) -> TrainedPolicy:
+    if config.device == "cuda" and not torch.cuda.is_available():
+        config = config.model_copy(update={"device": "cpu"})
+    step = meta.get("step")
+    if type(step) is not int or step < 0:
+        raise ValueError(f"{path} is damaged: it does not say after how many steps it was written")
     spec = build_environment(config, 1, "shape").spec
     version = meta.get("task_version", spec.version)
     if version != spec.version:
         raise ValueError(f"{path} was trained on {config.task} version {version}, but this is version {spec.version}")
+    misfit = f"{path}: the weights do not fit the configuration beside them"
+    # Before anything of that size is made: a damaged configuration may ask for more than the machine has.
+    widths = (spec.observation.width, *config.network.hidden)
+    needed = len(config.seeds) * sum(inputs * outputs for inputs, outputs in pairwise(widths))
+    if min(widths) < 1 or needed > sum(tensor.numel() for tensor in tensors.values()):
+        raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
     policy = Policy(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1].strip()
-        raise ValueError(f"{path}: the weights do not fit the configuration beside them ({reason})") from None
-    return TrainedPolicy(config, policy, spec, int(meta.get("step", 0)), path)
+        raise ValueError(f"{misfit} ({reason})") from None
+    return TrainedPolicy(config, policy, spec, step, path, notes)
