@@ -162,4 +162,7 @@ def root(
 
 def main() -> None:
     """Run the application on the command line of this process."""
+    # Read by OpenMP when torch is imported. Its threads wait for each other by spinning, by default for milliseconds: a
+    # second busy program on the same cores then slows training tenfold and more.
+    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     app()
