@@ -112,6 +112,9 @@ class Collector:
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
-        self.observation = Observation(tensors["obs"], tensors["state"])
-        self.memory, self.episode_return = tensors["memory"], tensors["episode_return"]
+        own = {name: tensors[name].to(self.env.device) for name in ("obs", "state", "memory", "episode_return")}
+        if own["obs"].shape != self.observation.obs.shape:
+            raise ValueError("the saved worlds have other seeds, worlds or observations than these; use their settings")
+        self.observation = Observation(own["obs"], own["state"])
+        self.memory, self.episode_return = own["memory"], own["episode_return"]
         self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
