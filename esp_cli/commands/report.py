@@ -47,10 +47,11 @@ def report(
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:
-    if Path(text).exists():  # a folder may have "=" in its own name
+    """Split LABEL=PATH; either may itself have a "=", so the longest path that exists is taken."""
+    splits = [(text[:k], Path(text[k + 1 :])) for k, character in enumerate(text) if character == "="]
+    if Path(text).exists() or not splits:
         return None, Path(text)
-    label, equals, path = text.rpartition("=")
-    return (label, Path(path)) if equals else (None, Path(text))
+    return next((split for split in splits if split[1].exists()), splits[-1])
 
 
 def _references(items: list[str]) -> dict[str, float]:

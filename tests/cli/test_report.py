@@ -1,0 +1,135 @@
+"""`esp report`: runs side by side."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.cli.running import DAMAGE, esp, refused, train_tiny
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the same seeds without the prior."""
+    return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seeds", "3,7", "--prior", "none")
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("│").split("│")]
+
+
+def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_path: Path) -> None:
+    file, picture = tmp_path / "report.json", tmp_path / "curves.png"
+    options = ["--at", "100", "--at", "150", "--threshold", "-1000", "--threshold", "-0.5", "--reference", "paper=-110"]
+    told = esp("report", plain, f"ESP={finished}", *options, "--json", file, "--plot", picture)
+    result = json.loads(file.read_text())
+    assert (result["task"], result["task_version"], result["episodes_per_evaluation"]) == ("navigation", 1, 2)
+    first, second = result["runs"]
+    assert (first["label"], second["label"]) == ("plain", "ESP")
+    assert first["seeds"] == second["seeds"] == [3, 7]
+    assert (first["config"]["prior"]["kind"], second["config"]["prior"]["kind"]) == ("none", "esp")
+    assert list(first["returns"]) == ["100", "150"]
+    for step in ("100", "150"):
+        assert "difference" not in first["returns"][step]
+        gap = second["returns"][step]["difference"]
+        assert gap["paired"] is True
+        assert gap["mean"] == pytest.approx(second["returns"][step]["mean"] - first["returns"][step]["mean"])
+    assert first["steps_to"] == {
+        "-1000.0": {"mean": 0, "per_seed": [0, 0]},
+        "-0.5": {"mean": None, "per_seed": [None, None]},
+    }
+    table = [cells(line) for line in told.stdout.splitlines() if line.startswith("│")]
+    assert [row[:3] for row in table[:4]] == [
+        ["plain", "100", "2"],
+        ["plain", "150", "2"],
+        ["ESP", "100", "2"],
+        ["ESP", "150", "2"],
+    ]
+    assert [row[5] for row in table[:2]] == ["", ""]
+    assert table[3][5] == f"{second['returns']['150']['difference']['mean']:+.2f}"
+    assert table[4:] == [
+        [label, limit, at] for label in ("plain", "ESP") for limit, at in (("-1000.0", "0"), ("-0.5", "-"))
+    ]
+    assert result["convention"] in told.stdout
+    with Image.open(picture) as image:
+        assert image.format == "PNG"
+    drawing = picture.with_suffix(".svg").read_text()
+    assert all(text in drawing for text in ("<svg", "ESP", "plain", "paper"))
+    assert f"curves -> {picture}" in told.stderr
+
+
+def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_default(
+    finished: Path, plain: Path, tmp_path: Path
+) -> None:
+    short = train_tiny(tmp_path / "short", "--seeds", "3,7", steps=100)
+    result = json.loads(esp("report", finished, short, plain, "--json", "-").stdout)
+    assert [list(run["returns"]) for run in result["runs"]] == [["100"]] * 3
+
+
+def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Path) -> None:
+    one = train_tiny(tmp_path / "one", "--seeds", "3,", steps=50)
+    told = esp("report", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
+    rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│")]
+    assert rows[0][2] == "1"
+    assert "±" not in rows[0][3]
+    assert rows[0][4] == "-"
+    assert rows[1] == ["one", "9k", "0", "-", "-", "-", "-"]
+    first, second = json.loads((tmp_path / "report.json").read_text())["runs"]
+    assert (first["returns"]["50"]["sem"], first["returns"]["50"]["ci95"], first["returns"]["9000"]) == (
+        None,
+        None,
+        None,
+    )
+    assert second["returns"]["50"]["difference"]["paired"] is False, "other seeds"
+
+
+def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Path) -> None:
+    renamed = copied.rename(copied.with_name("rate=1e-3"))
+    for argument, label in ((renamed, "rate=1e-3"), (f"new={renamed}", "new"), (f"c=0.5={renamed}", "c=0.5")):
+        result = json.loads(esp("report", argument, "--json", "-").stdout)
+        assert result["runs"][0]["label"] == label
+
+
+def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) -> None:
+    hunt = train_tiny(tmp_path / "hunt", "--task", "predator-prey", steps=50)
+    two = train_tiny(tmp_path / "two", "--set", "task.num_agents=2", steps=50)
+    for other in (hunt, two):
+        assert "different tasks or task settings" in refused("report", finished, other)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--at", "soon"], "'soon' is no number of steps"),
+        (["--reference", "paper"], "--reference paper is no line to draw"),
+        (["--reference", "-110"], "--reference -110 is no line to draw"),
+        (["--reference", "paper=nan"], "--reference paper=nan is no line to draw"),
+        (["--threshold", "high"], "--threshold"),
+        (["--mode", "best"], "'best' is not one of 'greedy', 'stochastic'"),
+    ],
+)
+def test_a_bad_option_is_told_in_one_sentence(finished: Path, options: list[str], sentence: str) -> None:
+    assert sentence in refused("report", finished, *options)
+
+
+@pytest.mark.parametrize("kind", ["nothing there", "config that is no JSON", "seeds that are a text"])
+def test_what_is_no_run_is_told_in_one_sentence(finished: Path, copied: Path, kind: str) -> None:
+    damage, sentence = DAMAGE[kind]
+    assert sentence in refused("report", finished, damage(copied))
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("", "no row has the metric 'eval/return_greedy'"),
+        ('{"step": 0, "eval/return_greedy": [1.0]}\n', "its metrics have 1 seeds, its configuration 2"),
+        ('{"step": 0, "eval/return_greedy": ["high", 1]}\n', "something that is no number"),
+        ("train more\nsleep less\n", "line 1 is no row of metrics"),
+    ],
+)
+def test_damaged_metrics_are_told_in_one_sentence(copied: Path, content: str, sentence: str) -> None:
+    (copied / "metrics.jsonl").write_text(content)
+    assert sentence in refused("report", copied)

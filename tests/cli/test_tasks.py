@@ -1,0 +1,52 @@
+"""`esp tasks`: the tasks with their symmetries, and their cards."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from esp_envs.registry import make, task_names
+from tests.cli.running import esp, refused
+
+
+def test_the_list_names_every_task_with_the_symmetries_that_it_carries() -> None:
+    told = esp("tasks")
+    for name in task_names():
+        (row,) = (line for line in told.stdout.splitlines() if line.startswith(f"│ {name} "))
+        cells = [cell.strip() for cell in row.strip("│").split("│")]
+        spec = make(name, 1, [0]).spec
+        assert cells[1:4] == [str(spec.version), str(spec.num_agents), str(spec.horizon)]
+        assert cells[4] == "c2, d2, c4, d4, agents"
+        assert cells[5] == spec.convention
+    assert "esp tasks NAME" in told.stderr
+
+
+def test_the_list_as_json(tmp_path: Path) -> None:
+    found = json.loads(esp("tasks", "--json", "-").stdout)
+    assert [task["task"] for task in found] == list(task_names())
+    file = tmp_path / "tasks.json"
+    assert "navigation" in esp("tasks", "--json", file).stdout
+    assert json.loads(file.read_text()) == found
+
+
+def test_a_card_tells_what_the_numbers_are() -> None:
+    card = esp("tasks", "navigation").stdout
+    for part in ("simple_spread", "Reward", "landmarks", "vector x 3", "length/s", "num_agents", "Symmetries: c2, d2"):
+        assert part in card
+
+
+def test_a_card_as_json() -> None:
+    card = json.loads(esp("tasks", "navigation", "--json", "-").stdout)
+    assert set(card) == {
+        "task", "version", "convention", "agents", "horizon", "observation", "actions", "symmetries", "heuristics",
+        "settings",
+    }  # fmt: skip
+    assert card["observation"][0] == {"index": "0..1", "field": "velocity", "kind": "vector x 1", "unit": "length/s"}
+    assert card["actions"] == ["0 no-op (0, 0)", "1 left (-1, 0)", "2 right (1, 0)", "3 down (0, -1)", "4 up (0, 1)"]
+    assert card["heuristics"] == ["greedy", "cover"]
+    assert card["settings"]["num_agents"]["default"] == 3
+    assert all(setting["description"] for setting in card["settings"].values())
+
+
+def test_an_unknown_task_is_told_in_one_sentence() -> None:
+    assert refused("tasks", "chess") == f"unknown task 'chess'; the tasks are {', '.join(task_names())}"

@@ -1,0 +1,299 @@
+"""`esp train`: what the options mean, what is refused before a folder is made, and how runs stop and go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from esp_cli import console
+from esp_cli.algorithms.mappo import Mappo
+from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.metrics import read_metrics
+from esp_cli.training.run_folder import RunFolder
+from tests.cli.running import DAMAGE, STEPS, TINY_OPTIONS, edit_config, esp, refused, train_tiny
+
+
+def config_of(run: Path) -> dict[str, Any]:
+    return RunFolder.open(run).config
+
+
+def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
+    run = train_tiny(
+        tmp_path / "deep" / "run",
+        *("--algo", "mappo", "--task", "predator-prey", "--prior", "consistency", "--transforms", "rot90,flip-x"),
+        *("--consistency-coef", "0.25", "--network", "gru", "--seeds", "3,7", "--device", "cpu"),
+        *("--set", "mappo.learning_rate=5e-4", "--set", "task.prey=fleeing"),
+        steps="0.05k",
+    )
+    config = config_of(run)
+    assert (config["task"], config["algorithm"], config["preset"]) == ("predator-prey", "mappo", "default")
+    assert (config["steps"], config["seeds"], config["device"]) == (50, [3, 7], "cpu")
+    assert (config["network"]["name"], config["network"]["hidden"]) == ("gru", [8])
+    assert config["algorithm_settings"]["learning_rate"] == 5e-4
+    assert config["task_settings"]["prey"] == "fleeing"
+    prior = config["prior"]
+    assert (prior["kind"], prior["transforms"], prior["consistency_coef"]) == ("consistency", "rot90,flip-x", 0.25)
+    assert len(read_metrics(run / "metrics.jsonl")[-1]["train/return"]) == 2
+
+
+def test_the_paper_preset_is_rot90_with_a_recurrent_network(tmp_path: Path) -> None:
+    config = config_of(train_tiny(tmp_path / "run", "--preset", "paper", steps=50))
+    assert (config["preset"], config["prior"]["transforms"], config["prior"]["consistency_coef"]) == (
+        "paper",
+        "rot90",
+        0.5,
+    )
+    assert (config["network"]["name"], config["network"]["layer_norm"]) == ("gru", True)
+    assert config["algorithm_settings"]["clip_value"] is True
+    assert config["algorithm_settings"]["num_envs"] == 2, "--set has the last word over the preset"
+
+
+def test_a_setting_has_the_last_word_over_an_option(tmp_path: Path) -> None:
+    run = train_tiny(tmp_path / "run", "--prior", "esp", "--set", "prior.kind=none", steps=50)
+    assert config_of(run)["prior"]["kind"] == "none"
+
+
+def test_without_out_a_run_gets_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "none")
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name.startswith("navigation-mappo-none-")
+    assert (run / "policy.safetensors").is_file()
+
+
+def test_what_is_printed_where(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    told = esp("train", *TINY_OPTIONS, *STEPS, "--out", run)
+    assert "training: mappo on navigation, prior esp (d4, c = 0.5), 1 seed(s), 150 steps each" in told.stderr
+    assert "100%  150/150" in told.stderr
+    assert f"next: esp eval {run}    esp render {run} -o out.gif" in told.stderr
+    last = read_metrics(run / "metrics.jsonl")[-1]
+    for mode in ("greedy", "stochastic"):
+        (row,) = (line for line in told.stdout.splitlines() if f" {mode} " in line)
+        assert f"{last[f'eval/return_{mode}'][0]:.2f}" in row
+    assert "training" not in told.stdout
+    assert "no prior" in esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "b", "--prior", "none").stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--transforms", "c8"], "c8 cannot act on navigation: action 'left' turned by 45 degrees is no action"),
+        (["--transforms", "rot45,rot90"], "rot45,rot90 cannot act on navigation"),
+        (["--transforms", "so2", "--set", "prior.copies=all", "--set", "task.actions=continuous"], "finite group"),
+        (["--transforms", "spin"], "spin"),
+        (["--task", "chess"], "unknown task 'chess'; the tasks are navigation, predator-prey"),
+        (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
+        (["--preset", "best"], "mappo has no preset 'best'; it has default, paper"),
+        (["--prior", "some"], "'some' is not one of 'esp', 'augment', 'consistency', 'none'"),
+        (["--network", "cnn"], "'cnn' is not one of 'mlp', 'gru'"),
+        (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
+        (["--consistency-coef", "-1"], "--consistency-coef"),
+        (["--consistency-coef", "nan"], "--consistency-coef"),
+        (["--consistency-coef", "inf"], "bad value inf for 'prior.consistency_coef': it has to be a finite number"),
+        (["--steps", "some"], "'some' is no number of steps"),
+        (["--seeds", "2,2"], "name one seed twice"),
+        (["--seeds", "0"], "0 seeds cannot be trained at once"),
+        (["--device", "tpu"], "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
+        (["--set", "learning_rate=1"], "cannot set 'learning_rate': a setting is SECTION.NAME"),
+        (["--set", "mappo.speed=1"], "unknown setting 'mappo.speed'; mappo has num_envs"),
+        (["--set", "mappo.gamma=2"], "bad value 2 for 'mappo.gamma': input should be less than or equal to 1"),
+        (["--set", "mappo.learning_rate=fast"], "bad value 'fast' for 'mappo.learning_rate'"),
+        (["--set", "mappo.learning_rate=Infinity"], "it has to be a finite number"),
+        (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is no setting"),
+        (["--set", "task.prey=still"], "unknown setting 'task.prey'"),
+        (["--set", "task.num_agents=99"], "bad value 99 for 'task.num_agents'"),
+        (["--task", "predator-prey", "--set", "task.prey=policy"], "give both or neither"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_sentence_and_leaves_no_folder(
+    tmp_path: Path, options: list[str], sentence: str
+) -> None:
+    assert sentence in refused("train", *STEPS, "--out", tmp_path / "run", *options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_that_is_not_there_is_told(copied: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    missing = "there is no CUDA device here; use --device cpu or auto"
+    assert refused("train", "--device", "cuda", "--out", tmp_path / "run") == missing
+    assert not (tmp_path / "run").exists()
+    assert missing in refused("train", "--resume", edit_config(copied, device="cuda"))
+    assert config_of(train_tiny(tmp_path / "auto", "--device", "auto", steps=50))["device"] == "cpu"
+
+
+def test_a_place_that_is_taken_is_refused_and_stays_as_it_was(copied: Path, tmp_path: Path) -> None:
+    before = {file: file.read_bytes() for file in copied.rglob("*") if file.is_file()}
+    sentence = refused("train", *TINY_OPTIONS, *STEPS, "--out", copied)
+    assert sentence == f"{copied} exists: resume with esp train --resume {copied} or choose another --out"
+    assert {file: file.read_bytes() for file in copied.rglob("*") if file.is_file()} == before
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("\\section{Symmetry}")
+    assert "is not empty and no run folder" in refused("train", *STEPS, "--out", tmp_path / "thesis")
+    assert [entry.name for entry in (tmp_path / "thesis").iterdir()] == ["chapter.tex"]
+
+
+def test_a_finished_run_has_nothing_to_resume_and_no_policy_file_is_left_out(copied: Path) -> None:
+    assert esp("train", "--resume", copied).stderr == f"{copied} is complete at 150 steps\n"
+    policy = (copied / "policy.safetensors").read_bytes()
+    (copied / "policy.safetensors").unlink()  # as if killed between the last checkpoint and the policy file
+    esp("train", "--resume", copied)
+    assert (copied / "policy.safetensors").read_bytes() == policy
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_after_the_iteration_and_the_run_goes_on_to_the_same_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, finished: Path, number: signal.Signals
+) -> None:
+    update = console.TrainingProgress.update
+
+    def interrupted(self: console.TrainingProgress, done: int, metrics: dict[str, float]) -> None:
+        update(self, done, metrics)
+        if done == 50:
+            signal.raise_signal(number)
+
+    run = tmp_path / "run"
+    before = signal.getsignal(number)
+    with monkeypatch.context() as patch:
+        patch.setattr(console.TrainingProgress, "update", interrupted)
+        stopped = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", run, code=130)
+    assert signal.getsignal(number) is before
+    assert "stopping after this iteration" in stopped.stderr
+    assert stopped.stderr.endswith(f"stopped at 50 steps; go on with: esp train --resume {run}\n")
+    assert stopped.stdout == ""
+    resumed = esp("train", "--resume", run)
+    assert "resuming at 50" in resumed.stderr
+    ends = [load_checkpoint(r / "policy.safetensors", format_name="esp-policy")[0] for r in (run, finished)]
+    assert all(torch.equal(tensor, ends[1][name]) for name, tensor in ends[0].items())
+
+
+def test_a_second_interrupt_stops_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def impatient(self: console.TrainingProgress, done: int, metrics: dict[str, float]) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(console.TrainingProgress, "update", impatient)
+    stopped = esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "run", code=130)
+    assert stopped.stderr.endswith("interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--steps", "3M"], "--steps"),
+        (["--steps", "1M"], "--steps"),
+        (["--seeds", "10", "--out", "elsewhere"], "--seeds, --out"),
+        (["--task", "navigation", "--prior", "none"], "--task, --prior"),
+        (["-a", "mappo", "--preset", "paper", "--transforms", "c4"], "--algo, --preset, --transforms"),
+        (["--network", "gru", "--consistency-coef", "1"], "--consistency-coef, --network"),
+        (["--device", "cpu", "--set", "mappo.gamma=0.9"], "--device, --set"),
+    ],
+)
+def test_options_that_a_resumed_run_would_ignore_are_refused(copied: Path, options: list[str], named: str) -> None:
+    sentence = f"--resume goes on with a run just as it was; leave out {named}, or start a new run"
+    assert refused("train", "--resume", copied, *options) == sentence
+
+
+def test_tensorboard_may_be_asked_for_on_resuming(copied: Path) -> None:
+    pytest.importorskip("tensorboard")
+    (copied / "policy.safetensors").unlink()
+    esp("train", "--resume", copied, "--tensorboard")
+    assert (copied / "tensorboard").is_dir()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "nothing there",
+        "a folder without a run",
+        "truncated checkpoints",
+        "config that is no JSON",
+        "config of another program",
+        "config of a newer version",
+        "seeds that are a text",
+        "a key nobody knows",
+        "a task nobody has",
+        "an algorithm nobody has",
+        "task settings of another",
+    ],
+)
+def test_a_damaged_run_is_not_resumed(copied: Path, kind: str) -> None:
+    damage, sentence = DAMAGE[kind]
+    assert sentence in refused("train", "--resume", damage(copied))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"task": None}, "bad value None for 'config.task'"),
+        ({"network": {"hidden": [9]}}, "the checkpoint does not fit this configuration"),
+        ({"seeds": [3]}, "the checkpoint does not fit this configuration"),
+        ({"algorithm_settings": {"gamma": "low"}}, "setting 'gamma'"),
+    ],
+)
+def test_a_configuration_that_was_changed_by_hand_is_not_resumed(
+    copied: Path, changes: dict[str, Any], sentence: str
+) -> None:
+    assert sentence in refused("train", "--resume", edit_config(copied, **changes))
+
+
+def test_a_policy_file_and_damaged_metrics_are_not_resumed(copied: Path) -> None:
+    assert "is a file, not a run folder" in refused("train", "--resume", copied / "policy.safetensors")
+    metrics = copied / "metrics.jsonl"
+    metrics.write_text("sleep less\n" + metrics.read_text())
+    assert "line 1 is no row of metrics" in refused("train", "--resume", copied)
+
+
+def test_a_run_in_use_is_refused(copied: Path) -> None:
+    with RunFolder.open(copied).lock():
+        assert "is in use by process" in refused("train", "--resume", copied)
+
+
+def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    iterate = Mappo.iterate
+
+    def broken(self: Mappo, progress: float) -> dict[str, torch.Tensor]:
+        metrics = iterate(self, progress)
+        metrics["train/policy_loss"][0] = torch.nan
+        return metrics
+
+    monkeypatch.setattr(Mappo, "iterate", broken)
+    told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", tmp_path / "run")
+    assert "seed 3 stopped at step 50" in told.stderr
+    value = read_metrics(tmp_path / "run" / "metrics.jsonl")[-1]["eval/return_greedy"]
+    assert value[0] is None
+    (row,) = (line for line in told.stdout.splitlines() if " greedy " in line)
+    assert [cell.strip() for cell in row.strip("│").split("│")] == ["greedy", f"{value[1]:.2f}", "1"]
+    monkeypatch.undo()
+    report = json.loads(esp("report", tmp_path / "run", "--json", "-").stdout)["runs"][0]["returns"]["150"]
+    assert report["per_seed"] == [None, value[1]]
+    assert report["sem"] is None
+
+
+def test_a_run_whose_every_seed_stopped_ends_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    iterate = Mappo.iterate
+    monkeypatch.setattr(
+        Mappo, "iterate", lambda self, p: {**iterate(self, p), "train/value_loss": torch.full((1,), torch.inf)}
+    )
+    told = esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "run", code=2)
+    assert told.stderr.splitlines()[-1].startswith("error: every seed stopped on a number that is not finite")
+
+
+def test_two_equal_command_lines_give_equal_runs(finished: Path, tmp_path: Path) -> None:
+    again = train_tiny(tmp_path / "again", "--seeds", "3,7")
+    assert (again / "policy.safetensors").read_bytes() == (finished / "policy.safetensors").read_bytes()
+    other = train_tiny(tmp_path / "other", "--seeds", "4,7")
+    assert (other / "policy.safetensors").read_bytes() != (finished / "policy.safetensors").read_bytes()
+
+
+def test_a_moved_run_goes_on_in_its_new_place(copied: Path, tmp_path: Path) -> None:
+    shutil.move(copied, tmp_path / "moved")
+    assert "is complete" in esp("train", "--resume", tmp_path / "moved").stderr
