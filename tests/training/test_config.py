@@ -1,0 +1,116 @@
+"""The resolved configuration: which choice has the last word, what is refused, and that it survives being stored."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from esp_cli.algorithms.mappo import MappoConfig
+from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.prior import PriorConfig
+from esp_cli.training.config import EvaluationConfig, RunConfig, resolve_config
+from esp_cli.training.loading import parse_config
+
+
+def test_without_a_choice_every_default_is_the_models_own():
+    config = resolve_config("navigation")
+    assert config.algorithm_settings == MappoConfig().model_dump()
+    assert (config.network, config.prior, config.evaluation) == (NetworkConfig(), PriorConfig(), EvaluationConfig())
+    assert (config.preset, config.device, config.seeds) == ("default", "cpu", (0,))
+    assert config.task_settings["num_agents"] == 3
+
+
+def test_the_paper_preset_is_supplement_table_2():
+    config = resolve_config("navigation", preset="paper")
+    mappo, network, prior = config.algorithm_settings, config.network, config.prior
+    assert (prior.kind, prior.transforms, prior.consistency_coef) == ("esp", "rot90", 0.5)
+    assert (network.name, network.hidden, network.activation, network.layer_norm) == ("gru", (64, 64), "relu", True)
+    assert {name: mappo[name] for name in ("num_envs", "num_steps", "num_epochs", "num_minibatches")} == {
+        "num_envs": 128,
+        "num_steps": 25,
+        "num_epochs": 10,
+        "num_minibatches": 1,
+    }
+    assert (mappo["learning_rate"], mappo["gamma"], mappo["gae_lambda"]) == (7e-4, 0.99, 0.95)
+    assert (mappo["clip_epsilon"], mappo["entropy_coef"], mappo["max_grad_norm"]) == (0.2, 0.01, 10.0)
+    assert (mappo["clip_value"], mappo["anneal_learning_rate"], mappo["anneal_entropy"]) == (True, False, False)
+
+
+def test_an_override_has_the_last_word_over_a_preset_which_has_it_over_a_default():
+    config = resolve_config(
+        "navigation", preset="paper", overrides={"mappo.learning_rate": 1e-4, "network.name": "mlp"}
+    )
+    assert config.algorithm_settings["learning_rate"] == 1e-4, "not the preset's 7e-4"
+    assert config.algorithm_settings["num_envs"] == 128, "not the default's 32"
+    assert (config.network.name, config.network.layer_norm) == ("mlp", True)
+
+
+def test_overrides_may_be_text_as_on_the_command_line():
+    texts = {
+        "network.hidden": "[32, 16]",
+        "mappo.clip_value": "true",
+        "task.actions": "continuous",
+        "prior.kind": "none",
+    }
+    config = resolve_config("navigation", overrides=texts)
+    assert (config.network.hidden, config.prior.kind) == ((32, 16), "none")
+    assert config.algorithm_settings["clip_value"] is True
+    assert config.task_settings["actions"] == "continuous"
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ({"task": "chess"}, "unknown task 'chess'; the tasks are navigation, predator-prey"),
+        ({"algorithm": "magic"}, "unknown algorithm 'magic'; the algorithms are mappo"),
+        ({"preset": "best"}, "mappo has no preset 'best'; it has default, paper"),
+        (
+            {"overrides": {"speed": 1}},
+            "cannot set 'speed': a setting is SECTION.NAME with a section of task, mappo, network, prior, evaluation",
+        ),
+        ({"overrides": {"qmix.tau": 1}}, "cannot set 'qmix.tau': a setting is SECTION.NAME"),
+        ({"overrides": {"prior.force": 1}}, "unknown setting 'prior.force'; prior has kind, transforms, copies"),
+        ({"overrides": {"network.width": 1}}, "unknown setting 'network.width'; network has name, hidden, activation"),
+        (
+            {"overrides": {"evaluation.often": 1}},
+            "unknown setting 'evaluation.often'; evaluation has every_steps, episodes",
+        ),
+        ({"overrides": {"task.prey": "still"}}, "unknown setting 'task.prey'; task has convention, actions, horizon"),
+        (
+            {"overrides": {"mappo.num_envs": 0}},
+            "bad value 0 for 'mappo.num_envs': input should be greater than or equal",
+        ),
+        ({"overrides": {"mappo.gamma": float("nan")}}, "bad value nan for 'mappo.gamma': it has to be a finite number"),
+        ({"overrides": {"network.hidden": "[64, wide]"}}, "bad value '[64, wide]' for 'network.hidden'"),
+        ({"overrides": {"network.hidden": [64, "wide"]}}, "bad value 'wide' for 'network.hidden.1'"),
+        ({"steps": 0}, "bad value 0 for 'run.steps'"),
+        ({"seeds": ()}, "for 'run.seeds'"),
+        ({"device": "tpu"}, "bad value 'tpu' for 'run.device'"),
+    ],
+)
+def test_what_is_unknown_or_out_of_range_is_one_sentence(choice, sentence):
+    with pytest.raises(ValueError, match=re.escape(sentence)) as caught:
+        resolve_config(**({"task": "navigation"} | choice))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("task", "choice"),
+    [
+        ("navigation", {}),
+        ("navigation", {"preset": "paper", "seeds": (3, 7), "steps": 500_000}),
+        ("predator-prey", {"overrides": {"task.prey": "fleeing", "network.hidden": [16], "prior.transforms": "rot90"}}),
+    ],
+)
+def test_a_stored_configuration_is_read_back_as_it_was(task, choice):
+    config = resolve_config(task, **choice)
+    stored = json.loads(json.dumps(config.model_dump(mode="json"), allow_nan=False))
+    assert parse_config(stored, Path("run")) == config
+    assert isinstance(parse_config(stored, Path("run")), RunConfig)
+
+
+def test_a_configuration_cannot_be_changed_afterwards():
+    config = resolve_config("navigation")
+    with pytest.raises(ValueError, match="frozen"):
+        config.steps = 5
