@@ -100,7 +100,7 @@ class Mappo(Learner):
         prior_generators: one CPU generator per seed for the prior alone, so that it disturbs no other draw.
 
     Raises:
-        ValueError: a recurrent network whose rollouts are not whole episodes.
+        ValueError: a recurrent network whose rollouts are not whole episodes, or more minibatches than rows.
     """
 
     config_class = MappoConfig
@@ -128,6 +128,11 @@ class Mappo(Learner):
         if self.recurrent and config.num_steps % spec.horizon:
             raise ValueError(
                 f"a recurrent network needs whole episodes: set mappo.num_steps to a multiple of {spec.horizon}"
+            )
+        sequences = config.num_envs * config.num_steps // (spec.horizon if self.recurrent else 1)
+        if config.num_minibatches > sequences:
+            raise ValueError(
+                f"mappo.num_minibatches is {config.num_minibatches}, but a rollout has {sequences} rows to share"
             )
         self.actor_parameters = list(self.policy.parameters())
         self.critic_parameters = list(self.critic.parameters())
@@ -193,7 +198,7 @@ class Mappo(Learner):
             rollout.log_prob,
             per_agent,
             self.normaliser.normalise(target),
-            self.normaliser.normalise(value),
+            raw_value,
         )
         batch = Batch(*(self._as_sequences(x) for x in fields))
         return batch, {"train/explained_variance": explained_variance(value, target)}

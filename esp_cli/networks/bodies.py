@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -22,7 +22,9 @@ class NetworkConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Literal["mlp", "gru"] = "mlp"
-    hidden: tuple[int, ...] = Field((64, 64), min_length=1, description="hidden widths; MAPPO paper: two of 64")
+    hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(
+        (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
+    )
     activation: Literal["relu", "tanh"] = Field("tanh", description="of the actor; MAPPO paper: relu")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")

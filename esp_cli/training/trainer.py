@@ -228,8 +228,11 @@ class Trainer:
         if found is not None:
             tensors, meta = found
             self.learner.load_state_dict(tensors)
-            self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
-            self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
+            try:
+                self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
+                self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
+            except (KeyError, TypeError, ValueError, AttributeError):
+                raise ValueError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
         self.folder.truncate_metrics(self.step if found else -1)
 
     def _policy_meta(self) -> dict[str, Any]:

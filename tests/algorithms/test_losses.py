@@ -26,7 +26,7 @@ def flags(*values):
 
 
 def test_gae_by_hand():
-    # gamma = 0.5, lambda = 0.5: delta_0 = 1 + 0.5 * 3 - 2 = 0.5, delta_1 = 2 + 0.5 * 4 - 3 = 1, delta_2 = 3 + 0.5 * 5 - 4 = 1.5
+    # gamma = lambda = 1/2: deltas 1 + 3 / 2 - 2 = 0.5, 2 + 4 / 2 - 3 = 1, 3 + 5 / 2 - 4 = 1.5
     # A_2 = 1.5, A_1 = 1 + 0.25 * 1.5 = 1.375, A_0 = 0.5 + 0.25 * 1.375 = 0.84375
     no = flags(False, False, False)
     advantage = gae(row(1, 2, 3), row(2, 3, 4), row(3, 4, 5), no, no, 0.5, 0.5)

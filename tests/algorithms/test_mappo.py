@@ -164,6 +164,19 @@ def test_recurrent_networks_need_whole_episodes():
         learner(network__name="gru", mappo__num_steps=20)
 
 
+def test_a_rollout_has_a_row_for_every_minibatch():
+    with pytest.raises(ValueError, match="100 rows to share"):
+        learner(mappo__num_minibatches=101)
+
+
+def test_the_old_value_of_value_clipping_is_what_the_critic_said():
+    trained = learner(mappo__clip_value=True)
+    trained.iterate(0.0)
+    batch, _ = trained._prepare(trained.collector.collect(25))
+    now = trained.critic.unroll(trained._critic_input(batch.obs, batch.state))
+    torch.testing.assert_close(batch.value, now, rtol=1e-4, atol=1e-5)
+
+
 def test_a_restored_learner_goes_on_bit_for_bit():
     straight = learner()
     for _ in range(2):

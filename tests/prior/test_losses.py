@@ -91,7 +91,7 @@ def test_a_seed_draws_the_same_elements_alone_and_among_others():
 
     def drawn(*seeds):
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-        return [[g.elements for g in prior.for_minibatch(generators)][0] for _ in range(20)]
+        return [prior.for_minibatch(generators)[0].elements for _ in range(20)]
 
     together, alone = drawn(3, 4), drawn(4)
     assert [pair[1] for pair in together] == [single[0] for single in alone]

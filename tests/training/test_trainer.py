@@ -199,3 +199,12 @@ def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
     }
     assert len(meta["greedy_returns"]) == 2
     assert run.step == alone.step == 300
+
+
+def test_a_checkpoint_that_does_not_say_where_its_run_stands_is_refused_in_one_sentence(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(stop_after(2))
+    tensors, meta = folder.latest_checkpoint()
+    folder.write_checkpoint(meta["step"] + 50, tensors, {"iteration": "many"})
+    with pytest.raises(ValueError, match="does not say where its run stands"):
+        trainer(folder)
