@@ -27,6 +27,9 @@ def report(
         typer.Option("--reference", help="Draw a line at somebody else's number.", metavar="NAME=VALUE"),
     ] = None,
     mode: Annotated[Literal["greedy", "stochastic"], typer.Option("--mode", help="Which evaluations.")] = "greedy",
+    view: Annotated[
+        tuple[float, float] | None, typer.Option("--view", help="Lowest and highest return in the picture.")
+    ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")] = None,
     json: JsonOption = None,
 ) -> None:
@@ -42,7 +45,7 @@ def report(
     if json is not None:
         console.write_json(json, result)
     if plot is not None:
-        for file in comparison.plot(curves, plot, result["convention"], mode, lines):
+        for file in comparison.plot(curves, plot, result["convention"], mode, lines, view):
             console.note(f"curves -> {file}")
 
 

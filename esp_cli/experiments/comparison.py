@@ -135,9 +135,17 @@ def _summary(values: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def plot(
-    curves: Sequence[RunCurve], path: Path, convention: str, mode: Mode, references: dict[str, float]
+    curves: Sequence[RunCurve],
+    path: Path,
+    convention: str,
+    mode: Mode,
+    references: dict[str, float],
+    view: tuple[float, float] | None = None,
 ) -> tuple[Path, Path]:
-    """Draw the learning curves with 95 % bands; returns the PNG and the SVG file."""
+    """Draw the learning curves with 95 % bands; returns the PNG and the SVG file.
+
+    `view` is the lowest and the highest return shown, by default all.
+    """
     lines = [Curve(curve.label, curve.steps, curve.values) for curve in curves]
     task = curves[0].config.task
-    return learning_curves(lines, path, task, f"{mode} return ({convention})", references=references)
+    return learning_curves(lines, path, task, f"{mode} return ({convention})", references=references, ylim=view)
