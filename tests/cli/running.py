@@ -120,12 +120,12 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "an algorithm nobody has": (lambda run: edit_config(run, algorithm="magic"), "was trained by 'magic'"),
     "task settings of another": (lambda run: edit_config(run, task_settings={"wind": 1}), "no setting 'wind'"),
     "a network larger than the file": (
-        lambda run: edit_config(run, network={"hidden": [10**6, 10**6]}),
+        lambda run: edit_config(run, network={"hidden": [4096] * 16}),
         "the weights do not fit the configuration",
     ),
     "a network of negative size": (
         lambda run: edit_config(run, network={"hidden": [-8]}),
-        "the weights do not fit the configuration",
+        "bad value -8",
     ),
     "another number of seeds": (lambda run: edit_config(run, seeds=[3]), "the weights do not fit the configuration"),
     "an empty policy file": (lambda run: _rewrite(run / "policy.safetensors", b""), "is no safetensors file"),

@@ -83,10 +83,7 @@ def test_a_policy_file_with_a_wrong_description_is_refused(folder, changes, sent
         {"network": {"hidden": [7]}},
         {"network": {"hidden": [8, 8]}},
         {"network": {"name": "gru", "hidden": [8]}},
-        {"network": {"hidden": [2**40, 2**40]}},
-        {"network": {"hidden": [200_000] * 5}},
-        {"network": {"hidden": [0]}},
-        {"network": {"hidden": [-8]}},
+        {"network": {"hidden": [4096] * 16}},
         {"seeds": [3]},
         {"seeds": list(range(1000))},
         {"task_settings": {"num_agents": 2}},
@@ -96,6 +93,14 @@ def test_a_policy_file_with_a_wrong_description_is_refused(folder, changes, sent
 def test_weights_of_another_shape_are_refused(folder, changes):
     config = tiny_config(steps=100, seeds=(3, 7)).model_dump(mode="json") | changes
     with pytest.raises(ValueError, match="the weights do not fit the configuration") as caught:
+        load_policy(edited_policy(folder, config=config))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("hidden", [[2**40, 2**40], [200_000] * 5, [0], [-8], [8] * 17, []])
+def test_networks_of_impossible_size_are_refused_before_they_are_built(folder, hidden):
+    config = tiny_config(steps=100, seeds=(3, 7)).model_dump(mode="json") | {"network": {"hidden": hidden}}
+    with pytest.raises(ValueError, match=r"network\.hidden") as caught:
         load_policy(edited_policy(folder, config=config))
     assert "\n" not in str(caught.value)
 
