@@ -190,8 +190,9 @@ class RunFolder:
                     holder = _holder(os.pread(descriptor, 4096, 0))
                     raise RunFolderError(f"{self.path} is in use by {holder}; wait for it, or stop it first") from None
                 owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-                os.ftruncate(descriptor, 0)
+                # In this order, so that whoever is refused meanwhile finds a name and not an empty file.
                 os.pwrite(descriptor, owner.encode(), 0)
+                os.ftruncate(descriptor, len(owner.encode()))
                 self._remove_half_written()
             yield
         finally:

@@ -129,13 +129,17 @@ def _start(folder):
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment, text=True)
 
 
+def _newest(folder):
+    """The step of the newest checkpoint, 0 before the first."""
+    return max((int(file.name[5:17]) for file in (folder / "checkpoints").glob("step-*")), default=0)
+
+
 def _wait_for_steps(folder, steps, process):
     """Wait until a process has written a checkpoint past `steps`."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
-        files = sorted((folder / "checkpoints").glob("step-*"))
-        if files and int(files[-1].name[5:17]) > steps:
-            return int(files[-1].name[5:17])
+        if _newest(folder) > steps:
+            return
         assert process.poll() is None, f"it ended too early: {process.stderr.read()}"
         time.sleep(0.01)
     raise AssertionError("no checkpoint within a minute")
@@ -144,10 +148,10 @@ def _wait_for_steps(folder, steps, process):
 def test_a_killed_process_is_resumed_bit_for_bit_and_a_second_one_is_refused(tmp_path):
     steps = 20_000
     straight, killed = tiny_folder(tmp_path / "a", steps=steps), tiny_folder(tmp_path / "b", steps=steps)
-    reached = 0
     for _ in range(2):
+        reached = _newest(killed.path)
         process = _start(killed.path)
-        reached = _wait_for_steps(killed.path, reached, process)
+        _wait_for_steps(killed.path, reached, process)
         second = subprocess.run(
             [sys.executable, "-c", ESP, "train", "--resume", str(killed.path)],
             capture_output=True,
