@@ -159,7 +159,7 @@ THIN = 16
 
 
 # A single column is computed as two: for one seed and one column torch would take a matrix-vector routine, which rounds
-# differently, and a seed would no longer learn bit for bit the same alone and among others.
+# otherwise than the batched product that several seeds take.
 
 
 def _affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ class PriorConfig(BaseModel):
     copies: Literal["draw", "all"] = Field(
         "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"
     )
-    consistency_coef: float = Field(0.5, ge=0, description="c of Eq. 10; paper: 0.5")
+    consistency_coef: float = Field(0.1, ge=0, description="c of Eq. 10; paper: 0.5")
     old_log_prob: Literal["copy", "recompute"] = Field(
         "copy", description="pi_old of a copied transition: that of the original, or evaluated anew on the copy (Eq. 7)"
     )

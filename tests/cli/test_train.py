@@ -70,7 +70,7 @@ def test_without_out_a_run_gets_a_folder_of_its_own(tmp_path: Path, monkeypatch:
 def test_what_is_printed_where(tmp_path: Path) -> None:
     run = tmp_path / "run"
     told = esp("train", *TINY_OPTIONS, *STEPS, "--out", run)
-    assert "training: mappo on navigation, prior esp (d4, c = 0.5), 1 seed(s), 150 steps each" in told.stderr
+    assert "training: mappo on navigation, prior esp (d4, c = 0.1), 1 seed(s), 150 steps each" in told.stderr
     assert "100%  150/150" in told.stderr
     assert f"next: esp eval {run}    esp render {run} -o out.gif" in told.stderr
     last = read_metrics(run / "metrics.jsonl")[-1]

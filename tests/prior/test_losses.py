@@ -55,9 +55,9 @@ def test_stop_gradient_holds_the_side_that_it_names(stop, moves):
 @pytest.mark.parametrize(
     ("kind", "augments", "coefficient", "active"),
     [
-        ("esp", True, 0.5, True),
+        ("esp", True, 0.1, True),
         ("augment", True, 0, True),
-        ("consistency", False, 0.5, True),
+        ("consistency", False, 0.1, True),
         ("none", False, 0, False),
     ],
 )
