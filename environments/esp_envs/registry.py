@@ -12,6 +12,7 @@ from esp_envs.base import Environment, generators_for
 _TASKS = {
     "navigation": "esp_envs.mpe.navigation:Navigation",
     "predator-prey": "esp_envs.mpe.predator_prey:PredatorPrey",
+    "formation": "esp_envs.epuck.formation:Formation",
 }
 
 

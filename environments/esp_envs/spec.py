@@ -174,6 +174,7 @@ class TaskSpec:
         symmetry: name of the largest planar group under which the *dynamics and reward* are invariant ("d4", "o2").
         shared_reward: whether all agents get the same reward, so that one value per world suffices.
         control_period_s: simulated seconds of one step, for rendering in real time.
+        totals: names of the metrics that add up over an episode; the others are averaged over its steps.
     """
 
     name: str
@@ -187,6 +188,7 @@ class TaskSpec:
     symmetry: str
     shared_reward: bool = True
     control_period_s: float = 0.1
+    totals: tuple[str, ...] = ()
     settings: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

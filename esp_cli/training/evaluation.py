@@ -80,7 +80,7 @@ class Episodes:
     Attributes:
         returns: [S, E] mean over agents of the sum of rewards over time.
         lengths: [S, E] steps.
-        metrics: task measures, each [S, E], averaged over the episode's steps.
+        metrics: task measures, each [S, E], averaged over the episode's steps or added up, as the spec says.
     """
 
     returns: Tensor
@@ -105,4 +105,5 @@ def play(env: Environment, controller: Controller) -> Episodes:
             sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
         running &= ~(step.terminated | step.truncated)
         observation = step.next
-    return Episodes(returns, lengths, {name: value / lengths for name, value in sums.items()})
+    means = {name: value if name in env.spec.totals else value / lengths for name, value in sums.items()}
+    return Episodes(returns, lengths, means)

@@ -1,0 +1,464 @@
+"""Formation change: N e-pucks on a square swap places with their antipodes without bumping into anything."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import Field as Setting
+from pydantic import model_validator
+from torch import Tensor
+
+from esp_envs.base import (
+    Body,
+    Environment,
+    Observation,
+    Scene,
+    Step,
+    TaskSettings,
+    generator_states,
+    restore_generators,
+)
+from esp_envs.epuck import steering
+from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.physics import Bodies, make_physics
+from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED
+from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, TaskSpec, layout
+
+WHEELS = Continuous(layout(Field("wheels", Kind.WHEELS, 1, "share of full speed")))
+"""Left and right wheel speed in [-1, 1], times 6.28 rad/s."""
+_LEVELS = tuple(round(-1 + 0.2 * k, 1) for k in range(11))
+WHEEL_PAIRS = Discrete(
+    Kind.WHEELS,
+    tuple((left, right) for left in _LEVELS for right in _LEVELS),
+    tuple(f"{left:g}/{right:g}" for left in _LEVELS for right in _LEVELS),
+)
+"""Each wheel in steps of 0.2: 121 pairs."""
+PENALTY_RADIUS_M = {"paper": 0.5, "tight": 0.15}
+RISKY_GAP_M = 0.05
+"""Gap between two robots below which a state is risky (supplement of the paper)."""
+CONTACT_GAP_M = 0.001
+"""Gap below which two bodies count as touching."""
+_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
+_PILLAR_COLOR = "#707070"
+
+
+class FormationSettings(TaskSettings):
+    """What a user may change of `formation`."""
+
+    convention: Literal["paper", "tight"] = Setting(
+        "paper", description="how near is too near: within 0.5 m, as the paper prints it, or 0.15 m, for robots"
+    )
+    actions: Literal["continuous", "discrete"] = Setting(
+        "continuous", description="two wheel speeds, or 121 pairs of them in steps of 0.2 (for QMIX)"
+    )
+    physics: Literal["mujoco", "mujoco-3d", "pymunk"] = Setting(
+        "mujoco", description="planar MuJoCo, MuJoCo with wheels and casters, or pymunk"
+    )
+    num_agents: int = Setting(8, ge=1, le=16, description="N, robots")
+    num_obstacles: int = Setting(2, ge=0, le=8, description="M, pillars on a ring around the middle")
+    obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
+    arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
+    horizon: int = Setting(300, ge=1, description="control steps of an episode")
+    control_period_s: float = Setting(0.1, gt=0, le=1, description="time of a control step, s; a multiple of 0.01")
+    neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
+    progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
+    collision_penalty: float = Setting(0.35, ge=0, description="c_collision, reward lost in a step with a body too near")
+    penalty_radius_m: float | None = Setting(
+        None, gt=0, description="C, distance of centres, m; 0.5 by default, 0.15 in the convention tight"
+    )
+    penalty_counts: Literal["any", "each"] = Setting(
+        "any", description="the penalty counts once a step, or once for each body that is too near"
+    )
+    arrival_radius_m: float = Setting(0.05, gt=0, description="r_arrival, distance at which a robot has arrived, m")
+    start_noise_m: float = Setting(0.01, ge=0, le=0.01, description="posts are missed by up to this along x and y, m")
+    sensor_noise_m: float = Setting(0.0, ge=0, description="standard deviation of each seen coordinate, m")
+    heading_noise_rad: float = Setting(0.0, ge=0, description="standard deviation of the seen heading, rad")
+    action_delay: int = Setting(0, ge=0, le=20, description="control steps until a chosen action acts")
+    wheel_mismatch: float = Setting(
+        0.0, ge=0, le=0.5, description="standard deviation of each wheel's own factor on its speed, drawn per episode"
+    )
+    mass_spread: float = Setting(0.0, ge=0, lt=1, description="masses are drawn from 1 - spread to 1 + spread e-pucks")
+    friction_spread: float = Setting(0.0, ge=0, lt=1, description="likewise the grip of the wheels")
+
+    @property
+    def radius(self) -> float:
+        """C with its default filled in, m."""
+        return self.penalty_radius_m or PENALTY_RADIUS_M[self.convention]
+
+    @property
+    def seen_robots(self) -> int:
+        """Robots that an observation shows."""
+        return min(self.neighbours, self.num_agents - 1)
+
+    @property
+    def arena(self) -> Arena:
+        """The arena that these settings describe."""
+        return Arena(self.arena_m, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
+
+    @model_validator(mode="after")
+    def _fits(self) -> FormationSettings:
+        _ = self.arena
+        return self
+
+
+class Formation(Environment):
+    """Formation change of e-pucks: every robot drives to the antipode of its post, past the others and past pillars.
+
+    N robots (discs of radius 0.037 m, 0.16 kg, at most 0.1256 m/s) stand around the edge of a walled square, eight on
+    its corners and edge midpoints. All of them want to cross the middle at once. A control step is 0.1 s.
+
+    Actions:
+        continuous: `wheels`, left and right wheel speed in [-1, 1] times 6.28 rad/s; beyond that they are clipped.
+        discrete: each wheel in steps of 0.2, 121 pairs; the left wheel is the slow index.
+
+    Observation of one robot, 3 + (nearest robots) planar vectors in the world frame, positions relative to its own
+    (no `obstacle` without pillars, no `robots` for a single robot):
+
+        | index | field    | meaning                                     | unit      |
+        |-------|----------|---------------------------------------------|-----------|
+        | 0..1  | heading  | cosine and sine of the own heading          | direction |
+        | 2..3  | obstacle | the nearest pillar's centre minus own       | m         |
+        | 4..5  | goal     | own goal minus own position                 | m         |
+        | 6..7  | robots   | the nearest robots' centres minus own       | m         |
+
+    State: headings, positions, velocities, turning rates and goals of all robots, positions of the pillars.
+
+    Reward of robot i, with p its position and d the distance of centres:
+        r_i = progress_weight (|p_before - goal| - |p - goal|) - collision_penalty [some body has d < C];
+        convention `paper`: C = 0.5 m, convention `tight`: C = 0.15 m. With `penalty_counts` = each the penalty is paid
+        for every body nearer than C. The return of an episode is the mean over robots of the sum over time.
+
+    Start: posts missed by up to `start_noise_m` along x and y, headings uniform, everything at rest.
+
+    Terminated: never. Truncated: after `horizon` = 300 steps; bootstrap there.
+
+    Metrics, per episode: `arrival_rate` share of robots that were within `arrival_radius_m` of their goal at some time;
+        `time_to_arrival_s` until then, the whole episode for a robot that never was; `collisions` how often two bodies
+        came to touch (robots with robots or pillars); `risky_rate` share of states in which two robots have a gap below
+        5 cm; `path_length_m` of a robot; `final_distance_m` between a robot and its goal at the end.
+
+    Heuristics: `avoid` (default) drives to the goal, gives way to near bodies and passes them on the right; `straight`
+        turns to the goal and drives.
+
+    Symmetry: quarter turns and mirrors (`d4`). A rotation turns headings and vectors and leaves wheels alone, a mirror
+        swaps the wheels. Pillars and goals stand in the state and turn along.
+
+    Versions: 1, the first.
+    """
+
+    Settings: ClassVar[type[TaskSettings]] = FormationSettings
+    heuristics: ClassVar[tuple[str, ...]] = ("avoid", "straight")
+    settings: FormationSettings
+
+    def __init__(self, settings: FormationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        self.arena = settings.arena
+        self.spec = _spec(settings)
+        self.num_worlds = self.num_seeds * num_envs
+        self.physics = make_physics(
+            settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
+        )
+        robots = (self.num_worlds, settings.num_agents)
+        lead = (self.num_seeds, num_envs, settings.num_agents)
+        self._action_shape = lead if settings.actions == "discrete" else (*lead, 2)
+        self._pairs = torch.tensor(WHEEL_PAIRS.points, dtype=torch.float64)
+        self._time = 0
+        self._goals = torch.zeros(*robots, 2, dtype=torch.float64)
+        self._pillars = torch.zeros(self.num_worlds, settings.num_obstacles, 2, dtype=torch.float64)
+        self._mass = self._friction = torch.ones(robots, dtype=torch.float64)
+        self._wheel_factor = torch.ones(*robots, 2, dtype=torch.float64)
+        self._pending = torch.zeros(settings.action_delay, *robots, 2, dtype=torch.float64)
+        self._arrived = torch.zeros(robots, dtype=torch.bool)
+        others = settings.num_agents + settings.num_obstacles
+        self._own = torch.eye(settings.num_agents, others, dtype=torch.bool)
+        radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
+        self._reach = torch.tensor(radii, dtype=torch.float64) + BODY_RADIUS_M
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        settings = self.settings
+        posts = torch.from_numpy(self.arena.posts())
+        draws = [self._draw_episode(generator) for generator in self.generators]
+        noise, heading, factor, mass, friction = (torch.cat(parts) for parts in zip(*draws, strict=True))
+        self._goals[:] = -posts
+        self._pillars[:] = torch.from_numpy(self.arena.pillars())
+        self._wheel_factor = 1 + settings.wheel_mismatch * factor
+        self._mass = 1 + settings.mass_spread * mass
+        self._friction = 1 + settings.friction_spread * friction
+        pose = torch.cat([posts + settings.start_noise_m * noise, math.pi * heading.unsqueeze(-1)], -1)
+        return self._begin(pose, torch.zeros_like(pose))
+
+    def _draw_episode(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """Draw all random numbers of the starts of one seed: uniform in [-1, 1], wheel factors normal."""
+        robots = (self.num_envs, self.settings.num_agents)
+
+        def uniform(*shape: int) -> Tensor:
+            return torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device).cpu() * 2 - 1
+
+        start, heading = uniform(2), uniform()
+        factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu()
+        return start, heading, factor, uniform(), uniform()
+
+    def _begin(self, pose: Tensor, velocity: Tensor) -> Observation:
+        """Start the episode from these bodies."""
+        self._time = 0
+        self._pending.zero_()
+        parts = (pose, velocity, self._pillars, self._mass, self._friction)
+        self.physics.place(Bodies(*(part.numpy() for part in parts)))
+        self._arrived.zero_()
+        self._look()
+        self._touching = self._touches()
+        return self._observe()
+
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one control step.
+
+        Raises:
+            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, 2] (continuous).
+        """
+        if tuple(action.shape) != self._action_shape:
+            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {self._action_shape}")
+        before, distance_before = self._position, self._distance
+        self.physics.advance(self._wheel_speeds(action).numpy())
+        self._time += 1
+        self._look()
+        ended = self._time == self.spec.horizon
+        reward = self._reward(distance_before)
+        metrics = self._measure((self._position - before).norm(dim=-1), ended)
+        following, final = self._observe(), None
+        if ended:
+            final, following = following, self.reset()
+        shape = (self.num_seeds, self.num_envs)
+        return Step(
+            next=following,
+            reward=self._per_world(reward),
+            terminated=torch.zeros(shape, dtype=torch.bool, device=self.device),
+            truncated=torch.full(shape, ended, dtype=torch.bool, device=self.device),
+            final=final,
+            metrics={name: self._per_world(value) for name, value in metrics.items()},
+        )
+
+    def _wheel_speeds(self, action: Tensor) -> Tensor:
+        """Return what the wheels really do [W, N, 2], rad/s."""
+        if self.settings.actions == "discrete":
+            chosen = self._pairs[action.cpu().reshape(self.num_worlds, -1)]
+        else:
+            chosen = action.double().cpu().reshape(self.num_worlds, -1, 2).clamp(-1, 1)
+        if self.settings.action_delay:
+            waiting = torch.cat([self._pending, chosen.unsqueeze(0)])
+            chosen, self._pending = waiting[0], waiting[1:]
+        return chosen * self._wheel_factor * MAX_WHEEL_SPEED
+
+    def _look(self) -> None:
+        """Measure where everything is: distances to goals, ways and distances between bodies."""
+        pose = torch.from_numpy(self.physics.pose)
+        self._position, self._heading = pose[..., :2].contiguous(), pose[..., 2]
+        self._to_goal = self._goals - self._position
+        self._distance = self._to_goal.norm(dim=-1)
+        bodies = torch.cat([self._position, self._pillars], 1)
+        self._ways = bodies.unsqueeze(1) - self._position.unsqueeze(2)
+        self._apart = self._ways.square().sum(-1).sqrt_().masked_fill_(self._own, torch.inf)
+
+    def _touches(self) -> Tensor:
+        """Return which bodies touch each robot: [W, N, N + M]."""
+        return self._apart < self._reach + CONTACT_GAP_M
+
+    def _reward(self, distance_before: Tensor) -> Tensor:
+        """Return g_i + c_i: [W, N]."""
+        near = self._apart < self.settings.radius
+        count = near.any(-1).double() if self.settings.penalty_counts == "any" else near.sum(-1).double()
+        progress = distance_before - self._distance
+        return self.settings.progress_weight * progress - self.settings.collision_penalty * count
+
+    def _measure(self, way: Tensor, ended: bool) -> dict[str, Tensor]:
+        """Return the metrics of the step just made, each [W].
+
+        Args:
+            way: [W, N] length of every robot's way in this step, m.
+            ended: whether this was the last step.
+        """
+        robots = self.settings.num_agents
+        here = self._distance < self.settings.arrival_radius_m
+        new, self._arrived = here & ~self._arrived, here | self._arrived
+        touching = self._touches()
+        begun = touching & ~self._touching
+        self._touching = touching
+        risky = self._apart[..., :robots] < RISKY_GAP_M + 2 * BODY_RADIUS_M
+        return {
+            "arrival_rate": new.double().mean(-1),
+            "time_to_arrival_s": (~self._arrived).double().mean(-1) * self.settings.control_period_s,
+            "collisions": begun[..., :robots].sum((1, 2)) / 2 + begun[..., robots:].sum((1, 2)),
+            "risky_rate": risky.any(-1).any(-1).double(),
+            "path_length_m": way.mean(-1),
+            "final_distance_m": self._distance.mean(-1) * ended,
+        }
+
+    def _observe(self) -> Observation:
+        """Return what the robots see, and the global state."""
+        heading = self._heading
+        parts = [heading.cos(), heading.sin()]
+        robots = self.settings.num_agents
+        seen: list[Tensor] = []
+        if self.settings.num_obstacles:
+            seen.append(self._nearest(slice(robots, None), 1))
+        seen.append(self._to_goal)
+        if self.settings.seen_robots:
+            seen.append(self._nearest(slice(robots), self.settings.seen_robots))
+        vectors = torch.cat(seen, -1)
+        if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
+            vectors, parts = self._disturbed(vectors)
+        obs = torch.cat([torch.stack(parts, -1), vectors], -1)
+        velocity = torch.from_numpy(self.physics.velocity)
+        direction = torch.stack([heading.cos(), heading.sin()], -1)
+        rows = (direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
+        state = torch.cat([part.flatten(1) for part in rows], 1)
+        return Observation(self._per_world(obs), self._per_world(state))
+
+    def _nearest(self, bodies: slice, count: int) -> Tensor:
+        """Return the ways [W, N, count * 2] to the nearest of some bodies, nearest first."""
+        apart, ways = self._apart[..., bodies], self._ways[:, :, bodies]
+        if count == 1:
+            index = apart.argmin(-1, keepdim=True)
+        else:
+            index = apart.argsort(dim=-1, stable=True)[..., :count]
+        return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2)).flatten(2)
+
+    def _disturbed(self, vectors: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the seen vectors and the cosine and sine of the seen heading, with noise."""
+        shape = (self.num_envs, self.settings.num_agents, vectors.shape[-1] + 1)
+        draws = [torch.randn(shape, generator=g, dtype=torch.float64, device=self.device).cpu() for g in self.generators]
+        noise = torch.cat(draws)
+        heading = self._heading + self.settings.heading_noise_rad * noise[..., 0]
+        return vectors + self.settings.sensor_noise_m * noise[..., 1:], [heading.cos(), heading.sin()]
+
+    def _per_world(self, values: Tensor) -> Tensor:
+        """Return float32 [S, E, ...] on the task's device from [W, ...]."""
+        shaped = values.float().view(self.num_seeds, self.num_envs, *values.shape[1:])
+        return shaped.contiguous().to(self.device)
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state at the start of an episode, with nominal masses, grip and wheels."""
+        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
+        if tuple(state.shape) != expected:
+            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
+        rows = state.double().cpu().reshape(self.num_worlds, -1)
+        where = self.spec.state.slices()
+
+        def items(name: str) -> Tensor:
+            return rows[:, where[name]].unflatten(1, (-1, 2))
+
+        heading = items("heading")
+        pose = torch.cat([items("position"), torch.atan2(heading[..., 1], heading[..., 0]).unsqueeze(-1)], -1)
+        velocity = torch.cat([items("velocity"), rows[:, where["spin"]].unsqueeze(-1)], -1)
+        self._goals = items("goals").clone()
+        if self.settings.num_obstacles:
+            self._pillars = items("obstacles").clone()
+        self._mass = self._friction = torch.ones_like(self._mass)
+        self._wheel_factor = torch.ones_like(self._wheel_factor)
+        return self._begin(pose, velocity)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return physics, clock, memory of the metrics, what this episode drew, and generators."""
+        own = {name: getattr(self, f"_{name}").clone() for name in _REMEMBERED}
+        physics = {f"physics.{name}": torch.from_numpy(array) for name, array in self.physics.state_dict().items()}
+        return own | physics | {"time": torch.tensor(self._time), "generators": generator_states(self.generators)}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: the tensors belong to an environment of another size or another physics.
+        """
+        physics = {k.removeprefix("physics."): v.numpy() for k, v in tensors.items() if k.startswith("physics.")}
+        own = self.state_dict()
+        if {k: v.shape for k, v in tensors.items()} != {k: v.shape for k, v in own.items()}:
+            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+        for name in _REMEMBERED:
+            setattr(self, f"_{name}", tensors[name].clone())
+        self.physics.load_state_dict(physics)
+        self._time = int(tensors["time"])
+        restore_generators(self.generators, tensors["generators"])
+        self._look()
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of `avoid` (default) or `straight`.
+
+        Raises:
+            ValueError: no such heuristic.
+        """
+        name = name or self.heuristics[0]
+        if name not in self.heuristics:
+            raise ValueError(f"formation has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        wish = self._to_goal
+        if name == "avoid":
+            wish = steering.give_way(wish, self._ways, self._apart - self._reach)
+        wheels = steering.towards(wish, self._heading, self.settings.control_period_s)
+        lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
+        if self.settings.actions == "discrete":
+            level = ((wheels + 1) * 5).round().long()
+            return (level[..., 0] * len(_LEVELS) + level[..., 1]).view(lead).to(self.device)
+        return wheels.float().view(*lead, 2).to(self.device)
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return goals, pillars and robots of one world (seed index, world index)."""
+        w = world[0] * self.num_envs + world[1]
+        bodies = []
+        for i, goal in enumerate(self._goals[w].tolist()):
+            bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal"))
+        for pillar in self._pillars[w].tolist():
+            bodies.append(Body(tuple(pillar), self.settings.obstacle_radius_m, _PILLAR_COLOR, model="pillar"))
+        poses = zip(self._position[w].tolist(), self._heading[w].tolist(), strict=True)
+        for i, (position, heading) in enumerate(poses):
+            color = _COLORS[i % len(_COLORS)]
+            bodies.append(Body(tuple(position), BODY_RADIUS_M, color, "disc", heading, trail=True, model="robot"))
+        half = self.arena.side_m / 2
+        return Scene(tuple(bodies), (-half, half, -half, half))
+
+
+_REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
+
+
+def _spec(settings: FormationSettings) -> TaskSpec:
+    """Return the spec that follows from the settings."""
+    robots, pillars = settings.num_agents, settings.num_obstacles
+    state = [
+        Field("heading", Kind.VECTOR, robots, "direction", Items.AGENTS),
+        Field("position", Kind.VECTOR, robots, "m", Items.AGENTS),
+        Field("velocity", Kind.VECTOR, robots, "m/s", Items.AGENTS),
+        Field("spin", Kind.PSEUDOSCALAR, robots, "rad/s", Items.AGENTS),
+        Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS),
+    ]
+    if pillars:
+        state.append(Field("obstacles", Kind.VECTOR, pillars, "m"))
+    counts = "once" if settings.penalty_counts == "any" else "each"
+    penalty = f"{settings.collision_penalty:g} {counts} a step within {settings.radius:g} m"
+    return TaskSpec(
+        name="formation",
+        version=1,
+        convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}",
+        num_agents=robots,
+        horizon=settings.horizon,
+        observation=_observation_layout(settings),
+        state=Layout(tuple(state)),
+        action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
+        symmetry="d4",
+        shared_reward=False,
+        control_period_s=settings.control_period_s,
+        totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
+        settings=settings.model_dump() | {"penalty_radius_m": settings.radius},
+    )
+
+
+def _observation_layout(settings: FormationSettings) -> Layout:
+    fields = [Field("heading", Kind.VECTOR, 1, "direction")]
+    if settings.num_obstacles:
+        fields.append(Field("obstacle", Kind.VECTOR, 1, "m"))
+    fields.append(Field("goal", Kind.VECTOR, 1, "m"))
+    if settings.seen_robots:
+        # Sorted by distance, so that no permutation of the robots moves them.
+        fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, "m"))
+    return layout(*fields)

@@ -1,0 +1,117 @@
+"""What a physics engine is to the tasks: robots are placed, driven by wheel speeds, and read back.
+
+Adding an engine is one module and one line in `_ENGINES`; it is imported when a task asks for it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+
+from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.robot import Array
+
+_ENGINES = {
+    "mujoco": "esp_envs.epuck.mujoco_planar:MujocoPlanar",
+    "mujoco-3d": "esp_envs.epuck.mujoco_spatial:MujocoSpatial",
+    "pymunk": "esp_envs.epuck.pymunk_planar:PymunkPlanar",
+}
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Where everything is at the start of an episode, and what the robots are made of.
+
+    Shape:
+        pose [W, N, 3]: x, y (m) and heading (rad, counter-clockwise from the x axis).
+        velocity [W, N, 3]: of x, y (m/s) and heading (rad/s).
+        pillars [W, M, 2]: x, y (m).
+        mass, friction [W, N]: multiples of a robot's own; 1 is the e-puck.
+    """
+
+    pose: Array
+    velocity: Array
+    pillars: Array
+    mass: Array
+    friction: Array
+
+
+class Physics(ABC):
+    """W worlds of N robots and M pillars in one arena, in float64 on the CPU.
+
+    Args:
+        arena: walls, and the number and size of everything.
+        num_worlds: W.
+        control_period_s: simulated time of one `advance`.
+        num_threads: threads to step with, where the engine can.
+    """
+
+    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
+        self.arena, self.num_worlds = arena, num_worlds
+        self.control_period_s, self.num_threads = control_period_s, num_threads
+
+    @abstractmethod
+    def place(self, bodies: Bodies) -> None:
+        """Put every world into this state; what follows depends on nothing before."""
+
+    @abstractmethod
+    def advance(self, wheels: Array) -> None:
+        """Drive for one control period.
+
+        Args:
+            wheels: [W, N, 2] left and right wheel speed, rad/s.
+        """
+
+    @property
+    @abstractmethod
+    def pose(self) -> Array:
+        """[W, N, 3] x, y and heading, as memory of its own."""
+
+    @property
+    @abstractmethod
+    def velocity(self) -> Array:
+        """[W, N, 3] of x, y and heading, as memory of its own."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Array]:
+        """Return copies of all that `load_state_dict` needs to go on bit for bit."""
+
+    @abstractmethod
+    def load_state_dict(self, arrays: dict[str, Array]) -> None:
+        """Restore what `state_dict` of an engine of the same size returned."""
+
+
+def engine_names() -> tuple[str, ...]:
+    """Return the registered names."""
+    return tuple(_ENGINES)
+
+
+def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int = 1) -> Physics:
+    """Make W worlds in the engine `name`.
+
+    Raises:
+        ValueError: no such engine, or its library is not installed.
+    """
+    if name not in _ENGINES:
+        raise ValueError(f"unknown physics '{name}'; there are {', '.join(_ENGINES)}")
+    module, attribute = _ENGINES[name].split(":")
+    try:
+        engine: type[Physics] = getattr(import_module(module), attribute)
+    except ImportError as error:
+        raise ValueError(f"the physics '{name}' needs the package {error.name}; pip install {error.name}") from None
+    return engine(arena, num_worlds, control_period_s, num_threads)
+
+
+def num_substeps(control_period_s: float, timestep_s: float) -> int:
+    """Return how many time steps make up a control period.
+
+    Raises:
+        ValueError: the period is no multiple of the time step.
+    """
+    count = round(control_period_s / timestep_s)
+    if count < 1 or not np.isclose(count * timestep_s, control_period_s, rtol=1e-9):
+        raise ValueError(f"a control period of {control_period_s:g} s is no multiple of {timestep_s:g} s; use one")
+    return count
