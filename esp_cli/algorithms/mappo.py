@@ -26,12 +26,12 @@ from esp_cli.algorithms.losses import (
 )
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Collector, Rollout
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.critic import Critic, CriticInput
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment, Observation
-from esp_envs.spec import TaskSpec
 
 
 class MappoConfig(BaseModel):
@@ -57,8 +57,9 @@ class MappoConfig(BaseModel):
     anneal_entropy: bool = Field(True, description="linearly to 0 over the run")
     bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
     value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
-    critic_input: Literal["state", "observations"] = Field(
-        "observations", description="the task's global state, or all agents' observations in a row"
+    critic_input: CriticInput = Field(
+        "observations",
+        description="the task's global state, all agents' observations in a row, or each agent's own observation",
     )
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
@@ -119,10 +120,9 @@ class Mappo(Learner):
         self.generators = {"learner": list(generators), "prior": list(prior_generators)}
         self.prior = SymmetryPrior(prior, spec, device)
         self.policy = Policy(spec, network, generators).to(device)
-        self.num_values = 1 if spec.shared_reward else spec.num_agents
         critic_network = network.model_copy(update={"activation": config.critic_activation})
-        critic_width = _critic_width(spec, config)
-        self.critic = build_network(generators, critic_width, self.num_values, critic_network, 1.0).to(device)
+        self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)
+        self.num_values = self.critic.num_values
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
         self.recurrent = self.policy.actor.memory_width > 0
         if self.recurrent and config.num_steps % spec.horizon:
@@ -142,7 +142,7 @@ class Mappo(Learner):
         self.modules = {"policy": self.policy, "critic": self.critic, "normaliser": self.normaliser}
         self.optimisers = {"adam": self.optimiser}
         self.collector = Collector(env, self.policy, self.generators["learner"])
-        self._old: tuple[Policy, torch.nn.Module] | None = None
+        self._old: tuple[Policy, Critic] | None = None
 
     @property
     def steps_per_iteration(self) -> int:
@@ -210,26 +210,25 @@ class Mappo(Learner):
 
     def _values(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
         """Return V(s_t) and V of what really followed, each [S, E, T, C], in normalised units."""
-        x = self._critic_input(rollout.obs, rollout.state)
         if self.recurrent:
-            finals = torch.stack([self._critic_rows(rollout.finals[t]) for t in sorted(rollout.finals)], 2)
-            episodes = torch.cat([x.unflatten(2, (-1, self.spec.horizon)), finals.unsqueeze(3)], 3).flatten(1, 2)
-            values = self.critic.unroll(episodes).unflatten(1, (x.shape[1], -1))
+            finals = [rollout.finals[t] for t in sorted(rollout.finals)]
+            obs = self._episodes(rollout.obs, [final.obs for final in finals])
+            state = self._episodes(rollout.state, [final.state for final in finals])
+            values = self.critic.unroll(obs, state).unflatten(1, (rollout.obs.shape[1], -1))
             return values[:, :, :, :-1].flatten(2, 3), values[:, :, :, 1:].flatten(2, 3)
-        value = self.critic.unroll(x)
+        value = self.critic.unroll(rollout.obs, rollout.state)
         next_value = torch.cat([value[:, :, 1:], self._value_of(rollout.last).unsqueeze(2)], 2)
         for t, final in rollout.finals.items():
             next_value[:, :, t] = self._value_of(final)
         return value, next_value
 
+    def _episodes(self, rows: Tensor, finals: list[Tensor]) -> Tensor:
+        """Cut [S, E, T, ...] into whole episodes, each with its final row behind it: [S, E * k, horizon + 1, ...]."""
+        episodes = rows.unflatten(2, (-1, self.spec.horizon))
+        return torch.cat([episodes, torch.stack(finals, 2).unsqueeze(3)], 3).flatten(1, 2)
+
     def _value_of(self, observation: Observation) -> Tensor:
-        return self.critic.unroll(self._critic_rows(observation).unsqueeze(2)).squeeze(2)
-
-    def _critic_rows(self, observation: Observation) -> Tensor:
-        return self._critic_input(observation.obs, observation.state)
-
-    def _critic_input(self, obs: Tensor, state: Tensor) -> Tensor:
-        return state if self.config.critic_input == "state" else obs.flatten(-2)
+        return self.critic.unroll(observation.obs.unsqueeze(2), observation.state.unsqueeze(2)).squeeze(2)
 
     def _remember_old_networks(self) -> None:
         """Keep the behaviour policy and the critic of the rollout where something is evaluated anew under them."""
@@ -276,7 +275,7 @@ class Mappo(Learner):
         count = chunk.obs.shape[1]
         rows = self._with_copies(chunk, transforms)
         outputs = self.policy.unroll(rows.obs, config.truncation)
-        values = self.critic.unroll(self._critic_input(rows.obs, rows.state), config.truncation)
+        values = self.critic.unroll(rows.obs, rows.state, config.truncation)
 
         used = rows if prior.augments else chunk
         learned = outputs, values
@@ -330,7 +329,7 @@ class Mappo(Learner):
                 if self.prior.config.old_log_prob == "recompute":
                     log_prob = old_policy.head.log_prob(old_policy.unroll(obs), action)
                 if self.config.clip_value:
-                    value = old_critic.unroll(self._critic_input(obs, state))  # type: ignore[operator]
+                    value = old_critic.unroll(obs, state)
         return Batch(obs, state, action, log_prob, advantage, target, value)
 
     @torch.no_grad()
@@ -341,7 +340,7 @@ class Mappo(Learner):
             return {}
         originals = batch.chunks(max(1, PROBE_STEPS // batch.obs.shape[2]))[0]
         rows = Batch.concatenate([originals, *(self._transformed(originals, g) for g in probe)])
-        outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(self._critic_input(rows.obs, rows.state))
+        outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(rows.obs, rows.state)
         count = originals.obs.shape[1]
         base = outputs[:, :count], values[:, :count]
         policy_gap, value_gap = self._consistency(base, outputs[:, count:], values[:, count:], probe)
@@ -359,10 +358,6 @@ class Mappo(Learner):
             policy_gaps.append(_mean(policy_consistency_loss(head.divergence, pulled_back, originals[0], stop)))
             value_gaps.append(_mean(value_consistency_loss(g.values(copied_values), originals[1], stop)))
         return torch.stack(policy_gaps).mean(0), torch.stack(value_gaps).mean(0)
-
-
-def _critic_width(spec: TaskSpec, config: MappoConfig) -> int:
-    return spec.state.width if config.critic_input == "state" else spec.num_agents * spec.observation.width
 
 
 def _grad(parameter: torch.nn.Parameter) -> Tensor:

@@ -169,7 +169,7 @@ def test_the_old_value_of_value_clipping_is_what_the_critic_said():
     trained = learner(mappo__clip_value=True)
     trained.iterate(0.0)
     batch, _ = trained._prepare(trained.collector.collect(25))
-    now = trained.critic.unroll(trained._critic_input(batch.obs, batch.state))
+    now = trained.critic.unroll(batch.obs, batch.state)
     torch.testing.assert_close(batch.value, now, rtol=1e-4, atol=1e-5)
 
 

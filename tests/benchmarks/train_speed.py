@@ -48,7 +48,7 @@ def flops_per_step(learner: Mappo) -> float:
     """Count the operations of actor and critic per environment step of one seed."""
     config, agents = learner.config, learner.spec.num_agents
     work = 0.0
-    for network, rows in ((learner.policy.actor, agents), (learner.critic, 1)):
+    for network, rows in ((learner.policy.actor, agents), (learner.critic.network, 1)):
         shapes = [layer.weight.shape[1:] for layer in network.layers]  # type: ignore[union-attr]
         products = [2.0 * shape[0] * shape[1] * rows for shape in shapes]
         backward = 2 * sum(products) - products[0]

@@ -88,7 +88,7 @@ def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path)
         if broken.iteration == 2:
             good.append(broken.learner.policy.actor.layers[0].weight[1].detach().clone())
             with torch.no_grad():
-                broken.learner.critic.layers[0].weight[1, 0, 0] = torch.nan
+                broken.learner.critic.network.layers[0].weight[1, 0, 0] = torch.nan
         return iterate(progress)
 
     broken.learner.iterate = break_seed_one_in_the_third_iteration

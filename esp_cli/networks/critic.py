@@ -1,0 +1,49 @@
+"""A value function: one network for the whole team, or one shared by its agents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_envs.spec import TaskSpec
+
+CriticInput = Literal["state", "observations", "own"]
+
+
+class Critic(nn.Module):
+    """S critics of one shape.
+
+    It reads the global "state" or all agents' "observations" in a row and returns one value for a shared reward, else one
+    per agent; or it reads each agent's "own" observation and returns that agent's value, with weights that all share.
+
+    Args:
+        spec: the task.
+        reads: see above.
+        network: shape.
+        generators: one CPU generator per seed, for the initial weights.
+    """
+
+    def __init__(
+        self, spec: TaskSpec, reads: CriticInput, network: NetworkConfig, generators: Sequence[torch.Generator]
+    ) -> None:
+        super().__init__()
+        self.reads = reads
+        own = reads == "own"
+        self.num_values = 1 if spec.shared_reward and not own else spec.num_agents
+        observed = spec.observation.width
+        width = {"state": spec.state.width, "observations": spec.num_agents * observed, "own": observed}[reads]
+        self.network = build_network(generators, width, 1 if own else self.num_values, network, 1.0)
+
+    def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
+        """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
+        if self.reads == "state":
+            return self.network.unroll(state, truncation)
+        if self.reads == "observations":
+            return self.network.unroll(obs.flatten(-2), truncation)
+        rows = obs.transpose(2, 3).flatten(1, 2)
+        values = self.network.unroll(rows, truncation).unflatten(1, (obs.shape[1], obs.shape[3]))
+        return values.squeeze(-1).transpose(2, 3)
