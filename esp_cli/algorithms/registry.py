@@ -9,3 +9,6 @@ ALGORITHMS: dict[str, type[Mappo]] = {"mappo": Mappo}
 
 PRESETS = {"mappo": mappo.PRESETS}
 """Per algorithm and preset: the settings, by section, that differ from the defaults."""
+
+TUNED = {"mappo": mappo.TUNED}
+"""Per algorithm and task: the settings, by section, that the preset `default` changes there."""

@@ -88,6 +88,22 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
     return settings
 
 
+def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dict[str, object]:
+    """Read settings of the task alone, written as "task.name=value", and the shorthand `--physics`.
+
+    ["task.sensor_noise_m=0.005"], "pymunk" -> {"sensor_noise_m": 0.005, "physics": "pymunk"}.
+
+    Raises:
+        ValueError: as `parse_assignments`, or a setting that is not the task's.
+    """
+    settings = parse_assignments(items)
+    for name in settings:
+        if not name.startswith("task."):
+            raise ValueError(f"--set {name} changes no setting of the task; a trained policy takes only task.NAME=VALUE")
+    own = {name.removeprefix("task."): value for name, value in settings.items()}
+    return own if physics is None else {**own, "physics": physics}
+
+
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     """Wrap a parser so that its message reaches the user beside the option it belongs to."""
 
@@ -145,6 +161,16 @@ SetOption = Annotated[
     typer.Option(
         "--set", help="Change one setting, as mappo.learning_rate=5e-4; may be repeated.", metavar="NAME=VALUE"
     ),
+]
+TaskSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", help="Change one setting of the task, as task.sensor_noise_m=0.005; repeatable.", metavar="NAME=VALUE"
+    ),
+]
+PhysicsOption = Annotated[
+    str | None,
+    typer.Option("--physics", help="Short for --set task.physics=NAME: mujoco, mujoco-3d, pymunk.", metavar="NAME"),
 ]
 TransformsOption = Annotated[
     str | None,

@@ -17,6 +17,7 @@ from esp_cli import console
 from esp_cli.commands.options import (
     AlgoOption,
     DeviceOption,
+    PhysicsOption,
     SeedsOption,
     SetOption,
     StepsOption,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp train --algo mappo --task navigation\n
     esp train --task navigation --prior none --seeds 10 --steps 3M --out runs/cn-mappo\n
+    esp train --task formation --physics pymunk --set task.num_obstacles=0\n
     esp train --resume runs/cn-mappo"""
 
 DEFAULT_STEPS = 1_000_000
@@ -53,6 +55,7 @@ def train(
     consistency_coef: Annotated[
         float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
     ] = None,
+    physics: PhysicsOption = None,
     network: Annotated[Literal["mlp", "gru"] | None, typer.Option("--network", help="Shape of the networks.")] = None,
     steps: StepsOption = DEFAULT_STEPS,
     seeds: SeedsOption = (0,),
@@ -80,6 +83,7 @@ def train(
             "prior.transforms": transforms,
             "prior.consistency_coef": consistency_coef,
             "network.name": network,
+            "task.physics": physics,
         }
         given = {name: value for name, value in chosen.items() if value is not None}
         overrides = {**given, **parse_assignments(settings or [])}

@@ -19,6 +19,7 @@ from esp_cli.training.evaluation import (
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
+from esp_envs.registry import task_class
 
 MAX_WORLDS = 4096
 """Worlds played at once, over all seeds; more episodes are played one batch after the other."""
@@ -29,26 +30,35 @@ def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
 
     Returns:
         A JSON-able dict: task, task_version, convention, episodes, greedy and stochastic (each mean, sem, ci95 over
-        seeds, per_seed), anchors (random and heuristic, one number each), metrics (of the greedy policy).
+        seeds, per_seed), anchors (random, heuristic, and the task's other heuristics by name; one number each), heuristics
+        (their names, the one called "heuristic" first), metrics (of the greedy policy) and metrics_per_seed,
+        anchor_metrics (the same of each anchor), task_settings.
     """
     seeds = trained.config.seeds
     greedy = _play(trained, PolicyController(trained.policy), "greedy", episodes)
     drawn = PolicyController(trained.policy, generators(seeds, "judgement", "noise"))
     stochastic = _play(trained, drawn, "stochastic", episodes)
-    random = _play(trained, RandomController(), "random", episodes)
-    heuristic = _play(trained, HeuristicController(), "heuristic", episodes)
+    names = task_class(trained.config.task).heuristics
+    anchors = {"random": _play(trained, RandomController(), "random", episodes)}
+    for index, name in enumerate(names):
+        key = "heuristic" if index == 0 else name
+        anchors[key] = _play(trained, HeuristicController(name), "heuristic", episodes)
     return {
         "task": trained.config.task,
         "task_version": trained.spec.version,
         "convention": trained.spec.convention,
+        "task_settings": trained.config.task_settings,
         "source": str(trained.source),
         "step": trained.step,
         "seeds": list(seeds),
         "episodes": episodes,
         "greedy": summary(greedy.returns),
         "stochastic": summary(stochastic.returns),
-        "anchors": {"random": float(random.returns.mean()), "heuristic": float(heuristic.returns.mean())},
-        "metrics": {name: float(value.mean()) for name, value in greedy.metrics.items()},
+        "anchors": {name: float(played.returns.mean()) for name, played in anchors.items()},
+        "heuristics": list(names),
+        "metrics": _means(greedy),
+        "metrics_per_seed": {name: value.mean(1).tolist() for name, value in greedy.metrics.items()},
+        "anchor_metrics": {name: _means(played) for name, played in anchors.items()},
     }
 
 
@@ -58,6 +68,10 @@ def summary(returns: Tensor) -> dict[str, Any]:
     mean, sem = mean_and_sem(per_seed)
     interval = bootstrap_interval(per_seed)
     return {"mean": mean, "sem": sem, "ci95": interval, "per_seed": per_seed.tolist()}
+
+
+def _means(episodes: Episodes) -> dict[str, float]:
+    return {name: float(value.mean()) for name, value in episodes.metrics.items()}
 
 
 def _play(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from esp_cli.algorithms.registry import ALGORITHMS, PRESETS
+from esp_cli.algorithms.registry import ALGORITHMS, PRESETS, TUNED
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class
@@ -56,7 +56,7 @@ def resolve_config(
     Args:
         task: registered task name.
         algorithm: registered algorithm name.
-        preset: one of the algorithm's presets.
+        preset: one of the algorithm's presets; "default" takes what measured best on the task, where that is known.
         steps: environment steps per seed.
         seeds: run seeds.
         device: "cpu" or "cuda".
@@ -72,8 +72,10 @@ def resolve_config(
         raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(PRESETS[algorithm])}")
     names = {"task": "task", algorithm: algorithm, "network": "network", "prior": "prior", "evaluation": "evaluation"}
     sections: dict[str, dict[str, object]] = {name: {} for name in names}
-    for section, values in PRESETS[algorithm][preset].items():
-        sections[section].update(values)
+    tuned = TUNED.get(algorithm, {}).get(task, {}) if preset == "default" else {}
+    for layer in (PRESETS[algorithm][preset], tuned):
+        for section, values in layer.items():
+            sections[section].update(values)
     for dotted, value in (overrides or {}).items():
         section, dot, key = dotted.partition(".")
         if not dot or section not in sections:
@@ -82,7 +84,7 @@ def resolve_config(
         if isinstance(read, float) and not math.isfinite(read):
             raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
 
-    task_settings = _validated(task_class(task).Settings, sections["task"], "task")
+    task_settings = resolve_task_settings(task, sections["task"])
     algorithm_settings = _validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
     values = {
         "task": task,
@@ -90,7 +92,7 @@ def resolve_config(
         "preset": preset,
         "steps": steps,
         "seeds": tuple(seeds),
-        "task_settings": task_settings.model_dump(),
+        "task_settings": task_settings,
         "algorithm_settings": algorithm_settings.model_dump(),
         "network": _validated(NetworkConfig, sections["network"], "network"),
         "prior": _validated(PriorConfig, sections["prior"], "prior"),
@@ -98,6 +100,15 @@ def resolve_config(
         "device": device,
     }
     return _validated(RunConfig, values, "run")
+
+
+def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str, Any]:
+    """Fill in the defaults of a task's settings.
+
+    Raises:
+        ValueError: an unknown task or setting, or a value out of range, in one sentence.
+    """
+    return _validated(task_class(task).Settings, settings, "task").model_dump()
 
 
 def _read(value: object) -> object:

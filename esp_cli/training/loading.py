@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
-from esp_cli.training.config import RunConfig, one_sentence
+from esp_cli.training.config import RunConfig, one_sentence, resolve_task_settings
 from esp_cli.training.run_folder import POLICY_FORMAT, CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
@@ -78,6 +78,31 @@ def load_policy(path: Path) -> TrainedPolicy:
     own = {name.removeprefix("policy."): t for name, t in tensors.items() if name.startswith("policy.")}
     notes = tuple(str(warning.message) for warning in caught)
     return _build(path, parse_config(folder.config, path), own, meta, notes)
+
+
+def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:
+    """Return the policy for its task under other settings: another physics, more noise, another reward.
+
+    Args:
+        trained: the policy as it was trained.
+        settings: task settings that differ from those of its training.
+
+    Raises:
+        ValueError: an unknown setting, or one under which the policy does not see or do the same things.
+    """
+    if not settings:
+        return trained
+    changed = resolve_task_settings(trained.config.task, {**trained.config.task_settings, **settings})
+    config = trained.config.model_copy(update={"task_settings": changed})
+    spec = build_environment(config, 1, "shape").spec
+    for part in ("num_agents", "observation", "action"):
+        if getattr(spec, part) != getattr(trained.spec, part):
+            names = ", ".join(f"task.{name}" for name in settings)
+            raise ValueError(
+                f"{trained.source} was trained with other {part.replace('num_', '')} than the task has with {names} "
+                "changed; change only what a policy neither sees nor does"
+            )
+    return replace(trained, config=config, spec=spec)
 
 
 def _build(

@@ -12,7 +12,7 @@ import torch
 from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
-BESIDE = {"source", "step", "seeds"}
+BESIDE = {"source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
 
 
 def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, 
     assert set(result) == DOCUMENTED | BESIDE
     assert (result["task"], result["task_version"], result["episodes"]) == ("navigation", 1, 4)
     assert (result["source"], result["step"], result["seeds"]) == (str(finished), 150, [3, 7])
-    assert set(result["anchors"]) == {"random", "heuristic"}
+    assert set(result["anchors"]) == {"random", "heuristic", "cover"}
     assert set(result["metrics"]) == {"collisions", "landmark_distance", "coverage"}
     for mode in ("greedy", "stochastic"):
         verdict = result[mode]
@@ -95,3 +95,32 @@ def test_a_policy_of_a_gpu_plays_on_the_cpu_where_there_is_none(copied: Path, mo
 )
 def test_a_bad_option_is_told_in_one_sentence(finished: Path, options: list[str], sentence: str) -> None:
     assert sentence in refused("eval", finished, *options)
+
+
+def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> None:
+    trained = json.loads(esp("eval", finished, "--episodes", 2, "--json", "-").stdout)
+    again = json.loads(
+        esp("eval", finished, "--episodes", 2, "--set", "task.landmark_extent=1.0", "--json", "-").stdout
+    )
+    assert trained["task_settings"]["landmark_extent"] is None
+    assert again["task_settings"]["landmark_extent"] == 1.0
+    assert again["greedy"]["mean"] != trained["greedy"]["mean"]
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("task.num_agents=2", "was trained with other agents than the task has with task.num_agents changed"),
+        ("task.num_landmarks=2", "was trained with other observation than the task has"),
+        ("task.actions=continuous", "was trained with other action than the task has"),
+        ("task.wind=2", "unknown setting 'task.wind'"),
+        ("task.horizon=0", "bad value 0 for 'task.horizon'"),
+        ("mappo.gamma=0.9", "changes no setting of the task"),
+    ],
+)
+def test_settings_that_a_policy_cannot_take_are_refused(finished: Path, setting: str, sentence: str) -> None:
+    assert sentence in refused("eval", finished, "--episodes", 2, "--set", setting)
+
+
+def test_physics_is_refused_where_a_task_has_none(finished: Path) -> None:
+    assert "unknown setting 'task.physics'" in refused("eval", finished, "--physics", "pymunk")

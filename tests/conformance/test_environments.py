@@ -31,7 +31,22 @@ SETTINGS: dict[str, list[dict[str, object]]] = {
         {"prey": "still", "convention": "pettingzoo", "num_predators": 1},
         {"control": "prey"},
     ],
+    "formation": [
+        {"horizon": 8},
+        {"horizon": 6, "actions": "discrete", "physics": "pymunk", "num_obstacles": 0, "num_agents": 3, "neighbours": 2},
+        {"horizon": 5, "physics": "mujoco-3d", "num_agents": 4, "sight": "nearness", "convention": "tight"},
+        {"horizon": 7, "num_agents": 5, "action_delay": 2, "mass_spread": 0.3, "friction_spread": 0.5},
+        {"horizon": 6, "num_agents": 2, "sensor_noise_m": 0.01, "heading_noise_rad": 0.1, "wheel_mismatch": 0.05},
+    ],
 }
+ROUNDING = {"formation": 1e-5}
+"""Tasks whose physics is finer than the float32 of the states they hand out, and how far one step carries that."""
+
+
+def hides_state(settings: Mapping[str, object]) -> bool:
+    """Whether a task has noise of its own, or wheels and tilts that its planar state leaves out."""
+    own = ("noise", "spread", "mismatch", "delay")
+    return settings.get("physics") == "mujoco-3d" or any(word in name for name in settings for word in own)
 
 
 @dataclass(frozen=True)
@@ -70,6 +85,11 @@ def same_step(a: Step, b: Step, where: tuple[object, ...] = ()) -> bool:
     if a.final is not None and b.final is not None:
         pairs += [(a.final.obs, b.final.obs), (a.final.state, b.final.state)]
     return all(torch.equal(x[where], y[where]) for x, y in pairs)
+
+
+def nearly_same(a: list[Tensor], b: list[Tensor], bound: float) -> bool:
+    """Whether tensors agree within `bound`; bit for bit where it is 0."""
+    return all(bool(((x.float() - y.float()).abs() <= bound).all()) for x, y in zip(a, b, strict=True))
 
 
 def tensors_of(step: Step) -> list[Tensor]:
@@ -243,16 +263,18 @@ def test_an_environment_of_another_size_is_refused(case: Case) -> None:
 
 @cases
 def test_set_state_reproduces_what_follows(case: Case) -> None:
+    if hides_state(case.settings):
+        pytest.skip("the state does not say everything")
     env, other = case.make(), case.make(seeds=(50, 60))
     observation = env.reset()
     for t in range(min(6, env.spec.horizon - 1)):
-        assert same_observation(other.set_state(observation.state), observation)
+        again = other.set_state(observation.state)
+        assert nearly_same([again.obs, again.state], [observation.obs, observation.state], ROUNDING.get(case.task, 0))
         if hasattr(env, "prey_moves"):
             other.prey_moves[0] = env.prey_moves[t]
         action = env.random_action()
-        step = env.step(action)
-        copy = other.step(action)
-        assert same_step(step, copy)
+        step, copy = env.step(action), other.step(action)
+        assert nearly_same(tensors_of(copy), tensors_of(step), ROUNDING.get(case.task, 0))
         observation = step.next
 
 
@@ -305,6 +327,8 @@ def permute_observations(obs: Tensor, layout: Layout, order: list[int]) -> Tenso
 @cases
 def test_agents_of_a_team_are_interchangeable(case: Case) -> None:
     """Permuting the agents permutes everything that the layouts mark as counting over agents."""
+    if case.settings.get("sensor_noise_m"):
+        pytest.skip("each sensor has noise of its own")
     env, other = case.make(), case.make()
     spec = env.spec
     observation = env.reset()
@@ -313,8 +337,8 @@ def test_agents_of_a_team_are_interchangeable(case: Case) -> None:
         env.set_state(observation.state)
         seen = other.set_state(permute(observation.state, spec.state, list(order)))
         expected = permute_observations(observation.obs, spec.observation, list(order))
-        assert torch.equal(seen.obs, expected)
-        assert not torch.equal(seen.obs, observation.obs), "an order that changes nothing checks nothing"
+        assert nearly_same([seen.obs], [expected], ROUNDING.get(case.task, 0))
+        assert not nearly_same([seen.obs], [observation.obs], 0.01), "an order that changes nothing checks nothing"
         action = env.heuristic()
         a, b = env.step(action), other.step(action[:, :, list(order)])
         torch.testing.assert_close(b.reward, a.reward[..., list(order)])

@@ -41,7 +41,13 @@ def test_a_verdict_states_what_was_judged_and_is_json(tmp_path):
     assert (result["task"], result["task_version"], result["convention"]) == ("navigation", 1, trained.spec.convention)
     assert (result["source"], result["step"], result["seeds"], result["episodes"]) == (str(tmp_path), 0, [3, 7], 3)
     assert result["greedy"]["per_seed"] != result["stochastic"]["per_seed"]
-    assert json.loads(json.dumps(result, allow_nan=False))["anchors"].keys() == {"random", "heuristic"}
+    assert json.loads(json.dumps(result, allow_nan=False))["anchors"].keys() == {"random", "heuristic", "cover"}
+    assert result["heuristics"] == ["greedy", "cover"]
+    assert result["anchor_metrics"].keys() == result["anchors"].keys()
+    assert all(metrics.keys() == result["metrics"].keys() for metrics in result["anchor_metrics"].values())
+    for name, values in result["metrics_per_seed"].items():
+        assert sum(values) / len(values) == pytest.approx(result["metrics"][name])
+    assert result["task_settings"]["num_agents"] == 3
     assert judge(trained, 3) == result, "the same every time"
 
 

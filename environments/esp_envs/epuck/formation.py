@@ -38,10 +38,13 @@ WHEEL_PAIRS = Discrete(
 )
 """Each wheel in steps of 0.2: 121 pairs."""
 PENALTY_RADIUS_M = {"paper": 0.5, "tight": 0.15}
+SIGHT: dict[str, Literal["offset", "nearness"]] = {"paper": "offset", "tight": "nearness"}
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
 CONTACT_GAP_M = 0.001
 """Gap below which two bodies count as touching."""
+FADING_M = 0.2
+"""Gap over which the sight `nearness` of a body fades to 1/e."""
 _COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _PILLAR_COLOR = "#707070"
 
@@ -64,6 +67,11 @@ class FormationSettings(TaskSettings):
     arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
     horizon: int = Setting(300, ge=1, description="control steps of an episode")
     control_period_s: float = Setting(0.1, gt=0, le=1, description="time of a control step, s; a multiple of 0.01")
+    sight: Literal["offset", "nearness"] | None = Setting(
+        None,
+        description="bodies are seen by their `offset` in m (by default in the convention paper), or by a direction that "
+        "fades with the gap, `nearness` (in the convention tight)",
+    )
     neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
     progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
     collision_penalty: float = Setting(0.35, ge=0, description="c_collision, reward lost in a step with a body too near")
@@ -88,6 +96,11 @@ class FormationSettings(TaskSettings):
     def radius(self) -> float:
         """C with its default filled in, m."""
         return self.penalty_radius_m or PENALTY_RADIUS_M[self.convention]
+
+    @property
+    def seen_as(self) -> Literal["offset", "nearness"]:
+        """How bodies are seen, with its default filled in."""
+        return self.sight or SIGHT[self.convention]
 
     @property
     def seen_robots(self) -> int:
@@ -125,7 +138,11 @@ class Formation(Environment):
         | 4..5  | goal     | own goal minus own position                 | m         |
         | 6..7  | robots   | the nearest robots' centres minus own       | m         |
 
-    State: headings, positions, velocities, turning rates and goals of all robots, positions of the pillars.
+    In the convention `tight`, `obstacle` and `robots` are seen as nearness instead: a vector in the direction of the
+    body, of length exp(-gap / 0.2 m). The setting `sight` chooses either in both conventions.
+
+    State: headings, positions, velocities, turning rates and goals of all robots, positions of the pillars. It says
+        everything but what the robots' own differences and delays hide, and in `mujoco-3d` the wheels and tilts.
 
     Reward of robot i, with p its position and d the distance of centres:
         r_i = progress_weight (|p_before - goal| - |p - goal|) - collision_penalty [some body has d < C];
@@ -167,8 +184,9 @@ class Formation(Environment):
         self._action_shape = lead if settings.actions == "discrete" else (*lead, 2)
         self._pairs = torch.tensor(WHEEL_PAIRS.points, dtype=torch.float64)
         self._time = 0
-        self._goals = torch.zeros(*robots, 2, dtype=torch.float64)
-        self._pillars = torch.zeros(self.num_worlds, settings.num_obstacles, 2, dtype=torch.float64)
+        posts = torch.from_numpy(self.arena.posts()).expand(*robots, 2)
+        self._goals = -posts
+        self._pillars = torch.from_numpy(self.arena.pillars()).repeat(self.num_worlds, 1, 1)
         self._mass = self._friction = torch.ones(robots, dtype=torch.float64)
         self._wheel_factor = torch.ones(*robots, 2, dtype=torch.float64)
         self._pending = torch.zeros(settings.action_delay, *robots, 2, dtype=torch.float64)
@@ -177,6 +195,8 @@ class Formation(Environment):
         self._own = torch.eye(settings.num_agents, others, dtype=torch.bool)
         radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
         self._reach = torch.tensor(radii, dtype=torch.float64) + BODY_RADIUS_M
+        pose = torch.cat([posts, torch.zeros(*robots, 1, dtype=torch.float64)], -1)
+        self._begin(pose, torch.zeros_like(pose))
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
@@ -184,8 +204,8 @@ class Formation(Environment):
         posts = torch.from_numpy(self.arena.posts())
         draws = [self._draw_episode(generator) for generator in self.generators]
         noise, heading, factor, mass, friction = (torch.cat(parts) for parts in zip(*draws, strict=True))
-        self._goals[:] = -posts
-        self._pillars[:] = torch.from_numpy(self.arena.pillars())
+        self._goals = (-posts).repeat(self.num_worlds, 1, 1)
+        self._pillars = torch.from_numpy(self.arena.pillars()).repeat(self.num_worlds, 1, 1)
         self._wheel_factor = 1 + settings.wheel_mismatch * factor
         self._mass = 1 + settings.mass_spread * mass
         self._friction = 1 + settings.friction_spread * friction
@@ -299,41 +319,47 @@ class Formation(Environment):
 
     def _observe(self) -> Observation:
         """Return what the robots see, and the global state."""
-        heading = self._heading
-        parts = [heading.cos(), heading.sin()]
-        robots = self.settings.num_agents
-        seen: list[Tensor] = []
-        if self.settings.num_obstacles:
-            seen.append(self._nearest(slice(robots, None), 1))
-        seen.append(self._to_goal)
+        robots, pillars = self.settings.num_agents, self.settings.num_obstacles
+        heading, offsets = self._heading, [self._to_goal.unsqueeze(2)]
+        if pillars:
+            offsets.append(self._nearest(slice(robots, None), 1))
         if self.settings.seen_robots:
-            seen.append(self._nearest(slice(robots), self.settings.seen_robots))
-        vectors = torch.cat(seen, -1)
+            offsets.append(self._nearest(slice(robots), self.settings.seen_robots))
+        seen = torch.cat(offsets, 2)
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
-            vectors, parts = self._disturbed(vectors)
-        obs = torch.cat([torch.stack(parts, -1), vectors], -1)
-        velocity = torch.from_numpy(self.physics.velocity)
+            heading, seen = self._disturbed(heading, seen)
+        direction = torch.stack([heading.cos(), heading.sin()], -1)
+        goal, pillar, others = seen.split([1, min(pillars, 1), self.settings.seen_robots], 2)
+        if self.settings.seen_as == "nearness":
+            pillar = nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
+            others = nearness(others, 2 * BODY_RADIUS_M)
+        obs = torch.cat([direction, pillar.flatten(2), goal.flatten(2), others.flatten(2)], -1)
+        return Observation(self._per_world(obs), self._per_world(self._state()))
+
+    def _state(self) -> Tensor:
+        """Return the global state [W, state width]."""
+        heading, velocity = self._heading, torch.from_numpy(self.physics.velocity)
         direction = torch.stack([heading.cos(), heading.sin()], -1)
         rows = (direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
-        state = torch.cat([part.flatten(1) for part in rows], 1)
-        return Observation(self._per_world(obs), self._per_world(state))
+        return torch.cat([part.flatten(1) for part in rows], 1)
 
     def _nearest(self, bodies: slice, count: int) -> Tensor:
-        """Return the ways [W, N, count * 2] to the nearest of some bodies, nearest first."""
+        """Return the offsets [W, N, count, 2] of the nearest of some bodies, nearest first."""
         apart, ways = self._apart[..., bodies], self._ways[:, :, bodies]
         if count == 1:
             index = apart.argmin(-1, keepdim=True)
         else:
             index = apart.argsort(dim=-1, stable=True)[..., :count]
-        return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2)).flatten(2)
+        return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
 
-    def _disturbed(self, vectors: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the seen vectors and the cosine and sine of the seen heading, with noise."""
-        shape = (self.num_envs, self.settings.num_agents, vectors.shape[-1] + 1)
+    def _disturbed(self, heading: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
+        lead = (self.num_envs, self.settings.num_agents)
+        shape = (*lead, 1 + 2 * seen.shape[2])
         draws = [torch.randn(shape, generator=g, dtype=torch.float64, device=self.device).cpu() for g in self.generators]
         noise = torch.cat(draws)
-        heading = self._heading + self.settings.heading_noise_rad * noise[..., 0]
-        return vectors + self.settings.sensor_noise_m * noise[..., 1:], [heading.cos(), heading.sin()]
+        offsets = noise[..., 1:].unflatten(-1, (-1, 2)) * self.settings.sensor_noise_m
+        return heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
 
     def _per_world(self, values: Tensor) -> Tensor:
         """Return float32 [S, E, ...] on the task's device from [W, ...]."""
@@ -419,6 +445,17 @@ class Formation(Environment):
         return Scene(tuple(bodies), (-half, half, -half, half))
 
 
+def nearness(offset: Tensor, reach_m: float) -> Tensor:
+    """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
+
+    Args:
+        offset: [..., 2] between the centres, m.
+        reach_m: distance of the centres where the bodies touch.
+    """
+    distance = offset.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    return offset / distance * torch.exp(-(distance - reach_m).clamp(min=0) / FADING_M)
+
+
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
@@ -449,16 +486,17 @@ def _spec(settings: FormationSettings) -> TaskSpec:
         shared_reward=False,
         control_period_s=settings.control_period_s,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
-        settings=settings.model_dump() | {"penalty_radius_m": settings.radius},
+        settings=settings.model_dump() | {"penalty_radius_m": settings.radius, "sight": settings.seen_as},
     )
 
 
 def _observation_layout(settings: FormationSettings) -> Layout:
+    unit = "m" if settings.seen_as == "offset" else "nearness"
     fields = [Field("heading", Kind.VECTOR, 1, "direction")]
     if settings.num_obstacles:
-        fields.append(Field("obstacle", Kind.VECTOR, 1, "m"))
+        fields.append(Field("obstacle", Kind.VECTOR, 1, unit))
     fields.append(Field("goal", Kind.VECTOR, 1, "m"))
     if settings.seen_robots:
         # Sorted by distance, so that no permutation of the robots moves them.
-        fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, "m"))
+        fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, unit))
     return layout(*fields)

@@ -101,7 +101,8 @@ def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: flo
     try:
         engine: type[Physics] = getattr(import_module(module), attribute)
     except ImportError as error:
-        raise ValueError(f"the physics '{name}' needs the package {error.name}; pip install {error.name}") from None
+        package = (error.name or "").partition(".")[0]
+        raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
     return engine(arena, num_worlds, control_period_s, num_threads)
 
 
