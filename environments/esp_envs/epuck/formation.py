@@ -196,7 +196,7 @@ class Formation(Environment):
         radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
         self._reach = torch.tensor(radii, dtype=torch.float64) + BODY_RADIUS_M
         pose = torch.cat([posts, torch.zeros(*robots, 1, dtype=torch.float64)], -1)
-        self._begin(pose, torch.zeros_like(pose))
+        self._place(pose, torch.zeros_like(pose))
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
@@ -210,7 +210,8 @@ class Formation(Environment):
         self._mass = 1 + settings.mass_spread * mass
         self._friction = 1 + settings.friction_spread * friction
         pose = torch.cat([posts + settings.start_noise_m * noise, math.pi * heading.unsqueeze(-1)], -1)
-        return self._begin(pose, torch.zeros_like(pose))
+        self._place(pose, torch.zeros_like(pose))
+        return self._observe()
 
     def _draw_episode(self, generator: torch.Generator) -> tuple[Tensor, ...]:
         """Draw all random numbers of the starts of one seed: uniform in [-1, 1], wheel factors normal."""
@@ -223,8 +224,8 @@ class Formation(Environment):
         factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu()
         return start, heading, factor, uniform(), uniform()
 
-    def _begin(self, pose: Tensor, velocity: Tensor) -> Observation:
-        """Start the episode from these bodies."""
+    def _place(self, pose: Tensor, velocity: Tensor) -> None:
+        """Begin an episode with the robots here."""
         self._time = 0
         self._pending.zero_()
         parts = (pose, velocity, self._pillars, self._mass, self._friction)
@@ -232,7 +233,6 @@ class Formation(Environment):
         self._arrived.zero_()
         self._look()
         self._touching = self._touches()
-        return self._observe()
 
     def step(self, action: Tensor) -> Step:
         """Advance every world by one control step.
@@ -385,7 +385,8 @@ class Formation(Environment):
             self._pillars = items("obstacles").clone()
         self._mass = self._friction = torch.ones_like(self._mass)
         self._wheel_factor = torch.ones_like(self._wheel_factor)
-        return self._begin(pose, velocity)
+        self._place(pose, velocity)
+        return self._observe()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock, memory of the metrics, what this episode drew, and generators."""
