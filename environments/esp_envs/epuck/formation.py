@@ -37,6 +37,8 @@ WHEEL_PAIRS = Discrete(
     tuple(f"{left:g}/{right:g}" for left in _LEVELS for right in _LEVELS),
 )
 """Each wheel in steps of 0.2: 121 pairs."""
+PENALTY = {"paper": 0.35, "tight": 1.0}
+"""A step at full speed towards the goal is worth 1.256: in `tight`, pushing through the others hardly pays."""
 PENALTY_RADIUS_M = {"paper": 0.5, "tight": 0.15}
 SIGHT: dict[str, Literal["offset", "nearness"]] = {"paper": "offset", "tight": "nearness"}
 RISKY_GAP_M = 0.05
@@ -53,7 +55,7 @@ class FormationSettings(TaskSettings):
     """What a user may change of `formation`."""
 
     convention: Literal["paper", "tight"] = Setting(
-        "paper", description="how near is too near: within 0.5 m, as the paper prints it, or 0.15 m, for robots"
+        "paper", description="what being near costs: as the paper prints it, or so that giving way pays, for robots"
     )
     actions: Literal["continuous", "discrete"] = Setting(
         "continuous", description="two wheel speeds, or 121 pairs of them in steps of 0.2 (for QMIX)"
@@ -74,7 +76,9 @@ class FormationSettings(TaskSettings):
     )
     neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
     progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
-    collision_penalty: float = Setting(0.35, ge=0, description="c_collision, reward lost in a step with a body too near")
+    collision_penalty: float | None = Setting(
+        None, ge=0, description="c_collision, reward lost in a step with a body too near; 0.35 by default, 1 in tight"
+    )
     penalty_radius_m: float | None = Setting(
         None, gt=0, description="C, distance of centres, m; 0.5 by default, 0.15 in the convention tight"
     )
@@ -91,6 +95,11 @@ class FormationSettings(TaskSettings):
     )
     mass_spread: float = Setting(0.0, ge=0, lt=1, description="masses are drawn from 1 - spread to 1 + spread e-pucks")
     friction_spread: float = Setting(0.0, ge=0, lt=1, description="likewise the grip of the wheels")
+
+    @property
+    def penalty(self) -> float:
+        """c_collision with its default filled in."""
+        return PENALTY[self.convention] if self.collision_penalty is None else self.collision_penalty
 
     @property
     def radius(self) -> float:
@@ -146,7 +155,7 @@ class Formation(Environment):
 
     Reward of robot i, with p its position and d the distance of centres:
         r_i = progress_weight (|p_before - goal| - |p - goal|) - collision_penalty [some body has d < C];
-        convention `paper`: C = 0.5 m, convention `tight`: C = 0.15 m. With `penalty_counts` = each the penalty is paid
+        convention `paper`: a penalty of 0.35 and C = 0.5 m, convention `tight`: 1.0 and C = 0.15 m. With `penalty_counts` = each the penalty is paid
         for every body nearer than C. The return of an episode is the mean over robots of the sum over time.
 
     Start: posts missed by up to `start_noise_m` along x and y, headings uniform, everything at rest.
@@ -218,7 +227,9 @@ class Formation(Environment):
         robots = (self.num_envs, self.settings.num_agents)
 
         def uniform(*shape: int) -> Tensor:
-            return torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device).cpu() * 2 - 1
+            return (
+                torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device).cpu() * 2 - 1
+            )
 
         start, heading = uniform(2), uniform()
         factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu()
@@ -292,7 +303,7 @@ class Formation(Environment):
         near = self._apart < self.settings.radius
         count = near.any(-1).double() if self.settings.penalty_counts == "any" else near.sum(-1).double()
         progress = distance_before - self._distance
-        return self.settings.progress_weight * progress - self.settings.collision_penalty * count
+        return self.settings.progress_weight * progress - self.settings.penalty * count
 
     def _measure(self, way: Tensor, ended: bool) -> dict[str, Tensor]:
         """Return the metrics of the step just made, each [W].
@@ -356,7 +367,9 @@ class Formation(Environment):
         """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
         lead = (self.num_envs, self.settings.num_agents)
         shape = (*lead, 1 + 2 * seen.shape[2])
-        draws = [torch.randn(shape, generator=g, dtype=torch.float64, device=self.device).cpu() for g in self.generators]
+        draws = [
+            torch.randn(shape, generator=g, dtype=torch.float64, device=self.device).cpu() for g in self.generators
+        ]
         noise = torch.cat(draws)
         offsets = noise[..., 1:].unflatten(-1, (-1, 2)) * self.settings.sensor_noise_m
         return heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
@@ -473,7 +486,7 @@ def _spec(settings: FormationSettings) -> TaskSpec:
     if pillars:
         state.append(Field("obstacles", Kind.VECTOR, pillars, "m"))
     counts = "once" if settings.penalty_counts == "any" else "each"
-    penalty = f"{settings.collision_penalty:g} {counts} a step within {settings.radius:g} m"
+    penalty = f"{settings.penalty:g} {counts} a step within {settings.radius:g} m"
     return TaskSpec(
         name="formation",
         version=1,
@@ -487,7 +500,8 @@ def _spec(settings: FormationSettings) -> TaskSpec:
         shared_reward=False,
         control_period_s=settings.control_period_s,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
-        settings=settings.model_dump() | {"penalty_radius_m": settings.radius, "sight": settings.seen_as},
+        settings=settings.model_dump()
+        | {"penalty_radius_m": settings.radius, "collision_penalty": settings.penalty, "sight": settings.seen_as},
     )
 
 

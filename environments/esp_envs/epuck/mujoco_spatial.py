@@ -129,7 +129,13 @@ def _robot(spec: mujoco.MjSpec, index: int, depth: float) -> None:
         wheel.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], armature=MOTOR_INERTIA)
         # By its priority a wheel's own friction counts, not the larger one of wheel and floor.
         wheel.add_geom(
-            type=sphere, size=[rim, 0, 0], contype=0, conaffinity=_FLOOR, condim=3, priority=1, friction=[FRICTION, 0, 0]
+            type=sphere,
+            size=[rim, 0, 0],
+            contype=0,
+            conaffinity=_FLOOR,
+            condim=3,
+            priority=1,
+            friction=[FRICTION, 0, 0],
         )
         servo = spec.add_actuator(
             name=name,

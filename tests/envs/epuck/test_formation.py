@@ -69,7 +69,9 @@ def test_progress_is_paid_by_the_metre() -> None:
     env.step(wheels((1, 1), (0, 0)))  # reaches its speed
     step = env.step(wheels((1, 1), (0, 0)))
     # one period at full speed, straight at the goal: 100 per metre; the other rests; no body within 0.5 m
-    torch.testing.assert_close(step.reward[0, 0], torch.tensor([100 * MAX_SPEED_M_S * PERIOD_S, 0.0]), atol=3e-3, rtol=0)
+    torch.testing.assert_close(
+        step.reward[0, 0], torch.tensor([100 * MAX_SPEED_M_S * PERIOD_S, 0.0]), atol=3e-3, rtol=0
+    )
     assert step.metrics["path_length_m"].item() == pytest.approx(MAX_SPEED_M_S * PERIOD_S / 2, rel=1e-3)
 
 
@@ -84,7 +86,8 @@ PLACES = [(0.0, 0.0), (0.3, 0.0), (0.0, 0.4), (-0.9, -0.9)]
         ({"penalty_counts": "each", "penalty_radius_m": 0.45}, [-0.7, -0.35, -0.35, 0.0]),
         ({"convention": "tight"}, [0.0, 0.0, 0.0, 0.0]),
         ({"penalty_radius_m": 0.35, "collision_penalty": 2.0}, [-2.0, -2.0, 0.0, 0.0]),
-        ({"convention": "tight", "penalty_radius_m": 0.35}, [-0.35, -0.35, 0.0, 0.0]),
+        ({"convention": "tight", "penalty_radius_m": 0.35}, [-1.0, -1.0, 0.0, 0.0]),
+        ({"collision_penalty": 0.0}, [0.0, 0.0, 0.0, 0.0]),
     ],
     ids=str,
 )
@@ -98,7 +101,7 @@ def test_a_pillar_is_a_body_for_the_penalty() -> None:
     near = 0.4 * math.sqrt(0.5)
     env = world([(near, near - 0.14), (near, near - 0.6)], [(0.0, 0.0)] * 2, convention="tight", num_obstacles=2)
     step = env.step(torch.zeros(1, 1, 2, 2))
-    torch.testing.assert_close(step.reward[0, 0], torch.tensor([-0.35, 0.0]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(step.reward[0, 0], torch.tensor([-1.0, 0.0]), atol=1e-5, rtol=0)
 
 
 def test_observation_by_hand() -> None:
@@ -253,8 +256,8 @@ def test_giving_way_passes_on_the_right() -> None:
         ({}, "random", 4.1),
         ({}, "straight", 182.0),
         ({}, "avoid", 166.0),
-        ({"convention": "tight"}, "straight", 209.7),
-        ({"convention": "tight"}, "avoid", 224.6),
+        ({"convention": "tight"}, "straight", 172.0),
+        ({"convention": "tight"}, "avoid", 215.5),
     ],
     ids=str,
 )

@@ -22,7 +22,9 @@ ARC_TOLERANCE_M = {"mujoco": 3e-3, "mujoco-3d": 1e-3, "pymunk": 1e-4}
 every_engine = pytest.mark.parametrize("name", engine_names())
 
 
-def run(name: str, wheels: tuple[float, float], pose: list[float], periods: int, velocity: Array | None = None) -> Array:
+def run(
+    name: str, wheels: tuple[float, float], pose: list[float], periods: int, velocity: Array | None = None
+) -> Array:
     """Return the poses [periods + 1, 3] of one robot."""
     others = {} if velocity is None else {"velocity": velocity.reshape(1, 1, 3)}
     physics = engine(name, OPEN, np.array([[pose]]), **others)
@@ -89,9 +91,7 @@ def test_a_robot_placed_at_full_speed_keeps_it(name: str) -> None:
 
 @every_engine
 def test_wheels_at_rest_stop_the_robot(name: str) -> None:
-    physics = engine(
-        name, OPEN, np.zeros((1, 1, 3)), velocity=np.array([[[MAX_SPEED_M_S, 0.0, 3.0]]])
-    )
+    physics = engine(name, OPEN, np.zeros((1, 1, 3)), velocity=np.array([[[MAX_SPEED_M_S, 0.0, 3.0]]]))
     for _ in range(5):
         physics.advance(np.zeros((1, 1, 2)))
     assert np.abs(physics.velocity).max() < 1e-4
@@ -144,6 +144,9 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
 def test_the_engines_are_imported_when_they_are_asked_for() -> None:
     code = "import sys, esp_envs.epuck.physics; print({'mujoco', 'pymunk'} & set(sys.modules))"
     done = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; {code}"], capture_output=True, text=True, check=True
+        [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; {code}"],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip() == "set()"

@@ -11,7 +11,15 @@ import pytest
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.physics import engine_names
 from esp_envs.epuck.robot import Array
-from tests.envs.epuck.driving import at_posts, at_random, engine, gap_between_robots, gap_to_pillars, gap_to_walls, to_the_middle
+from tests.envs.epuck.driving import (
+    at_posts,
+    at_random,
+    engine,
+    gap_between_robots,
+    gap_to_pillars,
+    gap_to_walls,
+    to_the_middle,
+)
 
 ARENA = Arena(1.0, 8, 2, 0.06)
 ELEMENTS = [(quarters, mirrored) for mirrored in (False, True) for quarters in range(4)]
