@@ -57,6 +57,7 @@ define install
 	@$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)" \
 	    && $(BIN)/python -m pip install --quiet -c constraints.txt -e "$(1)" \
 	    || { echo "make: installing failed; see pip's message above (is there a network connection and free disk?)" >&2; exit 1; }
+	@.ci/install-osmesa $(BIN)/python
 	@touch $@
 endef
 

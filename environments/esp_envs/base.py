@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
@@ -42,7 +45,8 @@ class Step:
         truncated: [S, E] bool; the horizon cut the episode: bootstrap from `final`.
         final: the last observation of the episodes that ended in this step (elsewhere equal to `next`), or None
             where no world can have ended; known without looking at the device.
-        metrics: task measures of this step, each [S, E] float32, averaged over an episode by whoever evaluates.
+        metrics: task measures of this step, each [S, E] float32; whoever evaluates averages them over an episode, or
+            adds up those that `spec.totals` names.
     """
 
     next: Observation
@@ -143,6 +147,16 @@ class Environment(ABC):
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return what there is to draw of one world (seed index, world index)."""
 
+    def painter(self, size: int) -> AbstractContextManager[Painter] | None:
+        """Return a view of this task's own to open, or None where the view from above is all there is.
+
+        Opening it raises a ValueError where this machine cannot draw it.
+
+        Args:
+            size: of the longer side of a picture, pixels.
+        """
+        return None
+
     def random_action(self) -> Tensor:
         """Return a uniformly random joint action, drawn from each seed's own generator."""
         shape: tuple[int, ...] = (self.num_envs, self.spec.num_agents)
@@ -166,6 +180,7 @@ class Body:
         shape: "disc", "ring", "cross" or "square".
         heading: direction of a nose mark in radians, or None.
         trail: whether a renderer may draw its path.
+        model: what a renderer in space builds of it ("robot", "pillar", "goal"); flat pictures ignore it.
     """
 
     position: tuple[float, float]
@@ -174,6 +189,7 @@ class Body:
     shape: str = "disc"
     heading: float | None = None
     trail: bool = False
+    model: str | None = None
 
 
 @dataclass(frozen=True)
@@ -182,3 +198,20 @@ class Scene:
 
     bodies: tuple[Body, ...]
     window: tuple[float, float, float, float]
+
+
+class Painter(Protocol):
+    """Whoever draws scenes.
+
+    Attributes:
+        note: a sentence for the user about how it draws, or None.
+    """
+
+    note: str | None
+
+    def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
+        """Draw one scene with the trails that bodies left in earlier scenes of the same world, oldest first.
+
+        Shape:
+            [H, W, 3] uint8, red, green and blue; the first row is the top.
+        """

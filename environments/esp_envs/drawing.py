@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,19 +13,19 @@ from esp_envs.base import Body, Scene
 
 _OVERSAMPLING = 3
 """Everything is drawn this much larger and averaged down, which smooths the edges."""
-_BACKGROUND = "#fafaf7"
-_GRID = "#e4e4de"
-_FRAME = "#c8c8c0"
-_GRID_SPACING = 0.5
+BACKGROUND = "#fafaf7"
+GRID = "#e4e4de"
+FRAME = "#c8c8c0"
+GRID_SPACING = 0.5
 _RIM_DARKENING = 0.7
-_TRAIL_WIDTH = 0.3
+TRAIL_WIDTH = 0.3
 """Width of a trail against the body's radius."""
 _TRAIL_STRENGTH = 0.8
 """How much of the body's colour the newest end of a trail has; the oldest has almost none."""
 _SHAPES = ("disc", "ring", "cross", "square")
 
 _Color = tuple[int, ...]
-_Point = tuple[float, float]
+Point = tuple[float, float]
 
 
 def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
@@ -47,13 +47,48 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
         raise ValueError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
     canvas = _Canvas(scene.window, size)
     canvas.grid()
-    for index, body in enumerate(scene.bodies):
-        if body.trail:
-            path = [earlier.bodies[index].position for earlier in trail if index < len(earlier.bodies)]
-            canvas.trail([*path, body.position], body)
+    for body, path in trails(scene, trail):
+        canvas.trail(path, body)
     for body in scene.bodies:
         canvas.body(body)
     return canvas.pixels()
+
+
+class TopPainter:
+    """Draws scenes from above.
+
+    Args:
+        size: pixels of the longer side of a picture.
+        note: a sentence for the user about why it draws, or None.
+    """
+
+    def __init__(self, size: int, note: str | None = None) -> None:
+        self._size, self.note = size, note
+
+    def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
+        """Draw one scene; see the function `draw`."""
+        return draw(scene, self._size, trail)
+
+
+def trails(scene: Scene, earlier: Sequence[Scene]) -> Iterator[tuple[Body, list[Point]]]:
+    """Yield every body that leaves a trail with the way it has come: its position in each earlier scene and in this."""
+    for index, body in enumerate(scene.bodies):
+        if body.trail and earlier:
+            path = [past.bodies[index].position for past in earlier if index < len(past.bodies)]
+            yield body, [*path, body.position]
+
+
+def fade(color: str, share: float) -> tuple[int, ...]:
+    """Return the colour of a piece of trail.
+
+    Args:
+        color: of the body, "#rrggbb".
+        share: where the piece lies: 0 is the oldest end of the trail, 1 the newest.
+
+    Returns:
+        Red, green and blue from 0 to 255.
+    """
+    return _mix(ImageColor.getrgb(BACKGROUND), ImageColor.getrgb(color), _TRAIL_STRENGTH * share)
 
 
 class _Canvas:
@@ -66,29 +101,28 @@ class _Canvas:
         self._size = (max(1, round((x_max - x_min) * per_unit)), max(1, round((y_max - y_min) * per_unit)))
         self._scale = per_unit * _OVERSAMPLING
         width, height = (side * _OVERSAMPLING for side in self._size)
-        self._image = Image.new("RGB", (width, height), _BACKGROUND)
+        self._image = Image.new("RGB", (width, height), BACKGROUND)
         self._draw = ImageDraw.Draw(self._image)
 
     def grid(self) -> None:
         """Draw grid lines every half unit and a frame."""
         x_min, x_max, y_min, y_max = self._window
-        for k in range(math.ceil(x_min / _GRID_SPACING), math.floor(x_max / _GRID_SPACING) + 1):
-            self._line([(k * _GRID_SPACING, y_min), (k * _GRID_SPACING, y_max)], _GRID, _OVERSAMPLING)
-        for k in range(math.ceil(y_min / _GRID_SPACING), math.floor(y_max / _GRID_SPACING) + 1):
-            self._line([(x_min, k * _GRID_SPACING), (x_max, k * _GRID_SPACING)], _GRID, _OVERSAMPLING)
+        for k in range(math.ceil(x_min / GRID_SPACING), math.floor(x_max / GRID_SPACING) + 1):
+            self._line([(k * GRID_SPACING, y_min), (k * GRID_SPACING, y_max)], GRID, _OVERSAMPLING)
+        for k in range(math.ceil(y_min / GRID_SPACING), math.floor(y_max / GRID_SPACING) + 1):
+            self._line([(x_min, k * GRID_SPACING), (x_max, k * GRID_SPACING)], GRID, _OVERSAMPLING)
         width, height = self._image.size
-        self._draw.rectangle((0, 0, width - 1, height - 1), outline=_FRAME, width=_OVERSAMPLING)
+        self._draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME, width=_OVERSAMPLING)
 
-    def trail(self, path: Sequence[_Point], body: Body) -> None:
+    def trail(self, path: Sequence[Point], body: Body) -> None:
         """Draw the way a body has come, fading towards its beginning."""
-        color, background = ImageColor.getrgb(body.color), ImageColor.getrgb(_BACKGROUND)
-        width = max(1, round(body.radius * _TRAIL_WIDTH * self._scale))
+        width = max(1, round(body.radius * TRAIL_WIDTH * self._scale))
         pieces = len(path) - 1
         for k in range(pieces):
-            share = _TRAIL_STRENGTH * (k + 1) / pieces
-            self._line([path[k], path[k + 1]], _mix(background, color, share), width)
+            color = fade(body.color, (k + 1) / pieces)
+            self._line([path[k], path[k + 1]], color, width)
             x, y = self._at(path[k + 1])
-            self._draw.ellipse(_box(x, y, width / 2), fill=_mix(background, color, share))
+            self._draw.ellipse(_box(x, y, width / 2), fill=color)
 
     def body(self, body: Body) -> None:
         """Draw a body with its rim and, where it has a heading, a nose mark."""
@@ -116,10 +150,10 @@ class _Canvas:
         """Return the picture at its final size."""
         return np.asarray(self._image.resize(self._size, Image.Resampling.BOX), dtype=np.uint8).copy()
 
-    def _line(self, points: Sequence[_Point], color: str | _Color, width: int) -> None:
+    def _line(self, points: Sequence[Point], color: str | _Color, width: int) -> None:
         self._draw.line([self._at(point) for point in points], fill=color, width=width)
 
-    def _at(self, point: _Point) -> _Point:
+    def _at(self, point: Point) -> Point:
         """Return the pixel of a world point; y points up in the world and down in the picture."""
         return (point[0] - self._window[0]) * self._scale, (self._window[3] - point[1]) * self._scale
 

@@ -101,8 +101,8 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
 }
 """What the preset `default` changes on a task: measured best there.
 
-Formation's worlds are in lockstep, so a rollout has to span an episode: one of its last seconds alone, in which everybody
-rests, leaves nothing but noise for the normalised advantages.
+Formation's worlds are in lockstep, so a rollout has to span an episode: one of its last seconds alone, in which
+everybody rests, leaves nothing but noise for the normalised advantages.
 """
 
 

@@ -99,7 +99,7 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
     settings = parse_assignments(items)
     for name in settings:
         if not name.startswith("task."):
-            raise ValueError(f"--set {name} changes no setting of the task; a trained policy takes only task.NAME=VALUE")
+            raise ValueError(f"--set {name} changes no setting of the task; here it takes only task.NAME=VALUE")
     own = {name.removeprefix("task."): value for name, value in settings.items()}
     return own if physics is None else {**own, "physics": physics}
 

@@ -2,38 +2,103 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import errno
+import math
+import os
+from typing import Annotated, Literal
 
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import OutOption, PolicyArgument
+from esp_cli.commands.options import (
+    OutOption,
+    PhysicsOption,
+    PolicyArgument,
+    TaskSetOption,
+    parse_task_settings,
+)
 
 EPILOG = """Examples:\n
     esp render runs/cn-mappo -o cn.gif\n
-    esp render runs/cn-mappo -o cn.gif --episodes 3 --size 480 --speed 0.5"""
+    esp render runs/cn-mappo -o cn.gif --episodes 5 --size 320 --speed 0.5\n
+    esp render runs/fc-mappo -o formation.gif --speed 4x\n
+    esp render runs/fc-mappo -o formation.png --view top"""
+
+FILMS, PICTURE = (".gif", ".mp4"), ".png"
+
+
+def parse_speed(value: str | float) -> float:
+    """Read a speed: 4, 0.5 or 4x.
+
+    Raises:
+        typer.BadParameter: no number, or not between 0.01 and 100.
+    """
+    try:
+        speed = float(str(value).strip().lower().removesuffix("x"))
+    except ValueError:
+        speed = math.nan
+    if not 0.01 <= speed <= 100:  # false for what is no number
+        raise typer.BadParameter(f"'{value}' is no speed; write a number from 0.01 to 100, as 0.5 or 4x")
+    return speed
 
 
 def render(
     policy: PolicyArgument,
     out: OutOption,
+    view: Annotated[
+        Literal["auto", "top", "3d"],
+        typer.Option("--view", help="From above, or in space; auto takes the latter where the task has it."),
+    ] = "auto",
     episodes: Annotated[
-        int, typer.Option("--episodes", "-e", min=1, max=100, help="Episodes, one after the other.")
-    ] = 3,
+        int | None,
+        typer.Option("--episodes", "-e", min=1, max=100, help="Episodes of a film; by default 3, of long tasks 1."),
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Which seed's policy acts; by default the first.")] = None,
-    size: Annotated[int, typer.Option("--size", min=32, max=2048, help="Longer side in pixels.")] = 320,
-    speed: Annotated[float, typer.Option("--speed", min=0.01, max=100, help="Times real time.")] = 1.0,
+    size: Annotated[int, typer.Option("--size", min=32, max=2048, help="Longer side in pixels.")] = 480,
+    speed: Annotated[
+        float, typer.Option("--speed", parser=parse_speed, metavar="TIMES", help="Times real time, as 0.5 or 4x.")
+    ] = 1.0,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", min=1, max=60, help="Most frames per second: 25 unless given, in a GIF up to 50."),
+    ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
+    physics: PhysicsOption = None,
+    settings: TaskSetOption = None,
 ) -> None:
-    """Play episodes and write them as a GIF; off-screen, no display needed."""
-    if out.suffix.lower() != ".gif":
-        raise ValueError(f"cannot write {out}: name a .gif file")
-    from esp_cli.experiments.rendering import film, write_gif
-    from esp_cli.training.loading import load_policy
+    """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
+    kind = out.suffix.lower()
+    if kind not in (*FILMS, PICTURE):
+        raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
+    if kind == PICTURE and episodes is not None and episodes > 1:
+        raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
+    if out.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
+    from esp_cli.experiments import films, rendering
+    from esp_cli.training.loading import load_policy, transfer
+    from esp_cli.training.trainer import build_environment
 
-    trained = load_policy(policy)
+    if kind == ".mp4":
+        films.mp4_library()  # a missing one is told before all the work, not after it
+    trained = transfer(load_policy(policy), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
-    frames = film(trained, trained.config.seeds[0] if seed is None else seed, episodes, size, not stochastic)
-    write_gif(out, frames, speed / trained.spec.control_period_s)
-    console.note(f"{len(frames)} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
+    seed = trained.config.seeds[0] if seed is None else seed
+    env = build_environment(trained.config, 1, "film")
+    count = 1 if kind == PICTURE else episodes or rendering.default_episodes(trained.spec)
+    with rendering.open_painter(env, view, size) as painter:
+        recorded = rendering.record(trained, env, seed, count, not stochastic)
+        if painter.note:
+            console.note(painter.note)
+        if kind == PICTURE:
+            rendering.write_picture(out, painter, recorded[0], f"{trained.config.task}, seed {seed}", size)
+            console.note(f"episode of {len(recorded[0]) - 1} steps -> {out}")
+            return
+        rate = fps or rendering.FRAMES_PER_SECOND
+        if kind == ".gif":
+            rate = min(rate, films.GIF_FRAMES_PER_SECOND)
+        period = trained.spec.control_period_s
+        taken = rendering.shots(recorded, rendering.stride(period, speed, rate))
+        with console.TrainingProgress(len(taken), description="draw") as progress:
+            rendering.write_film(out, painter, taken, period / speed, progress.update)
+    console.note(f"{len(taken)} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")

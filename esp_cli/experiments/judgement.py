@@ -30,8 +30,8 @@ def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
 
     Returns:
         A JSON-able dict: task, task_version, convention, episodes, greedy and stochastic (each mean, sem, ci95 over
-        seeds, per_seed), anchors (random, heuristic, and the task's other heuristics by name; one number each), heuristics
-        (their names, the one called "heuristic" first), metrics (of the greedy policy) and metrics_per_seed,
+        seeds, per_seed), anchors (random, heuristic, and the task's other heuristics by name; one number each),
+        heuristics (their names, the one called "heuristic" first), metrics (of the greedy policy) and metrics_per_seed,
         anchor_metrics (the same of each anchor), task_settings.
     """
     seeds = trained.config.seeds

@@ -1,12 +1,16 @@
-"""`esp render`: a GIF of the right length, size and speed, and one sentence for whatever cannot be drawn."""
+"""`esp render`: films and pictures of the right length, size and speed; one sentence for whatever cannot be drawn."""
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
+from esp_envs.epuck import gl
+from esp_envs.epuck.gl import space_painter
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 FRAMES = 26
@@ -18,6 +22,7 @@ def test_a_gif_has_every_step_of_every_episode_in_real_time(finished: Path, tmp_
     told = esp("render", finished, "-o", file, "--episodes", 2, "--size", 64)
     assert told.stdout == ""
     assert f"{2 * FRAMES} frames -> {file}" in told.stderr
+    assert f"{2 * FRAMES}/{2 * FRAMES}" in told.stderr, "progress is shown"
     with Image.open(file) as film:
         assert film.format == "GIF"
         assert film.n_frames == 2 * FRAMES
@@ -25,6 +30,11 @@ def test_a_gif_has_every_step_of_every_episode_in_real_time(finished: Path, tmp_
         assert film.info["duration"] == 100, "milliseconds: a step is 0.1 s"
         assert film.info["loop"] == 0
     assert [entry.name for entry in file.parent.iterdir()] == ["film.gif"]
+
+
+def test_short_tasks_show_three_episodes(finished: Path, tmp_path: Path) -> None:
+    told = esp("render", finished, "-o", tmp_path / "film.gif", "--size", 32)
+    assert f"{3 * FRAMES} frames -> " in told.stderr
 
 
 def test_speed_seed_and_noise_are_chosen(finished: Path, tmp_path: Path) -> None:
@@ -36,9 +46,110 @@ def test_speed_seed_and_noise_are_chosen(finished: Path, tmp_path: Path) -> None
     assert film("--seed", 3) == greedy, "the first seed acts by default"
     assert film("--seed", 7) != greedy
     assert film("--stochastic") != greedy
-    assert film("--speed", 0.5) != greedy
-    with Image.open(tmp_path / "film.gif") as slow:
-        assert slow.info["duration"] == 200
+    assert film("--view", "top") == greedy, "a flat task has no other view"
+
+
+@pytest.mark.parametrize(
+    ("options", "frames", "duration"),
+    [
+        (["--speed", "0.5"], FRAMES, 200),
+        (["--speed", "2x"], FRAMES, 50),
+        (["--speed", "4X"], 14, 50),  # 40 frames a second are too many: every second of 0..25, and the last
+        (["--speed", "4", "--fps", "40"], FRAMES, 20),  # 25 ms each, rounded to 20 and 30
+        (["--fps", "5"], 14, 200),
+        (["--speed", "10", "--fps", "60"], 14, 20),  # 50 a second are the most that players show
+    ],
+)
+def test_frames_are_skipped_at_high_speed(
+    finished: Path, tmp_path: Path, options: list[str], frames: int, duration: int
+) -> None:
+    esp("render", finished, "-o", tmp_path / "film.gif", "-e", 1, "--size", 48, *options)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert (film.n_frames, film.info["duration"]) == (frames, duration)
+
+
+def test_a_png_is_a_figure_of_the_trajectories(finished: Path, tmp_path: Path) -> None:
+    told = esp("render", finished, "-o", tmp_path / "ways.PNG", "--size", 200)
+    assert f"episode of {FRAMES - 1} steps -> {tmp_path / 'ways.PNG'}" in told.stderr
+    with Image.open(tmp_path / "ways.PNG") as figure:
+        assert (figure.format, figure.size) == ("PNG", (200, 200))
+    other = tmp_path / "other.png"
+    esp("render", finished, "-o", other, "--size", 200, "--view", "top", "--seed", 7, "--episodes", 1)
+    assert other.read_bytes() != (tmp_path / "ways.PNG").read_bytes()
+    sentence = refused("render", finished, "-o", other, "--episodes", 2)
+    assert sentence == f"{other} holds one episode; leave out --episodes 2 or name a .gif file"
+
+
+def test_an_mp4_without_its_extra_is_refused_before_anything_is_drawn(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    sentence = refused("render", finished, "-o", tmp_path / "film.mp4")
+    assert sentence == 'an MP4 needs an extra: pip install "esp-marl[video]"; or name a .gif file'
+    assert not (tmp_path / "film.mp4").exists()
+
+
+@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs the extra video")
+def test_an_mp4_is_written(finished: Path, tmp_path: Path) -> None:
+    told = esp("render", finished, "-o", tmp_path / "film.mp4", "--episodes", 1, "--size", 64)
+    assert f"{FRAMES} frames -> {tmp_path / 'film.mp4'}" in told.stderr
+    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_flat_task_has_no_view_in_space(finished: Path, tmp_path: Path) -> None:
+    sentence = refused("render", finished, "-o", tmp_path / "film.gif", "--view", "3d")
+    assert sentence == "navigation is a flat task without a view in space; leave out --view 3d"
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of e-pucks with short episodes."""
+    pytest.importorskip("mujoco")
+    out = tmp_path_factory.mktemp("robots") / "run"
+    return train_tiny(out, "--task", "formation", "--set", "task.horizon=8", steps=50)
+
+
+def test_robots_are_drawn_in_space_and_from_above(robots: Path, tmp_path: Path) -> None:
+    try:
+        with space_painter(64):
+            pass
+    except ValueError as error:
+        pytest.skip(str(error))
+    sizes = {}
+    for name, options in (("auto", []), ("space", ["--view", "3d"]), ("top", ["--view", "top"])):
+        for kind in ("gif", "png"):
+            file = tmp_path / f"{name}.{kind}"
+            esp("render", robots, "-o", file, "--size", 64, *options)
+            with Image.open(file) as picture:
+                sizes[file.name] = picture.size
+    assert sizes == {
+        "auto.gif": (64, 48),
+        "auto.png": (64, 48),
+        "space.gif": (64, 48),
+        "space.png": (64, 48),
+        "top.gif": (64, 64),
+        "top.png": (64, 64),
+    }
+    assert (tmp_path / "auto.gif").read_bytes() == (tmp_path / "space.gif").read_bytes()
+
+
+def test_without_graphics_the_view_is_from_above_and_a_note_says_why(
+    robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gl, "is_installed", lambda backend: False)
+    told = esp("render", robots, "-o", tmp_path / "film.gif", "--size", 64)
+    assert "apt-get install libosmesa6 (Fedora: dnf install mesa-libOSMesa); so the view is from above\n" in told.stderr
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.size == (64, 64)
+    sentence = refused("render", robots, "-o", tmp_path / "space.gif", "--view", "3d")
+    assert sentence.startswith("nothing here can draw a view in space (OSMesa: not installed; EGL: not installed)")
+    assert not (tmp_path / "space.gif").exists()
+
+
+def test_a_policy_is_drawn_under_other_settings_of_its_task(robots: Path, tmp_path: Path) -> None:
+    told = esp("render", robots, "-o", tmp_path / "long.png", "--view", "top", "--set", "task.horizon=12")
+    assert "episode of 12 steps" in told.stderr
+    assert "mujoco" in refused("render", robots, "-o", tmp_path / "film.gif", "--physics", "marbles")
 
 
 def test_predators_and_prey_are_drawn_from_a_policy_file(tmp_path: Path) -> None:
@@ -48,10 +159,10 @@ def test_predators_and_prey_are_drawn_from_a_policy_file(tmp_path: Path) -> None
         assert film.n_frames == FRAMES
 
 
-@pytest.mark.parametrize("name", ["film.mp4", "film.png", "film", "gif"])
+@pytest.mark.parametrize("name", ["film.mov", "film.jpg", "film", "gif"])
 def test_another_kind_of_file_is_refused(finished: Path, tmp_path: Path, name: str) -> None:
     sentence = refused("render", finished, "-o", tmp_path / name)
-    assert sentence == f"cannot write {tmp_path / name}: name a .gif file"
+    assert sentence == f"cannot write {tmp_path / name}: name a .gif, .mp4 or .png file"
     assert not (tmp_path / name).exists()
 
 
@@ -61,7 +172,11 @@ def test_another_kind_of_file_is_refused(finished: Path, tmp_path: Path, name: s
         (["--seed", "4"], "has no seed 4; it has 3, 7"),
         (["--size", "5"], "--size"),
         (["--episodes", "0"], "--episodes"),
-        (["--speed", "0"], "--speed"),
+        (["--speed", "0"], "'0' is no speed; write a number from 0.01 to 100, as 0.5 or 4x"),
+        (["--speed", "fast"], "'fast' is no speed"),
+        (["--speed", "nan"], "'nan' is no speed"),
+        (["--fps", "0"], "--fps"),
+        (["--view", "side"], "--view"),
     ],
 )
 def test_a_bad_option_is_told_in_one_sentence(

@@ -33,7 +33,14 @@ SETTINGS: dict[str, list[dict[str, object]]] = {
     ],
     "formation": [
         {"horizon": 8},
-        {"horizon": 6, "actions": "discrete", "physics": "pymunk", "num_obstacles": 0, "num_agents": 3, "neighbours": 2},
+        {
+            "horizon": 6,
+            "actions": "discrete",
+            "physics": "pymunk",
+            "num_obstacles": 0,
+            "num_agents": 3,
+            "neighbours": 2,
+        },
         {"horizon": 5, "physics": "mujoco-3d", "num_agents": 4, "sight": "nearness", "convention": "tight"},
         {"horizon": 7, "num_agents": 5, "action_delay": 2, "mass_spread": 0.3, "friction_spread": 0.5},
         {"horizon": 6, "num_agents": 2, "sensor_noise_m": 0.01, "heading_noise_rad": 0.1, "wheel_mismatch": 0.05},

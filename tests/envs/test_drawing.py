@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from esp_envs import Body, Scene
-from esp_envs.drawing import draw
+from esp_envs.drawing import BACKGROUND, TopPainter, draw, fade, trails
 
 WINDOW = (-1.0, 1.0, -1.0, 1.0)
 RED, BLUE = "#ff0000", "#0000ff"
@@ -52,6 +52,28 @@ def test_trails_fade_towards_their_beginning() -> None:
     assert new[1] < old[1] < 240, "red grows at the cost of green"
     plain = draw(Scene((Body(path[-1], 0.1, RED),), WINDOW), trail=scenes[:-1])
     assert pixel(plain, 0.6, 0.1)[1] > 240, "a body that leaves no trail has none"
+
+
+def test_trails_are_the_ways_of_the_bodies_that_leave_one() -> None:
+    still = Body((0.5, 0.5), 0.1, BLUE)
+    scenes = [Scene((still, Body((0.1 * k, 0.0), 0.1, RED, trail=True)), WINDOW) for k in range(3)]
+    assert list(trails(scenes[-1], scenes[:-1])) == [(scenes[-1].bodies[1], [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)])]
+    assert list(trails(scenes[-1], ())) == []
+
+
+def test_a_trail_fades_from_the_background_to_four_fifths_of_the_colour() -> None:
+    assert fade(RED, 0.0) == (0xFA, 0xFA, 0xF7)
+    assert BACKGROUND == "#fafaf7"
+    assert fade(RED, 1.0) == (254, 50, 49)  # 250 + 0.8 (255 - 250), 250 - 0.8 x 250, 247 - 0.8 x 247
+    assert fade(RED, 0.5) == (252, 150, 148)
+
+
+def test_the_painter_draws_the_same_as_the_function() -> None:
+    scenes = [Scene((Body((0.1 * k, 0.0), 0.1, RED, trail=True),), WINDOW) for k in range(3)]
+    painter = TopPainter(100, note="no space here")
+    assert np.array_equal(painter.draw(scenes[2], scenes[:2]), draw(scenes[2], 100, scenes[:2]))
+    assert np.array_equal(painter.draw(scenes[2]), draw(scenes[2], 100))
+    assert (painter.note, TopPainter(100).note) == ("no space here", None)
 
 
 def test_edges_are_smooth() -> None:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from contextlib import AbstractContextManager
+from typing import ClassVar
 
-import numpy as np
 import torch
-from pydantic import Field as Setting
-from pydantic import model_validator
 from torch import Tensor
 
 from esp_envs.base import (
     Body,
     Environment,
     Observation,
+    Painter,
     Scene,
     Step,
     TaskSettings,
@@ -23,24 +22,11 @@ from esp_envs.base import (
     restore_generators,
 )
 from esp_envs.epuck import steering
-from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.formation_spec import LEVELS, WHEEL_PAIRS, FormationSettings, formation_spec
+from esp_envs.epuck.gl import space_painter
 from esp_envs.epuck.physics import Bodies, make_physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED
-from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, TaskSpec, layout
 
-WHEELS = Continuous(layout(Field("wheels", Kind.WHEELS, 1, "share of full speed")))
-"""Left and right wheel speed in [-1, 1], times 6.28 rad/s."""
-_LEVELS = tuple(round(-1 + 0.2 * k, 1) for k in range(11))
-WHEEL_PAIRS = Discrete(
-    Kind.WHEELS,
-    tuple((left, right) for left in _LEVELS for right in _LEVELS),
-    tuple(f"{left:g}/{right:g}" for left in _LEVELS for right in _LEVELS),
-)
-"""Each wheel in steps of 0.2: 121 pairs."""
-PENALTY = {"paper": 0.35, "tight": 1.0}
-"""A step at full speed towards the goal is worth 1.256: in `tight`, pushing through the others hardly pays."""
-PENALTY_RADIUS_M = {"paper": 0.5, "tight": 0.15}
-SIGHT: dict[str, Literal["offset", "nearness"]] = {"paper": "offset", "tight": "nearness"}
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
 CONTACT_GAP_M = 0.001
@@ -49,82 +35,7 @@ FADING_M = 0.2
 """Gap over which the sight `nearness` of a body fades to 1/e."""
 _COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _PILLAR_COLOR = "#707070"
-
-
-class FormationSettings(TaskSettings):
-    """What a user may change of `formation`."""
-
-    convention: Literal["paper", "tight"] = Setting(
-        "paper", description="what being near costs: as the paper prints it, or so that giving way pays, for robots"
-    )
-    actions: Literal["continuous", "discrete"] = Setting(
-        "continuous", description="two wheel speeds, or 121 pairs of them in steps of 0.2 (for QMIX)"
-    )
-    physics: Literal["mujoco", "mujoco-3d", "pymunk"] = Setting(
-        "mujoco", description="planar MuJoCo, MuJoCo with wheels and casters, or pymunk"
-    )
-    num_agents: int = Setting(8, ge=1, le=16, description="N, robots")
-    num_obstacles: int = Setting(2, ge=0, le=8, description="M, pillars on a ring around the middle")
-    obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
-    arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
-    horizon: int = Setting(300, ge=1, description="control steps of an episode")
-    control_period_s: float = Setting(0.1, gt=0, le=1, description="time of a control step, s; a multiple of 0.01")
-    sight: Literal["offset", "nearness"] | None = Setting(
-        None,
-        description="bodies are seen by their `offset` in m (by default in the convention paper), or by a direction that "
-        "fades with the gap, `nearness` (in the convention tight)",
-    )
-    neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
-    progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
-    collision_penalty: float | None = Setting(
-        None, ge=0, description="c_collision, reward lost in a step with a body too near; 0.35 by default, 1 in tight"
-    )
-    penalty_radius_m: float | None = Setting(
-        None, gt=0, description="C, distance of centres, m; 0.5 by default, 0.15 in the convention tight"
-    )
-    penalty_counts: Literal["any", "each"] = Setting(
-        "any", description="the penalty counts once a step, or once for each body that is too near"
-    )
-    arrival_radius_m: float = Setting(0.05, gt=0, description="r_arrival, distance at which a robot has arrived, m")
-    start_noise_m: float = Setting(0.01, ge=0, le=0.01, description="posts are missed by up to this along x and y, m")
-    sensor_noise_m: float = Setting(0.0, ge=0, description="standard deviation of each seen coordinate, m")
-    heading_noise_rad: float = Setting(0.0, ge=0, description="standard deviation of the seen heading, rad")
-    action_delay: int = Setting(0, ge=0, le=20, description="control steps until a chosen action acts")
-    wheel_mismatch: float = Setting(
-        0.0, ge=0, le=0.5, description="standard deviation of each wheel's own factor on its speed, drawn per episode"
-    )
-    mass_spread: float = Setting(0.0, ge=0, lt=1, description="masses are drawn from 1 - spread to 1 + spread e-pucks")
-    friction_spread: float = Setting(0.0, ge=0, lt=1, description="likewise the grip of the wheels")
-
-    @property
-    def penalty(self) -> float:
-        """c_collision with its default filled in."""
-        return PENALTY[self.convention] if self.collision_penalty is None else self.collision_penalty
-
-    @property
-    def radius(self) -> float:
-        """C with its default filled in, m."""
-        return self.penalty_radius_m or PENALTY_RADIUS_M[self.convention]
-
-    @property
-    def seen_as(self) -> Literal["offset", "nearness"]:
-        """How bodies are seen, with its default filled in."""
-        return self.sight or SIGHT[self.convention]
-
-    @property
-    def seen_robots(self) -> int:
-        """Robots that an observation shows."""
-        return min(self.neighbours, self.num_agents - 1)
-
-    @property
-    def arena(self) -> Arena:
-        """The arena that these settings describe."""
-        return Arena(self.arena_m, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
-
-    @model_validator(mode="after")
-    def _fits(self) -> FormationSettings:
-        _ = self.arena
-        return self
+_REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
 class Formation(Environment):
@@ -155,8 +66,9 @@ class Formation(Environment):
 
     Reward of robot i, with p its position and d the distance of centres:
         r_i = progress_weight (|p_before - goal| - |p - goal|) - collision_penalty [some body has d < C];
-        convention `paper`: a penalty of 0.35 and C = 0.5 m, convention `tight`: 1.0 and C = 0.15 m. With `penalty_counts` = each the penalty is paid
-        for every body nearer than C. The return of an episode is the mean over robots of the sum over time.
+        convention `paper`: a penalty of 0.35 and C = 0.5 m, convention `tight`: 1.0 and C = 0.15 m. With
+        `penalty_counts` = each the penalty is paid for every body nearer than C. The return of an
+        episode is the mean over robots of the sum over time.
 
     Start: posts missed by up to `start_noise_m` along x and y, headings uniform, everything at rest.
 
@@ -183,7 +95,7 @@ class Formation(Environment):
     def __init__(self, settings: FormationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         self.arena = settings.arena
-        self.spec = _spec(settings)
+        self.spec = formation_spec(settings)
         self.num_worlds = self.num_seeds * num_envs
         self.physics = make_physics(
             settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
@@ -357,10 +269,7 @@ class Formation(Environment):
     def _nearest(self, bodies: slice, count: int) -> Tensor:
         """Return the offsets [W, N, count, 2] of the nearest of some bodies, nearest first."""
         apart, ways = self._apart[..., bodies], self._ways[:, :, bodies]
-        if count == 1:
-            index = apart.argmin(-1, keepdim=True)
-        else:
-            index = apart.argsort(dim=-1, stable=True)[..., :count]
+        index = apart.argmin(-1, keepdim=True) if count == 1 else apart.argsort(dim=-1, stable=True)[..., :count]
         return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
 
     def _disturbed(self, heading: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
@@ -440,7 +349,7 @@ class Formation(Environment):
         lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
         if self.settings.actions == "discrete":
             level = ((wheels + 1) * 5).round().long()
-            return (level[..., 0] * len(_LEVELS) + level[..., 1]).view(lead).to(self.device)
+            return (level[..., 0] * len(LEVELS) + level[..., 1]).view(lead).to(self.device)
         return wheels.float().view(*lead, 2).to(self.device)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
@@ -449,14 +358,18 @@ class Formation(Environment):
         bodies = []
         for i, goal in enumerate(self._goals[w].tolist()):
             bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal"))
-        for pillar in self._pillars[w].tolist():
-            bodies.append(Body(tuple(pillar), self.settings.obstacle_radius_m, _PILLAR_COLOR, model="pillar"))
+        pillars = self._pillars[w].tolist()
+        bodies += [Body(tuple(p), self.settings.obstacle_radius_m, _PILLAR_COLOR, model="pillar") for p in pillars]
         poses = zip(self._position[w].tolist(), self._heading[w].tolist(), strict=True)
         for i, (position, heading) in enumerate(poses):
             color = _COLORS[i % len(_COLORS)]
             bodies.append(Body(tuple(position), BODY_RADIUS_M, color, "disc", heading, trail=True, model="robot"))
         half = self.arena.side_m / 2
         return Scene(tuple(bodies), (-half, half, -half, half))
+
+    def painter(self, size: int) -> AbstractContextManager[Painter]:
+        """Open the view in space, with pictures `size` pixels wide."""
+        return space_painter(size)
 
 
 def nearness(offset: Tensor, reach_m: float) -> Tensor:
@@ -468,50 +381,3 @@ def nearness(offset: Tensor, reach_m: float) -> Tensor:
     """
     distance = offset.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     return offset / distance * torch.exp(-(distance - reach_m).clamp(min=0) / FADING_M)
-
-
-_REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
-
-
-def _spec(settings: FormationSettings) -> TaskSpec:
-    """Return the spec that follows from the settings."""
-    robots, pillars = settings.num_agents, settings.num_obstacles
-    state = [
-        Field("heading", Kind.VECTOR, robots, "direction", Items.AGENTS),
-        Field("position", Kind.VECTOR, robots, "m", Items.AGENTS),
-        Field("velocity", Kind.VECTOR, robots, "m/s", Items.AGENTS),
-        Field("spin", Kind.PSEUDOSCALAR, robots, "rad/s", Items.AGENTS),
-        Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS),
-    ]
-    if pillars:
-        state.append(Field("obstacles", Kind.VECTOR, pillars, "m"))
-    counts = "once" if settings.penalty_counts == "any" else "each"
-    penalty = f"{settings.penalty:g} {counts} a step within {settings.radius:g} m"
-    return TaskSpec(
-        name="formation",
-        version=1,
-        convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}",
-        num_agents=robots,
-        horizon=settings.horizon,
-        observation=_observation_layout(settings),
-        state=Layout(tuple(state)),
-        action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
-        symmetry="d4",
-        shared_reward=False,
-        control_period_s=settings.control_period_s,
-        totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
-        settings=settings.model_dump()
-        | {"penalty_radius_m": settings.radius, "collision_penalty": settings.penalty, "sight": settings.seen_as},
-    )
-
-
-def _observation_layout(settings: FormationSettings) -> Layout:
-    unit = "m" if settings.seen_as == "offset" else "nearness"
-    fields = [Field("heading", Kind.VECTOR, 1, "direction")]
-    if settings.num_obstacles:
-        fields.append(Field("obstacle", Kind.VECTOR, 1, unit))
-    fields.append(Field("goal", Kind.VECTOR, 1, "m"))
-    if settings.seen_robots:
-        # Sorted by distance, so that no permutation of the robots moves them.
-        fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, unit))
-    return layout(*fields)

@@ -12,6 +12,7 @@ from importlib import import_module
 import numpy as np
 
 from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.robot import Array
 
 _ENGINES = {
@@ -97,6 +98,7 @@ def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: flo
     """
     if name not in _ENGINES:
         raise ValueError(f"unknown physics '{name}'; there are {', '.join(_ENGINES)}")
+    forget_missing_backend()
     module, attribute = _ENGINES[name].split(":")
     try:
         engine: type[Physics] = getattr(import_module(module), attribute)

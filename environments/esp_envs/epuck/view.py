@@ -1,0 +1,226 @@
+"""The view in space: scenes drawn by MuJoCo's renderer, whatever physics they come from.
+
+Nothing is simulated here. A model of its own is built for the looks of a scene's bodies, which are then put where each
+scene says. The camera looks along the y axis and down, so x points right as in the view from above.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise, product
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from esp_envs.base import Scene
+from esp_envs.drawing import TRAIL_WIDTH, fade, trails
+from esp_envs.epuck import gl
+from esp_envs.epuck.looks import GLOW, TRAIL_LAYER_M, WALL_HEIGHT_M, WALL_WIDTH_M, model_of
+
+_ASPECT = 3 / 4
+_FIELD_OF_VIEW = math.radians(40)
+_ELEVATION = math.radians(60)
+"""How far the camera looks down."""
+_FILLED = 0.96
+"""Share of the picture that the arena may take."""
+_TRAIL_STEP = 1.0
+"""Shortest straight piece of a trail against the body's radius; finer bends are about a pixel."""
+_MAX_GEOMS = 20_000
+
+_Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where the picture is taken from.
+
+    Attributes:
+        target: the point (x, y, 0) in the middle of the picture, m.
+        distance: of the camera from it, m.
+        width, height: of the picture, pixels.
+    """
+
+    target: tuple[float, float, float]
+    distance: float
+    width: int
+    height: int
+
+    def project(self, points: ArrayLike) -> _Array:
+        """Return the pixels (column, row) of points in the world.
+
+        Args:
+            points: [..., 3] m.
+        """
+        across, up, ahead = self._seen(points)
+        scale = self._focal / (ahead + self.distance)
+        return np.stack([self.width / 2 + across * scale, self.height / 2 - up * scale], -1)
+
+    @classmethod
+    def facing(cls, window: tuple[float, float, float, float], width: int, height: int) -> Camera:
+        """Return the nearest camera that has all of a window and its walls in the picture, as high as low."""
+        x_min, x_max, y_min, y_max = window
+        rim = WALL_WIDTH_M
+        sides = ((x_min - rim, x_max + rim), (y_min - rim, y_max + rim), (0.0, WALL_HEIGHT_M))
+        corners = np.array(list(product(*sides)))
+        camera = cls(((x_min + x_max) / 2, (y_min + y_max) / 2, 0.0), 1.0, width, height)
+        for _ in range(20):  # what is near looks larger, so the middle of the picture is not that of the window
+            across, up, ahead = camera._seen(corners)
+            needed = np.maximum(abs(across) * 2 / width, abs(up) * 2 / height) * camera._focal / _FILLED - ahead
+            camera = replace(camera, distance=float(needed.max()))
+            rows = camera.project(corners)[:, 1]
+            low = (rows.min() + rows.max()) / 2 - height / 2
+            x, y, z = camera.target
+            moved = y - low * camera.distance / camera._focal / math.sin(_ELEVATION)
+            camera = replace(camera, target=(x, float(moved), z))
+        return camera
+
+    @property
+    def _focal(self) -> float:
+        """Pixels that a length spans from as far away as it is long."""
+        return self.height / 2 / math.tan(_FIELD_OF_VIEW / 2)
+
+    def _seen(self, points: ArrayLike) -> tuple[_Array, ...]:
+        """Return how far points lie to the right, upwards and ahead of the target as the camera sees it, m."""
+        x, y, z = np.moveaxis(np.asarray(points, dtype=np.float64) - self.target, -1, 0)
+        down, along = math.sin(_ELEVATION), math.cos(_ELEVATION)
+        return x, y * down + z * along, y * along - z * down
+
+
+@contextmanager
+def space_painter(size: int) -> Iterator[SpacePainter]:
+    """Open a painter of scenes in space; what it holds is given back at the end of the block.
+
+    Args:
+        size: width of a picture, pixels; the height is three quarters of it.
+
+    Raises:
+        ValueError: the size is below 16 pixels.
+        NoGraphicsError: no library on this machine can draw.
+    """
+    if size < 16:
+        raise ValueError(f"cannot draw on {size} pixels; use 16 or more")
+    height = round(size * _ASPECT)
+    with gl.context(size, height) as context:
+        painter = SpacePainter(size, height, context)
+        try:
+            yield painter
+        finally:
+            painter.close()
+
+
+class SpacePainter:
+    """Draws scenes whose bodies say what they are models of; made by `space_painter`.
+
+    Attributes:
+        note: a sentence for the user about how pictures are drawn, or None.
+        camera: where the last picture was taken from.
+    """
+
+    camera: Camera
+
+    def __init__(self, width: int, height: int, context: gl.Context) -> None:
+        self.note = context.note
+        self._size = width, height
+        self._make_current = context.make_current
+        self._looks: object = None
+        self._renderer: mujoco.MjrContext | None = None
+
+    def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
+        """Draw one scene.
+
+        Args:
+            scene: what to draw; its window is the floor between the walls.
+            trail: earlier scenes of the same world, oldest first; bodies that leave a trail get one.
+
+        Shape:
+            [H, W, 3] uint8, red, green and blue; the first row is the top.
+
+        Raises:
+            ValueError: the window is empty, or a body has an unknown model or none.
+        """
+        self._make_current()
+        looks = scene.window, [(body.model, body.radius, body.color) for body in scene.bodies]
+        if looks != self._looks:
+            self._build(scene)
+            self._looks = looks
+        for k, body in enumerate(scene.bodies):
+            half = (body.heading or 0.0) / 2
+            self._data.mocap_pos[k, :2] = body.position
+            self._data.mocap_quat[k] = math.cos(half), 0, 0, math.sin(half)
+        mujoco.mj_forward(self._model, self._data)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._eye, everything, self._geoms)
+        self._add_trails(scene, trail)
+        width, height = self._size
+        picture = np.empty((height, width, 3), dtype=np.uint8)
+        rectangle = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(rectangle, self._geoms, self._renderer)
+        mujoco.mjr_readPixels(picture, None, rectangle, self._renderer)
+        return picture[::-1].copy()  # OpenGL counts rows from below
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        if self._renderer is not None:
+            self._make_current()
+            self._renderer.free()
+            self._renderer = None
+
+    def _build(self, scene: Scene) -> None:
+        """Make the model, camera and renderer for scenes that look like this one."""
+        model = model_of(scene, *self._size, _FIELD_OF_VIEW)  # first, so that what cannot be drawn changes nothing
+        self.close()
+        self._model = model
+        self._data = mujoco.MjData(self._model)
+        self._geoms = mujoco.MjvScene(self._model, _MAX_GEOMS)
+        self._option = mujoco.MjvOption()
+        self.camera = Camera.facing(scene.window, *self._size)
+        self._eye = mujoco.MjvCamera()
+        self._eye.azimuth, self._eye.elevation = 90, -math.degrees(_ELEVATION)
+        self._eye.lookat[:], self._eye.distance = self.camera.target, self.camera.distance
+        self._renderer = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
+
+    def _add_trails(self, scene: Scene, trail: Sequence[Scene]) -> None:
+        """Lay the ways that bodies have come on the floor, fading towards their beginnings."""
+        for body, path in trails(scene, trail):
+            points = np.array(_thinned(path, body.radius * _TRAIL_STEP))
+            half = body.radius * TRAIL_WIDTH / 2
+            for k, (start, end) in enumerate(pairwise(points)):
+                length = math.dist(start, end)
+                if length == 0.0:
+                    continue
+                levels = np.array([*fade(body.color, (k + 1) / (len(points) - 1)), 255], dtype=np.float32)
+                color = levels / np.float32(255)
+                along = (end - start) / length
+                left = np.array([-along[1], along[0]])
+                # Two triangles take a tenth of the time of a box. They are longer than the way by a width, so that
+                # no gap shows where it bends.
+                reach = np.array([length + 2 * half, 2 * half, 0.0])
+                self._add_triangle(start - half * (along + left), along, left, reach, color)
+                self._add_triangle(end + half * (along + left), -along, -left, reach, color)
+
+    def _add_triangle(
+        self, corner: _Array, along: _Array, left: _Array, reach: _Array, color: NDArray[np.float32]
+    ) -> None:
+        """Lay a right-angled triangle on the floor, if there is room for one more shape."""
+        if self._geoms.ngeom == self._geoms.maxgeom:
+            return
+        geom = self._geoms.geoms[self._geoms.ngeom]
+        turn = np.array([along[0], left[0], 0.0, along[1], left[1], 0.0, 0.0, 0.0, 1.0])
+        place = np.array([*corner, TRAIL_LAYER_M])
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_TRIANGLE, reach, place, turn, color)
+        geom.emission, geom.specular = GLOW, 0.0
+        self._geoms.ngeom += 1
+
+
+def _thinned(path: Sequence[tuple[float, float]], step: float) -> list[tuple[float, float]]:
+    """Return the points of a path that are at least a step from the one before, and its end."""
+    kept = [path[0]]
+    for point in path[1:-1]:
+        if math.dist(point, kept[-1]) >= step:
+            kept.append(point)
+    return [*kept, path[-1]]

@@ -1,0 +1,152 @@
+"""Films and pictures as files: GIF, MP4 and PNG, each written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from esp_cli.training.checkpoint import write_bytes_atomic
+
+Frame = NDArray[np.uint8]
+
+GIF_FRAMES_PER_SECOND = 50
+"""Players slow down a GIF that is faster."""
+_GIF_TICK_S = 0.01
+_COLORS = 255
+"""Of a GIF; one more marks what has not changed since the frame before."""
+_EXACT_COLORS = 64
+
+
+def write_gif(path: Path, frames: Iterable[Frame], seconds: Sequence[float], sample: Sequence[Frame]) -> None:
+    """Write frames as an endlessly repeated GIF.
+
+    Args:
+        path: where to.
+        frames: [H, W, 3] each, all of one size; taken one after the other, so they need not all be in memory.
+        seconds: how long each frame is in view.
+        sample: some of the frames, which the one palette of the film is made for.
+    """
+    palette = _palette(sample)
+    reduced = _reduced(frames, palette)
+    content = BytesIO()
+    next(reduced).save(
+        content,
+        "GIF",
+        save_all=True,
+        append_images=reduced,
+        duration=_milliseconds(seconds),
+        loop=0,
+        optimize=True,
+        transparency=_COLORS,
+        palette=palette.tobytes().ljust(3 * 256, b"\0"),
+    )
+    write_file(path, content.getvalue())
+
+
+def _milliseconds(seconds: Sequence[float]) -> list[int]:
+    """Round to the hundredths that a GIF knows, so that the errors do not add up."""
+    shortest = round(1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S))
+    ends = np.cumsum(seconds) / _GIF_TICK_S
+    ticks, shown = [], 0
+    for end in ends:
+        ticks.append(max(shortest, round(end) - shown))
+        shown += ticks[-1]
+    return [round(tick * _GIF_TICK_S * 1000) for tick in ticks]
+
+
+def _palette(sample: Sequence[Frame]) -> Frame:
+    """Return up to 255 colours for some frames: the most frequent as they are, the others by how they differ.
+
+    A small robot has few pixels, so the others count once each, however many pixels they have.
+    """
+    codes, counts = np.unique(np.concatenate([_codes(frame).ravel() for frame in sample]), return_counts=True)
+    colors = _colors(codes[np.argsort(-counts, kind="stable")])
+    frequent, others = colors[:_EXACT_COLORS], colors[_EXACT_COLORS:]
+    if len(others):
+        grouped = Image.fromarray(others[None]).quantize(_COLORS - _EXACT_COLORS).getpalette() or []
+        others = np.array(grouped, dtype=np.uint8).reshape(-1, 3)[: _COLORS - _EXACT_COLORS]
+    return np.concatenate([frequent, others])
+
+
+def _reduced(frames: Iterable[Frame], palette: Frame) -> Iterator[Image.Image]:
+    """Yield each frame in the nearest colours of the palette (Pillow's own search is off by some levels)."""
+    nearest = cKDTree(palette.astype(np.float64))
+    table = np.full(1 << 24, -1, dtype=np.int16)  # of all colours, filled as they are met
+    for frame in frames:
+        codes = _codes(frame)
+        new = np.unique(codes[table[codes] < 0])
+        if len(new):
+            table[new] = nearest.query(_colors(new).astype(np.float64))[1]
+        image = Image.fromarray(table[codes].astype(np.uint8))
+        image.putpalette(palette.tobytes())
+        yield image
+
+
+def _codes(frame: Frame) -> NDArray[np.uint32]:
+    """Return one number per pixel."""
+    red, green, blue = np.moveaxis(frame.astype(np.uint32), -1, 0)
+    return red << 16 | green << 8 | blue
+
+
+def _colors(codes: NDArray[np.uint32]) -> Frame:
+    """Return [K, 3] the colours behind numbers [K]."""
+    return np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)
+
+
+def mp4_library() -> Any:
+    """Return imageio-ffmpeg, which brings its own ffmpeg.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        return import_module("imageio_ffmpeg")
+    except ImportError:
+        raise ValueError('an MP4 needs an extra: pip install "esp-marl[video]"; or name a .gif file') from None
+
+
+def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
+    """Write frames as an MP4.
+
+    Raises:
+        ValueError: imageio-ffmpeg is not installed.
+    """
+    ffmpeg = mp4_library()
+    with TemporaryDirectory() as folder:
+        made = Path(folder) / "film.mp4"
+        writer = None
+        for frame in frames:
+            height, width = frame.shape[:2]
+            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # as the format wants it
+            if writer is None:
+                height, width = even.shape[:2]
+                writer = ffmpeg.write_frames(
+                    str(made), (width, height), fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
+                )
+                writer.send(None)
+            writer.send(np.ascontiguousarray(even))
+        if writer is not None:
+            writer.close()
+        write_file(path, made.read_bytes())
+
+
+def write_png(path: Path, picture: Frame) -> None:
+    """Write one picture."""
+    content = BytesIO()
+    Image.fromarray(picture).save(content, "PNG")
+    write_file(path, content.getvalue())
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file into a folder that may have to be made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes_atomic(path, content)
