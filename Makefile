@@ -15,14 +15,14 @@ PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope
 help: ## list what make can do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(VENV)/.installed ## train MAPPO with the symmetry prior, evaluate it and draw it as a GIF (about 3 minutes)
+demo: $(VENV)/.installed ## teach eight robots to change places, evaluate and draw them as a GIF (about 3 minutes)
 	@if [ -f $(DEMO)/config.json ]; then \
 	    echo "Going on with $(DEMO) (make clean starts anew)"; \
 	    $(BIN)/esp train --resume $(DEMO); \
 	else \
-	    $(BIN)/esp train --algo mappo --task navigation --steps 300k --seeds 2 --out $(DEMO); \
+	    $(BIN)/esp train --algo mappo --task formation --set task.convention=tight --steps 200k --out $(DEMO); \
 	fi
-	$(BIN)/esp eval $(DEMO)
+	$(BIN)/esp eval $(DEMO) --episodes 64
 	$(BIN)/esp render $(DEMO) -o $(DEMO)/demo.gif
 	@echo "Look at $(DEMO)/demo.gif"
 

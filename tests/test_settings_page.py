@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from esp_cli.algorithms.mappo import PRESETS, MappoConfig
+from esp_cli.algorithms.mappo import PRESETS, TUNED, MappoConfig
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "mappo.md"
 SECTIONS = {"mappo": MappoConfig, "network": NetworkConfig, "prior": PriorConfig, "evaluation": EvaluationConfig}
+TUNED_ROW = re.compile(r"^\| (\w+) \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
 ROW = re.compile(r"\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \|")
 
 
@@ -35,6 +36,17 @@ def expected() -> dict[str, tuple[str, ...]]:
             values = (field.default, paper.get(name, field.default))
             table[f"{section}.{name}"] = tuple(written(value) for value in values)
     return table
+
+
+def test_what_a_task_changes_stands_on_the_page():
+    rows = TUNED_ROW.findall(PAGE.read_text(encoding="utf-8"))
+    changed = {
+        (task, f"{section}.{name}", written(value))
+        for task, sections in TUNED.items()
+        for section, values in sections.items()
+        for name, value in values.items()
+    }
+    assert {(task, name, value.strip("`")) for task, name, value in rows} == changed
 
 
 def test_every_setting_stands_on_the_page_with_its_default_and_the_papers_value():
