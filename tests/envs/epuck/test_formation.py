@@ -198,7 +198,7 @@ def test_a_delayed_action_acts_later() -> None:
         ({"sensor_noise_m": 0.02}, {"obstacle", "goal", "robots"}),
         ({"heading_noise_rad": 0.1}, {"heading"}),
     ],
-    ids=str,
+    ids=["none", "places", "headings"],
 )
 def test_sensor_noise_disturbs_what_is_seen_and_nothing_else(settings: dict[str, object], differs: set[str]) -> None:
     env, clean = make("formation", 40, [0], settings), make("formation", 40, [0])
