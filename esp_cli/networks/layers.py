@@ -146,8 +146,9 @@ class _Perceptron(Function):
             grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
         grads: list[Tensor | None] = [None] * (2 * count)
         for k in reversed(range(count)):
-            grads[2 * k] = _outer(inputs[k], grad).float()
-            grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
+            if ctx.needs_input_grad[4 + 2 * k]:  # not where a critic only passes a gradient on to the actor
+                grads[2 * k] = _outer(inputs[k], grad).float()
+                grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
         grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None

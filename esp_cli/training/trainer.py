@@ -179,7 +179,7 @@ class Trainer:
     def _stop_broken_seeds(self, row: dict[str, Tensor]) -> None:
         """Put a seed whose numbers are not finite back to its last good state, for the rest of the run."""
         watched = [value for name, value in row.items() if "loss" in name or "grad_norm" in name]
-        finite = torch.stack(watched).isfinite().all(0)
+        finite = torch.stack([torch.ones(len(self.config.seeds)), *watched]).isfinite().all(0)
         for index in (~finite).nonzero().flatten().tolist():
             if index not in self.stopped_seeds:
                 self.stopped_seeds[index] = self.step
@@ -217,7 +217,8 @@ class Trainer:
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
             "task_version": self.learner.collector.env.spec.version,
         }
-        self.folder.write_checkpoint(self.step, self.learner.state_dict(), meta, self.is_complete)
+        complete = self.is_complete
+        self.folder.write_checkpoint(self.step, self.learner.state_dict(complete), meta, complete)
 
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start anew."""

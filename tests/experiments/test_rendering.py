@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from esp_cli.experiments.rendering import film, write_gif
-from esp_cli.networks.policy import Policy
+from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.evaluation import PolicyController
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.streams import generators
@@ -23,7 +23,8 @@ SEEDS = (3, 7)
 def trained(tmp_path) -> TrainedPolicy:
     config = tiny_config(seeds=SEEDS, task__horizon=6)
     spec = build_environment(config, 1, "shape").spec
-    return TrainedPolicy(config, Policy(spec, config.network, generators(SEEDS, "weights")), spec, 0, tmp_path)
+    policy = StochasticPolicy(spec, config.network, generators(SEEDS, "weights"))
+    return TrainedPolicy(config, policy, spec, 0, tmp_path)
 
 
 def test_a_film_shows_the_start_and_every_step_of_every_episode(trained):
