@@ -31,6 +31,7 @@ class MaddpgConfig(OffPolicyConfig):
 
     learning_rate: float = Field(1e-3, gt=0, description="of the critic; paper: 7e-4")
     actor_learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
+    td_lambda: float = Field(0.0, ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
     critic_input: Literal["state", "observations"] = Field(
         "observations", description="what the critic sees beside the joint action"
     )
@@ -50,7 +51,8 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
             "rounds": 20,
             "learning_rate": 7e-4,
             "actor_learning_rate": 7e-4,
-            "bootstrap_truncated": True,
+            "critic_sees_time": False,
+            "output_penalty": 0.0,
         },
         "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
         "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},

@@ -38,7 +38,7 @@ class OffPolicyConfig(LearnerConfig):
     adam_epsilon: float = Field(1e-5, gt=0)
     max_grad_norm: float = Field(10.0, gt=0)
     gamma: float = Field(0.99, ge=0, le=1)
-    td_lambda: float = Field(0.0, ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
+    td_lambda: float = Field(ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
     huber_delta: float = Field(10.0, gt=0)
     bootstrap_truncated: bool = Field(False, description="value the final state where the horizon cuts an episode")
     reward_decay: float = Field(0.999, gt=0, lt=1, description="of the reward statistics, per episode")

@@ -36,6 +36,7 @@ class QmixConfig(OffPolicyConfig):
     critic_input: Literal["state", "observations"] = Field(
         "state", description="what the mixer sees: the task's global state, or all agents' observations in a row"
     )
+    td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     mixer_width: int = Field(32, ge=1, le=1024, description="hidden units of the mixer")
     hyper_width: int = Field(64, ge=1, le=1024, description="hidden units of the hypernetwork")
     double_q: bool = Field(True, description="the online network chooses the next action, the target network values it")
@@ -45,7 +46,7 @@ class QmixConfig(OffPolicyConfig):
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "default": {"network": {"activation": "relu"}},
     "paper": {
-        "qmix": {"num_envs": 1, "rounds": 20, "learning_rate": 7e-4, "bootstrap_truncated": True},
+        "qmix": {"num_envs": 1, "rounds": 20, "learning_rate": 7e-4, "td_lambda": 0.0, "critic_sees_time": False},
         "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
         "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
     },
