@@ -231,17 +231,16 @@ class _Unrolled(Function):
         hidden = width // 3
         memories = projected.new_zeros(num_seeds, num_steps + 1, batch, hidden)
         gates = torch.empty_like(projected, memory_format=torch.contiguous_format)  # r, z, n of every step
-        inner = torch.empty_like(memories[:, 1:])  # h U_n + b_n
+        recurrent = torch.empty_like(gates)  # h U + b of every step
         for t in range(num_steps):
-            memory, gate = memories[:, t], gates[:, t]
-            recurrent = torch.baddbmm(bias, memory, weight)
-            opened = torch.add(projected[:, t, :, : 2 * hidden], recurrent[..., : 2 * hidden]).sigmoid_()
-            inner[:, t] = recurrent[..., 2 * hidden :]
+            memory, opened, candidate = memories[:, t], gates[:, t, :, : 2 * hidden], gates[:, t, :, 2 * hidden :]
+            torch.baddbmm(bias, memory, weight, out=recurrent[:, t])
+            torch.add(projected[:, t, :, : 2 * hidden], recurrent[:, t, :, : 2 * hidden], out=opened).sigmoid_()
             reset, update = opened.chunk(2, -1)
-            candidate = torch.addcmul(projected[:, t, :, 2 * hidden :], reset, inner[:, t]).tanh_()
-            gate[..., : 2 * hidden], gate[..., 2 * hidden :] = opened, candidate
-            memories[:, t + 1] = torch.lerp(candidate, memory, update)
-        ctx.save_for_backward(memories, gates, inner, weight)
+            inner = recurrent[:, t, :, 2 * hidden :]
+            torch.addcmul(projected[:, t, :, 2 * hidden :], reset, inner, out=candidate).tanh_()
+            torch.lerp(candidate, memory, update, out=memories[:, t + 1])
+        ctx.save_for_backward(memories, gates, recurrent[..., 2 * hidden :], weight)
         ctx.truncation = truncation
         return memories[:, 1:]
 
