@@ -162,7 +162,9 @@ class Maddpg(OffPolicyLearner):
         self.critic.requires_grad_(False)
         value = self._value_of_policy(seen[:, : learned.shape[1], :-1], self.head.relaxed(learned, drawn), used.action)
         self.critic.requires_grad_(True)
-        loss = -masked_mean(value, used.valid)
+        # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
+        # that Adam's epsilon slows the actor down.
+        loss = -(self.spec.horizon**0.5) * masked_mean(value, used.valid)
         policy_loss = loss
         loss = loss + self.config.output_penalty * masked_mean(self.head.penalty(learned), used.valid)
         if transforms and self.prior.config.coefficient > 0:
