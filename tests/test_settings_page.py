@@ -1,17 +1,20 @@
-"""The settings table of the MAPPO page says what the code says."""
+"""The settings table of each algorithm's page says what the code says."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from esp_cli.algorithms.mappo import PRESETS, TUNED, MappoConfig
+import pytest
+from pydantic import BaseModel
+
+from esp_cli.algorithms.registry import ALGORITHMS, PRESETS, TUNED
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 
-PAGE = Path(__file__).parents[1] / "docs" / "mappo.md"
-SECTIONS = {"mappo": MappoConfig, "network": NetworkConfig, "prior": PriorConfig, "evaluation": EvaluationConfig}
+DOCS = Path(__file__).parents[1] / "docs"
+SHARED: dict[str, type[BaseModel]] = {"network": NetworkConfig, "prior": PriorConfig, "evaluation": EvaluationConfig}
 TUNED_ROW = re.compile(r"^\| (\w+) \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
 ROW = re.compile(r"\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \|")
 
@@ -27,29 +30,38 @@ def written(value: object) -> str:
     return str(value)
 
 
-def expected() -> dict[str, tuple[str, ...]]:
+def expected(algorithm: str) -> dict[str, tuple[str, ...]]:
     """Return default and paper value of every setting."""
     table = {}
-    for section, model in SECTIONS.items():
-        paper = PRESETS["paper"].get(section, {})
+    for section, model in ({algorithm: ALGORITHMS[algorithm].config_class} | SHARED).items():
+        presets = [PRESETS[algorithm][preset].get(section, {}) for preset in ("default", "paper")]
         for name, field in model.model_fields.items():
-            values = (field.default, paper.get(name, field.default))
-            table[f"{section}.{name}"] = tuple(written(value) for value in values)
+            table[f"{section}.{name}"] = tuple(written(preset.get(name, field.default)) for preset in presets)
     return table
 
 
-def test_what_a_task_changes_stands_on_the_page():
-    rows = TUNED_ROW.findall(PAGE.read_text(encoding="utf-8"))
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_what_a_task_changes_stands_on_the_page(algorithm: str) -> None:
+    rows = TUNED_ROW.findall((DOCS / f"{algorithm}.md").read_text(encoding="utf-8"))
     changed = {
         (task, f"{section}.{name}", written(value))
-        for task, sections in TUNED.items()
+        for task, sections in TUNED.get(algorithm, {}).items()
         for section, values in sections.items()
         for name, value in values.items()
     }
     assert {(task, name, value.strip("`")) for task, name, value in rows} == changed
 
 
-def test_every_setting_stands_on_the_page_with_its_default_and_the_papers_value():
-    rows = ROW.findall(PAGE.read_text(encoding="utf-8"))
+def expected_on_its_page(algorithm: str) -> dict[str, tuple[str, ...]]:
+    """Return what the page of an algorithm states: shared settings stand on MAPPO's, unless their values differ."""
+    whole, elsewhere = expected(algorithm), expected("mappo")
+    if algorithm == "mappo":
+        return whole
+    return {name: values for name, values in whole.items() if elsewhere.get(name) != values}
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_setting_stands_on_the_page_with_its_default_and_the_papers_value(algorithm: str) -> None:
+    rows = ROW.findall((DOCS / f"{algorithm}.md").read_text(encoding="utf-8"))
     found = {f"{s}.{n}": (d.strip().strip("`"), p.strip().strip("`")) for s, n, d, p in rows}
-    assert found == expected()
+    assert found == expected_on_its_page(algorithm)

@@ -3,14 +3,38 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol
 
 import torch
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
-from esp_cli.algorithms.rollout import Collector
+from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.policy import Policy
-from esp_envs.base import generator_states, restore_generators
+from esp_cli.prior import PriorConfig
+from esp_envs.base import Environment, generator_states, restore_generators
+from esp_envs.spec import TaskSpec
+
+
+class LearnerConfig(BaseModel):
+    """What the hyperparameters of every algorithm have in common."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_envs: int
+
+
+class Worlds(Protocol):
+    """Acts in the training worlds and remembers where each stands."""
+
+    env: Environment
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a resumed run needs to go on bit for bit."""
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
 
 
 class Learner(ABC):
@@ -18,7 +42,16 @@ class Learner(ABC):
 
     A subclass sets the attributes below in its constructor and implements `iterate`.
 
+    Args:
+        env: the training worlds.
+        config: hyperparameters, of the subclass's `config_class`.
+        network: shape of the networks.
+        prior: the symmetry prior's settings; kind "none" gives the plain algorithm bit for bit.
+        generators: one CPU generator per seed for initial weights, action noise and minibatches.
+        prior_generators: one CPU generator per seed for the prior alone, so that it disturbs no other draw.
+
     Attributes:
+        config_class: model of its hyperparameters.
         policy: what acts, and what evaluation, rendering and export take.
         modules: every network and statistic with a seed axis, by name.
         optimisers: by name.
@@ -26,11 +59,28 @@ class Learner(ABC):
         generators: random generators by name, one per seed each.
     """
 
+    config_class: ClassVar[type[LearnerConfig]]
     policy: Policy
     modules: dict[str, nn.Module]
     optimisers: dict[str, torch.optim.Optimizer]
-    collector: Collector
+    collector: Worlds
     generators: dict[str, list[torch.Generator]]
+
+    @abstractmethod
+    def __init__(
+        self,
+        env: Environment,
+        config: Any,
+        network: NetworkConfig,
+        prior: PriorConfig,
+        generators: Sequence[torch.Generator],
+        prior_generators: Sequence[torch.Generator],
+    ) -> None: ...
+
+    @classmethod
+    @abstractmethod
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> Policy:
+        """Return new policies of the kind that this algorithm trains, one per generator."""
 
     @property
     @abstractmethod
@@ -45,8 +95,12 @@ class Learner(ABC):
             progress: share of the run that is done, 0 to 1, for schedules.
         """
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that a resumed run needs to go on bit for bit, as flat tensors."""
+    def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
+        """Return everything that a resumed run needs to go on bit for bit, as flat tensors.
+
+        Args:
+            complete: the run has come to its end, so what only further learning needs may be left out.
+        """
         out: dict[str, Tensor] = {}
         for name, module in self.modules.items():
             out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
@@ -65,12 +119,12 @@ class Learner(ABC):
         """
         try:
             for name, module in self.modules.items():
-                module.load_state_dict(_below(tensors, name))
+                module.load_state_dict(below(tensors, name))
             for name, optimiser in self.optimisers.items():
-                _load_optimiser(optimiser, _below(tensors, f"optimiser.{name}"))
+                _load_optimiser(optimiser, below(tensors, f"optimiser.{name}"))
             for name, generators in self.generators.items():
                 restore_generators(generators, tensors[f"generators.{name}"])
-            self.collector.load_state_dict(_below(tensors, "collector"))
+            self.collector.load_state_dict(below(tensors, "collector"))
         except (KeyError, RuntimeError, IndexError, TypeError) as error:
             reason = str(error).split("\n")[0]
             raise ValueError(f"the checkpoint does not fit this configuration ({reason})") from None
@@ -84,7 +138,7 @@ class Learner(ABC):
         return out
 
 
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the entries under `prefix.`, without it."""
     return {k[len(prefix) + 1 :]: v for k, v in tensors.items() if k.startswith(prefix + ".")}
 

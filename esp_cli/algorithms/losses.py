@@ -41,6 +41,37 @@ def gae(
     return advantage
 
 
+def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, td_lambda: float) -> Tensor:
+    """Return targets for action values: one-step, or TD(lambda) along the stored episode.
+
+    y_t = r_t + gamma (1 - ended_t) ((1 - lambda) Q(s_{t+1}) + lambda y_{t+1}), and y_T = Q(s_T).
+
+    Args:
+        reward: [S, B, T, C].
+        next_value: [S, B, T, C] target network's value of the state that really followed.
+        ended: [S, B, T, 1] bool; no value lies beyond.
+        gamma: discount factor.
+        td_lambda: 0 is the one-step target, 1 the discounted return of what was done.
+
+    Returns:
+        [S, B, T, C].
+    """
+    ahead = torch.where(ended, 0.0, gamma * next_value)
+    if td_lambda == 0:
+        return reward + ahead
+    step, decay = reward + (1 - td_lambda) * ahead, td_lambda * gamma * (~ended).to(reward.dtype)
+    target = reward + ahead
+    for t in reversed(range(reward.shape[2] - 1)):
+        target[:, :, t] = step[:, :, t] + decay[:, :, t] * target[:, :, t + 1]
+    return target
+
+
+def masked_mean(x: Tensor, valid: Tensor) -> Tensor:
+    """Return the mean per seed over what is valid: x [S, B, T, ...], valid [S, B, T] -> [S]."""
+    rows = x.flatten(3).mean(3) if x.dim() > 3 else x
+    return torch.where(valid, rows, 0.0).flatten(1).sum(1) / valid.flatten(1).sum(1).clamp_min(1)
+
+
 def normalise_per_seed(x: Tensor, epsilon: float = 1e-5) -> Tensor:
     """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed; x: [S, ...]."""
     axes = tuple(range(1, x.dim()))

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.batch import Batch
-from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.learner import Learner, LearnerConfig
 from esp_cli.algorithms.losses import (
     clip_gradients_per_seed,
     clipped_surrogate,
@@ -28,16 +28,15 @@ from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Collector, Rollout
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.critic import Critic, CriticInput
-from esp_cli.networks.policy import Policy
+from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment, Observation
+from esp_envs.spec import TaskSpec
 
 
-class MappoConfig(BaseModel):
+class MappoConfig(LearnerConfig):
     """Hyperparameters; every default stands here and nowhere else."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_envs: int = Field(32, ge=1, description="worlds per seed; MAPPO paper on MPE: 128")
     num_steps: int = Field(25, ge=1, description="steps per world and update")
@@ -112,21 +111,15 @@ PROBE_STEPS = 100
 
 
 class Mappo(Learner):
-    """The learner: policy, centralised critic, optimiser and prior of S seeds.
-
-    Args:
-        env: the training worlds.
-        config: hyperparameters.
-        network: shape of actor and critic.
-        prior: the symmetry prior's settings; kind "none" gives the plain algorithm bit for bit.
-        generators: one CPU generator per seed for initial weights, action noise and minibatches.
-        prior_generators: one CPU generator per seed for the prior alone, so that it disturbs no other draw.
+    """The learner: policy, centralised critic, optimiser and prior of S seeds; arguments as of `Learner`.
 
     Raises:
         ValueError: a recurrent network whose rollouts are not whole episodes, or more minibatches than rows.
     """
 
     config_class = MappoConfig
+    policy: StochasticPolicy
+    collector: Collector
 
     def __init__(
         self,
@@ -141,7 +134,7 @@ class Mappo(Learner):
         self.config, self.spec, self.device = config, spec, device
         self.generators = {"learner": list(generators), "prior": list(prior_generators)}
         self.prior = SymmetryPrior(prior, spec, device)
-        self.policy = Policy(spec, network, generators).to(device)
+        self.policy = self.build_policy(spec, network, generators).to(device)
         critic_network = network.model_copy(update={"activation": config.critic_activation})
         self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)
         self.num_values = self.critic.num_values
@@ -164,7 +157,14 @@ class Mappo(Learner):
         self.modules = {"policy": self.policy, "critic": self.critic, "normaliser": self.normaliser}
         self.optimisers = {"adam": self.optimiser}
         self.collector = Collector(env, self.policy, self.generators["learner"])
-        self._old: tuple[Policy, Critic] | None = None
+        self._old: tuple[StochasticPolicy, Critic] | None = None
+
+    @classmethod
+    def build_policy(
+        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
+    ) -> StochasticPolicy:
+        """Return new stochastic policies."""
+        return StochasticPolicy(spec, network, generators)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -313,7 +313,7 @@ class Mappo(Learner):
         if transforms and prior.coefficient > 0:
             originals = outputs[:, :count], values[:, :count]
             policy_gap, value_gap = self._consistency(originals, outputs[:, count:], values[:, count:], transforms)
-            loss = loss + prior.coefficient * (policy_gap + value_gap)
+            loss = loss + self.prior.penalty(policy_gap, value_gap)
         if sums is not None:
             ratio_gap = log_ratio.detach()[:, :count]
             ratio = ratio_gap.exp()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from esp_cli.algorithms.losses import masked_mean
+
 
 class ValueNormaliser(nn.Module):
     """Keeps value targets near mean 0, variance 1 per seed, so that one learning rate fits every reward scale.
@@ -26,10 +28,14 @@ class ValueNormaliser(nn.Module):
         self.register_buffer("square", torch.zeros(num_seeds))
         self.register_buffer("weight", torch.zeros(num_seeds))
 
-    def update(self, target: Tensor) -> None:
-        """Take in a batch of targets."""
+    def update(self, target: Tensor, valid: Tensor | None = None) -> None:
+        """Take in a batch of targets, those alone that are `valid` (of the same shape) where that is given."""
         flat = target.flatten(1)
-        for buffer, value in ((self.mean, flat.mean(1)), (self.square, flat.square().mean(1))):
+        if valid is None:
+            mean, square = flat.mean(1), flat.square().mean(1)
+        else:
+            mean, square = masked_mean(target, valid), masked_mean(target.square(), valid)
+        for buffer, value in ((self.mean, mean), (self.square, square)):
             buffer.mul_(self.decay).add_(value, alpha=1 - self.decay)
         self.weight.mul_(self.decay).add_(1 - self.decay)
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from esp_cli.algorithms import mappo
-from esp_cli.algorithms.mappo import Mappo
+from esp_cli.algorithms import maddpg, mappo, qmix
+from esp_cli.algorithms.learner import Learner
 
-ALGORITHMS: dict[str, type[Mappo]] = {"mappo": Mappo}
+ALGORITHMS: dict[str, type[Learner]] = {"mappo": mappo.Mappo, "maddpg": maddpg.Maddpg, "qmix": qmix.Qmix}
 
-PRESETS = {"mappo": mappo.PRESETS}
+PRESETS = {"mappo": mappo.PRESETS, "maddpg": maddpg.PRESETS, "qmix": qmix.PRESETS}
 """Per algorithm and preset: the settings, by section, that differ from the defaults."""
 
 TUNED = {"mappo": mappo.TUNED}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from esp_cli.networks.policy import Policy
+from esp_cli.networks.policy import StochasticPolicy
 from esp_envs.base import Environment, Observation
 
 
@@ -43,7 +43,7 @@ class Collector:
         generators: one CPU generator per seed for action noise.
     """
 
-    def __init__(self, env: Environment, policy: Policy, generators: Sequence[torch.Generator]) -> None:
+    def __init__(self, env: Environment, policy: StochasticPolicy, generators: Sequence[torch.Generator]) -> None:
         self.env, self.policy, self.generators = env, policy, generators
         self.observation = env.reset()
         self.memory = policy.initial_memory(env.num_envs, self.observation.obs)

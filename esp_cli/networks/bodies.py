@@ -112,17 +112,11 @@ class GRU(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
-        num_seeds, batch, num_steps = x.shape[:3]
-        projected = self.gru.input(self.body(x.flatten(1, 2))).unflatten(1, (batch, num_steps))
-        memory = self.initial_memory(num_seeds, batch, x)
-        history = []
-        for t in range(num_steps):
-            if truncation and t and t % truncation == 0:
-                memory = memory.detach()
-            memory = self.gru.advance(projected[:, :, t], memory)
-            history.append(memory)
-        rows = torch.stack(history, 2).flatten(1, 2)
-        return self.head(self.norm(rows)).unflatten(1, (batch, num_steps))
+        batch, num_steps = x.shape[1:3]
+        in_time_order = x.transpose(1, 2).flatten(1, 2)
+        projected = self.gru.input(self.body(in_time_order)).unflatten(1, (num_steps, batch))
+        rows = self.gru.unroll(projected, truncation).flatten(1, 2)
+        return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
 
 
 NETWORKS: dict[str, type[MLP] | type[GRU]] = {"mlp": MLP, "gru": GRU}

@@ -146,8 +146,9 @@ class _Perceptron(Function):
             grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
         grads: list[Tensor | None] = [None] * (2 * count)
         for k in reversed(range(count)):
-            grads[2 * k] = _outer(inputs[k], grad).float()
-            grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
+            if ctx.needs_input_grad[4 + 2 * k]:  # not where a critic only passes a gradient on to the actor
+                grads[2 * k] = _outer(inputs[k], grad).float()
+                grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
         grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None
@@ -210,3 +211,58 @@ class SeedGRU(nn.Module):
         reset, update = torch.sigmoid(xr + hr), torch.sigmoid(xz + hz)
         candidate = torch.tanh(torch.addcmul(xn, reset, hn))
         return torch.lerp(candidate, h, update)
+
+    def unroll(self, projected: Tensor, truncation: int = 0) -> Tensor:
+        """Advance through whole episodes from empty memory: [S, T, B, 3H] -> every memory [S, T, B, H].
+
+        The same as `advance` step by step, with a backward written by hand that makes one product for the gradient of
+        the weights of all steps; gradients through time are cut every `truncation` steps (0: never).
+        """
+        weight, bias = self.recurrent.weight, self.recurrent.bias
+        return _Unrolled.apply(projected, weight, bias, truncation)  # type: ignore[no-untyped-call]
+
+
+class _Unrolled(Function):
+    """All steps of a gated recurrent unit; `SeedGRU.advance` under autograd is the reference in the tests."""
+
+    @staticmethod
+    def forward(ctx, projected, weight, bias, truncation):  # type: ignore[no-untyped-def]
+        num_seeds, num_steps, batch, width = projected.shape
+        hidden = width // 3
+        memories = projected.new_zeros(num_seeds, num_steps + 1, batch, hidden)
+        gates = torch.empty_like(projected, memory_format=torch.contiguous_format)  # r, z, n of every step
+        recurrent = torch.empty_like(gates)  # h U + b of every step
+        for t in range(num_steps):
+            memory, opened, candidate = memories[:, t], gates[:, t, :, : 2 * hidden], gates[:, t, :, 2 * hidden :]
+            torch.baddbmm(bias, memory, weight, out=recurrent[:, t])
+            torch.add(projected[:, t, :, : 2 * hidden], recurrent[:, t, :, : 2 * hidden], out=opened).sigmoid_()
+            reset, update = opened.chunk(2, -1)
+            inner = recurrent[:, t, :, 2 * hidden :]
+            torch.addcmul(projected[:, t, :, 2 * hidden :], reset, inner, out=candidate).tanh_()
+            torch.lerp(candidate, memory, update, out=memories[:, t + 1])
+        ctx.save_for_backward(memories, gates, recurrent[..., 2 * hidden :], weight)
+        ctx.truncation = truncation
+        return memories[:, 1:]
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        memories, gates, inner, weight = ctx.saved_tensors
+        num_steps, hidden = grad.shape[1], grad.shape[3]
+        into, back = torch.empty_like(gates), torch.empty_like(gates)  # of x W and of h U + b
+        backwards, carry = weight.transpose(1, 2), torch.zeros_like(memories[:, 0])
+        for t in reversed(range(num_steps)):
+            reset, update, candidate = gates[:, t].chunk(3, -1)
+            carry = carry + grad[:, t]
+            blocked = carry - carry * update
+            inward = torch.ops.aten.tanh_backward(blocked, candidate)
+            opening = torch.cat([inward * inner[:, t], carry * (memories[:, t] - candidate)], -1)
+            gate = torch.ops.aten.sigmoid_backward(opening, gates[:, t, :, : 2 * hidden])
+            into[:, t, :, : 2 * hidden], into[:, t, :, 2 * hidden :] = gate, inward
+            back[:, t, :, : 2 * hidden], back[:, t, :, 2 * hidden :] = gate, inward * reset
+            if ctx.truncation and t % ctx.truncation == 0:
+                carry = torch.zeros_like(carry)
+            else:
+                carry = torch.baddbmm(carry * update, back[:, t], backwards)
+        rows = back.flatten(1, 2)
+        before = memories[:, :-1].flatten(1, 2)
+        return into, torch.bmm(before.transpose(1, 2), rows), rows.sum(1, keepdim=True), None

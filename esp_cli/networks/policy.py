@@ -1,4 +1,4 @@
-"""A policy: an actor network shared by all agents, and the head that reads its outputs."""
+"""Policies: an actor network shared by all agents, and the head that reads its outputs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.bodies import NetworkConfig, build_network
-from esp_cli.networks.heads import build_head
+from esp_cli.networks.exploration import ExploringHead
+from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head
 from esp_envs.spec import TaskSpec
 
 POLICY_GAIN = 0.01
@@ -22,14 +23,28 @@ class Policy(nn.Module):
         spec: the task.
         network: shape of the actor.
         generators: one CPU generator per seed, for the initial weights.
+        head: reads the actor's outputs.
+        output_gain: orthogonal gain of the actor's last layer.
+        num_extra: numbers per agent that the actor sees beside its observation.
     """
 
-    def __init__(self, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
+    head: Head
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        network: NetworkConfig,
+        generators: Sequence[torch.Generator],
+        head: Head,
+        output_gain: float,
+        num_extra: int = 0,
+    ) -> None:
         super().__init__()
         self.num_seeds = len(generators)
         self.num_agents = spec.num_agents
-        self.head = build_head(spec.action, self.num_seeds)
-        self.actor = build_network(generators, spec.observation.width, self.head.num_outputs, network, POLICY_GAIN)
+        self.head = head
+        inputs = spec.observation.width + num_extra
+        self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain)
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""
@@ -40,14 +55,87 @@ class Policy(nn.Module):
         outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
         return self.head.normalise(outputs.unflatten(1, obs.shape[1:3])), memory
 
+    def act(self, obs: Tensor, memory: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
+        outputs, memory = self.step(obs, memory)
+        action = self.head.mode(outputs) if noise is None else self.head.sample(outputs, noise)
+        return self.head.to_environment(action), memory
+
+
+class StochasticPolicy(Policy):
+    """A policy that is a distribution over actions, as on-policy learners need it."""
+
+    head: Categorical | BoundedGaussian
+
+    def __init__(self, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(spec, network, generators, build_head(spec.action, len(generators)), POLICY_GAIN)
+
     def unroll(self, obs: Tensor, truncation: int = 0) -> Tensor:
         """Return the normalised outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""
         rows = obs.transpose(2, 3).flatten(1, 2)
         outputs = self.actor.unroll(rows, truncation).unflatten(1, (obs.shape[1], obs.shape[3]))
         return self.head.normalise(outputs.transpose(2, 3))
 
+
+class HistoryPolicy(Policy):
+    """A policy that explores by a schedule; a recurrent one sees its history (a_0, o_1, a_1, ..., a_{t-1}, o_t).
+
+    The previous action is part of its memory [S, B * N, H + width]: zeros at the start of an episode, then the one-hot
+    of a discrete action or the numbers of a continuous one. A perceptron sees the observation alone.
+    """
+
+    head: ExploringHead
+
+    def __init__(
+        self,
+        spec: TaskSpec,
+        network: NetworkConfig,
+        generators: Sequence[torch.Generator],
+        head: ExploringHead,
+        output_gain: float,
+    ) -> None:
+        extra = head.action_width if network.name == "gru" else 0
+        super().__init__(spec, network, generators, head, output_gain, extra)
+        self.recurrent = self.actor.memory_width > 0
+
+    def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
+        """Return the memory [S, E * N, H + width] with which an episode begins; [S, E * N, 0] of a perceptron."""
+        hidden = super().initial_memory(num_envs, like)
+        return torch.nn.functional.pad(hidden, (0, self.head.action_width)) if self.recurrent else hidden
+
+    def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the normalised outputs for obs [S, E, N, D], and the memory, in which the action is still missing."""
+        if not self.recurrent:
+            return super().step(obs, memory)
+        hidden, previous = memory.split((self.actor.memory_width, self.head.action_width), -1)
+        outputs, hidden = self.actor.step(torch.cat([obs.flatten(1, 2), previous], -1), hidden)
+        return self.head.normalise(outputs.unflatten(1, obs.shape[1:3])), torch.cat([hidden, previous], -1)
+
+    def remember(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Put the action [S, E, N(, width)] that was really taken into the memory."""
+        if not self.recurrent:
+            return memory
+        return torch.cat([memory[..., : self.actor.memory_width], self.head.encode(action).flatten(1, 2)], -1)
+
     def act(self, obs: Tensor, memory: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
-        outputs, memory = self.step(obs, memory)
-        action = self.head.mode(outputs) if noise is None else self.head.sample(outputs, noise)
-        return self.head.to_environment(action), memory
+        action, memory = super().act(obs, memory, noise)
+        return action, self.remember(memory, action)
+
+    def unroll(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Return the normalised outputs over whole episodes, from empty memory.
+
+        Args:
+            obs: [S, B, T + 1, N, D]; the last row may be left out.
+            action: [S, B, T, N(, width)] what was done in each step.
+
+        Returns:
+            [S, B, T + 1, N, outputs], one row for each row of `obs`.
+        """
+        rows = obs.transpose(2, 3).flatten(1, 2)
+        if self.recurrent:
+            done = self.head.encode(action)
+            previous = torch.cat([torch.zeros_like(done[:, :, :1]), done], 2)[:, :, : obs.shape[2]]
+            rows = torch.cat([rows, previous.transpose(2, 3).flatten(1, 2)], -1)
+        outputs = self.actor.unroll(rows).unflatten(1, (obs.shape[1], obs.shape[3]))
+        return self.head.normalise(outputs.transpose(2, 3))

@@ -24,6 +24,13 @@ class PriorConfig(BaseModel):
     old_log_prob: Literal["copy", "recompute"] = Field(
         "copy", description="pi_old of a copied transition: that of the original, or evaluated anew on the copy (Eq. 7)"
     )
+    terms: Literal["both", "policy", "value"] = Field(
+        "both", description="consistency terms: S_pi and S_V (S_Q of an action-value critic), or one of them"
+    )
+    replay: Literal["sampled", "stored"] = Field(
+        "sampled",
+        description="off-policy learners: copies are made of drawn batches, or stored in the replay (paper: stored)",
+    )
     stop_gradient: Literal["none", "original", "transformed"] = Field(
         "none", description="which side of the consistency losses is held fixed; authors' code: none"
     )
@@ -32,6 +39,16 @@ class PriorConfig(BaseModel):
     def augments(self) -> bool:
         """Whether copies of transitions enter the learner's own loss."""
         return self.kind in ("esp", "augment")
+
+    @property
+    def augments_batches(self) -> bool:
+        """Whether an off-policy learner's loss takes copies of drawn batches."""
+        return self.augments and self.replay == "sampled"
+
+    @property
+    def augments_replay(self) -> bool:
+        """Whether copies of episodes enter an off-policy learner's replay."""
+        return self.augments and self.replay == "stored"
 
     @property
     def coefficient(self) -> float:

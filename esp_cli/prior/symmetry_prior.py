@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import Transform, carried_groups, transform_set
@@ -57,6 +58,21 @@ class SymmetryPrior:
         if self.config.copies == "all" or self.transforms.size == 1:
             return self.transforms.each()
         return [self.transforms.draw(generators)]
+
+    def for_replay(self, generators: Sequence[torch.Generator]) -> list[Transform]:
+        """Return the transforms whose copies of new episodes an off-policy learner stores beside them."""
+        return self.for_minibatch(generators) if self.config.augments_replay else []
+
+    def for_batch(self, generators: Sequence[torch.Generator]) -> list[Transform]:
+        """Return the transforms of the next batch out of a replay; none where nothing would use them."""
+        used = self.config.augments_batches or self.config.coefficient > 0
+        return self.for_minibatch(generators) if used else []
+
+    def penalty(self, policy_gap: Tensor | None, value_gap: Tensor | None) -> Tensor:
+        """Return c times the sum of the consistency terms that are on (Eq. 10); None is a term that isn't there."""
+        gaps = {"policy": policy_gap, "value": value_gap}
+        chosen = [gap for name, gap in gaps.items() if gap is not None and self.config.terms in ("both", name)]
+        return self.config.coefficient * sum(chosen, start=torch.zeros(()))
 
 
 def _probe(spec: TaskSpec, device: torch.device | str) -> list[Transform]:

@@ -123,7 +123,8 @@ def _build(
     needed = len(config.seeds) * sum(inputs * outputs for inputs, outputs in pairwise(widths))
     if min(widths) < 1 or needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
-    policy = Policy(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
+    build = ALGORITHMS[config.algorithm].build_policy
+    policy = build(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:

@@ -26,7 +26,9 @@ from esp_envs.base import Environment
 from esp_envs.registry import make
 
 CHECKPOINT_SECONDS = float(os.environ.get("ESP_CHECKPOINT_SECONDS", "30"))
-"""A kill loses at most this much work; a checkpoint takes some milliseconds. Set by ESP_CHECKPOINT_SECONDS."""
+"""Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
+CHECKPOINT_SPACING = 20
+"""A checkpoint takes milliseconds, with a large replay seconds: the next waits for as many times as long as it took."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ class Trainer:
         Raises:
             ValueError: every seed stopped on a number that is not finite.
         """
-        started, saved = time.monotonic() - self.elapsed_s, time.monotonic()
+        started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
         with MetricsWriter(self.folder.metrics_path, self.tensorboard, self.step) as writer:
             if self.iteration == 0:
                 self._record(writer, self._evaluate(), listener)
@@ -139,9 +141,9 @@ class Trainer:
                 row["time/elapsed_s"] = self.elapsed_s
                 going = self._record(writer, row, listener)
                 all_broken = len(self.stopped_seeds) == len(self.config.seeds)
-                if self.is_complete or not going or all_broken or tick - saved > CHECKPOINT_SECONDS:
-                    self._checkpoint()
-                    saved = time.monotonic()
+                if self.is_complete or not going or all_broken or tick > due:
+                    cost = self._checkpoint()
+                    due = time.monotonic() + max(CHECKPOINT_SECONDS, CHECKPOINT_SPACING * cost)
                 if all_broken:
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
                 if not going and not self.is_complete:
@@ -179,7 +181,7 @@ class Trainer:
     def _stop_broken_seeds(self, row: dict[str, Tensor]) -> None:
         """Put a seed whose numbers are not finite back to its last good state, for the rest of the run."""
         watched = [value for name, value in row.items() if "loss" in name or "grad_norm" in name]
-        finite = torch.stack(watched).isfinite().all(0)
+        finite = torch.stack([torch.ones(len(self.config.seeds)), *watched]).isfinite().all(0)
         for index in (~finite).nonzero().flatten().tolist():
             if index not in self.stopped_seeds:
                 self.stopped_seeds[index] = self.step
@@ -210,14 +212,18 @@ class Trainer:
         notes, self.notes = tuple(self.notes), []
         return listener(Progress(self.step, self.config.steps, values, notes))
 
-    def _checkpoint(self) -> None:
+    def _checkpoint(self) -> float:
+        """Write a checkpoint; return how many seconds that took."""
+        begun = time.monotonic()
         meta = {
             "iteration": self.iteration,
             "elapsed_s": self.elapsed_s,
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
             "task_version": self.learner.collector.env.spec.version,
         }
-        self.folder.write_checkpoint(self.step, self.learner.state_dict(), meta, self.is_complete)
+        complete = self.is_complete
+        self.folder.write_checkpoint(self.step, self.learner.state_dict(complete), meta, complete)
+        return time.monotonic() - begun
 
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start anew."""

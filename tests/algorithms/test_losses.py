@@ -11,7 +11,9 @@ from esp_cli.algorithms.losses import (
     explained_variance,
     gae,
     huber,
+    masked_mean,
     normalise_per_seed,
+    td_targets,
     value_loss,
 )
 
@@ -90,6 +92,38 @@ def test_explained_variance_of_perfect_constant_and_opposite_predictions():
     value = torch.tensor([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0], [3.0, 2.0, 1.0]])
     # residuals of the last: -2, 0, 2 with variance 8/3 against 2/3
     torch.testing.assert_close(explained_variance(value, target), torch.tensor([1.0, 0.0, -3.0]))
+
+
+def test_one_step_targets_by_hand_on_two_transitions():
+    """y = r + gamma Q(s'), and r alone where the episode ends."""
+    reward, following = row(1.0, 2.0), row(10.0, 20.0)
+    assert td_targets(reward, following, flags(False, True), 0.9, 0.0).flatten().tolist() == pytest.approx([10.0, 2.0])
+    assert td_targets(reward, following, flags(True, False), 0.9, 0.0).flatten().tolist() == pytest.approx([1.0, 20.0])
+
+
+def test_lambda_targets_by_hand_on_two_transitions():
+    """y_1 = 2 + 0.9 x 20 = 20; y_0 = 1 + 0.9 (0.5 x 10 + 0.5 x 20) = 14.5; nothing flows back over an end."""
+    reward, following = row(1.0, 2.0), row(10.0, 20.0)
+    never, first = flags(False, False), flags(True, False)
+    assert td_targets(reward, following, never, 0.9, 0.5).flatten().tolist() == pytest.approx([14.5, 20.0])
+    assert td_targets(reward, following, first, 0.9, 0.5).flatten().tolist() == pytest.approx([1.0, 20.0])
+
+
+def test_lambda_one_is_the_discounted_return_and_lambda_zero_the_one_step_target():
+    reward, following = torch.randn(2, 3, 6, 1), torch.randn(2, 3, 6, 1)
+    ended = torch.zeros(2, 3, 6, 1, dtype=torch.bool)
+    ended[:, :, -1] = True
+    returns = sum(0.9**t * reward[:, :, t] for t in range(6))
+    torch.testing.assert_close(td_targets(reward, following, ended, 0.9, 1.0)[:, :, 0], returns)
+    tiny = td_targets(reward, following, ended, 0.9, 1e-9)
+    torch.testing.assert_close(td_targets(reward, following, ended, 0.9, 0.0), tiny)
+
+
+def test_a_masked_mean_counts_what_is_valid_alone():
+    x = torch.tensor([[[1.0, 2.0], [3.0, torch.nan]], [[5.0, 5.0], [7.0, 7.0]]])
+    valid = torch.tensor([[[True, True], [True, False]], [[False, False], [False, False]]])
+    assert masked_mean(x, valid).tolist() == [2.0, 0.0]
+    assert masked_mean(torch.stack([x, x + 2], -1), valid).tolist() == [3.0, 0.0]
 
 
 def test_normalisation_is_per_seed():

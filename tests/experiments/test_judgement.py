@@ -9,7 +9,7 @@ import torch
 
 from esp_cli.experiments import judgement
 from esp_cli.experiments.judgement import judge, summary
-from esp_cli.networks.policy import Policy
+from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.evaluation import HeuristicController, play
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.streams import generators
@@ -21,7 +21,8 @@ def untrained(tmp_path, seeds=(3, 7), **choice) -> TrainedPolicy:
     """Policies with their first weights, which depend on the seeds alone."""
     config = tiny_config(seeds=seeds, **choice)
     spec = build_environment(config, 1, "shape").spec
-    return TrainedPolicy(config, Policy(spec, config.network, generators(seeds, "weights")), spec, 0, tmp_path)
+    policy = StochasticPolicy(spec, config.network, generators(seeds, "weights"))
+    return TrainedPolicy(config, policy, spec, 0, tmp_path)
 
 
 def test_the_summary_by_hand():

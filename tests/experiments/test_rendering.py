@@ -23,7 +23,7 @@ from esp_cli.experiments.rendering import (
     write_film,
     write_picture,
 )
-from esp_cli.networks.policy import Policy
+from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.evaluation import PolicyController
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.streams import generators
@@ -40,7 +40,8 @@ RED, BLUE = "#ff0000", "#0000ff"
 def trained(tmp_path) -> TrainedPolicy:
     config = tiny_config(seeds=SEEDS, task__horizon=6)
     spec = build_environment(config, 1, "shape").spec
-    return TrainedPolicy(config, Policy(spec, config.network, generators(SEEDS, "weights")), spec, 0, tmp_path)
+    policy = StochasticPolicy(spec, config.network, generators(SEEDS, "weights"))
+    return TrainedPolicy(config, policy, spec, 0, tmp_path)
 
 
 @pytest.fixture

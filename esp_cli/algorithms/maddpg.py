@@ -1,0 +1,210 @@
+"""MADDPG (Lowe et al., 2017), plain or with a symmetry prior.
+
+Agents share one deterministic actor that sees what an agent sees; a critic that sees everything values joint actions.
+The actor climbs the critic's gradient. Supplement eq. 19 is added to the critic's loss, Eq. 8 to the actor's.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from esp_cli.algorithms.losses import huber, masked_mean
+from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
+from esp_cli.algorithms.replay import EpisodeBatch
+from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.exploration import ActorHead, build_actor_head
+from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
+from esp_cli.prior import PriorConfig, policy_consistency_loss
+from esp_cli.symmetry import Transform
+from esp_envs.base import Environment
+from esp_envs.spec import TaskSpec
+
+
+class MaddpgConfig(OffPolicyConfig):
+    """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
+
+    learning_rate: float = Field(1e-3, gt=0, description="of the critic; paper: 7e-4")
+    actor_learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
+    td_lambda: float = Field(0.0, ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
+    critic_input: Literal["state", "observations"] = Field(
+        "observations", description="what the critic sees beside the joint action"
+    )
+    critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
+    tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")
+    actor_actions: Literal["own", "all"] = Field(
+        "own", description="the actor's gradient: each agent's action alone is the policy's, or all agents' are"
+    )
+    output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
+
+
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
+    "default": {"network": {"activation": "relu"}},
+    "paper": {
+        "maddpg": {
+            "num_envs": 1,
+            "rounds": 20,
+            "learning_rate": 7e-4,
+            "actor_learning_rate": 7e-4,
+            "critic_sees_time": False,
+            "output_penalty": 0.0,
+        },
+        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
+        "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+    },
+}
+"""What a preset changes; "paper" is supplement table 3 with the MAPPO paper's defaults where it is silent."""
+
+
+class Maddpg(OffPolicyLearner):
+    """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`.
+
+    The critic is a perceptron with recurrent actors too: it sees all that there is to see at a step.
+    """
+
+    config_class = MaddpgConfig
+
+    def __init__(
+        self,
+        env: Environment,
+        config: MaddpgConfig,
+        network: NetworkConfig,
+        prior: PriorConfig,
+        generators: Sequence[torch.Generator],
+        prior_generators: Sequence[torch.Generator],
+    ) -> None:
+        super().__init__(env, config, network, prior, generators, prior_generators)
+        self.config, spec = config, self.spec
+        self.head: ActorHead = self.policy.head  # type: ignore[assignment]
+        self.num_values = 1 if spec.shared_reward else spec.num_agents
+        perceptron = network.model_copy(update={"name": "mlp", "activation": config.critic_activation})
+        width = self.critic_width + spec.num_agents * self.head.action_width
+        self.critic = build_network(generators, width, self.num_values, perceptron, 1.0).to(self.device)
+        self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
+        self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
+        self.actor_parameters, self.critic_parameters = list(self.policy.parameters()), list(self.critic.parameters())
+        self.actor_optimiser = adam(self.actor_parameters, config.actor_learning_rate, config.adam_epsilon)
+        self.critic_optimiser = adam(self.critic_parameters, config.learning_rate, config.adam_epsilon)
+        self.modules |= {
+            "critic": self.critic,
+            "target_policy": self.target_policy,
+            "target_critic": self.target_critic,
+        }
+        self.optimisers = {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
+        self._own = torch.eye(spec.num_agents, dtype=torch.bool, device=self.device).unsqueeze(-1)
+
+    @classmethod
+    def build_policy(
+        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
+    ) -> HistoryPolicy:
+        """Return new policies with the actor's head that fits the actions."""
+        return HistoryPolicy(spec, network, generators, build_actor_head(spec.action, len(generators)), POLICY_GAIN)
+
+    def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Take one gradient step of the critic, then one of the actor, then move the targets."""
+        transforms = self.prior.for_batch(self.generators["prior"])
+        rows = self._with_copies(batch, transforms)
+        seen = self._critic_rows(rows)
+        metrics = self._learn_critic(batch, rows, seen, transforms) | self._learn_actor(batch, rows, seen, transforms)
+        with torch.no_grad():
+            targets: list[Tensor] = [*self.target_policy.parameters(), *self.target_critic.parameters()]
+            torch._foreach_lerp_(targets, [*self.actor_parameters, *self.critic_parameters], self.config.tau)
+        return metrics
+
+    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
+        """Return S_pi and S_Q of a batch with its copies."""
+        values = self._value(self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
+        valid = rows.valid[:, : rows.valid.shape[1] // (1 + len(transforms))]
+        outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
+        return {
+            "policy": self._policy_gap(outputs, valid, transforms),
+            "value": self._value_gap(values, valid, transforms),
+        }
+
+    def _learn_critic(
+        self, batch: EpisodeBatch, rows: EpisodeBatch, seen: Tensor, transforms: list[Transform]
+    ) -> dict[str, Tensor]:
+        """Take one gradient step down L_TD + c S_Q."""
+        count = batch.obs.shape[1]
+        values = self._value(seen[:, :, :-1], self.head.encode(rows.action))
+        target = self._targets(batch, seen[:, :count])
+        learned, valid = values[:, :count], batch.valid
+        if self.prior.config.augments_batches:
+            learned, valid, target = values, rows.valid, self._targets_with_copies(target, transforms)
+        error = huber(learned - target, self.config.huber_delta)
+        loss = masked_mean(error, valid)
+        if transforms and self.prior.config.coefficient > 0:
+            loss = loss + self.prior.penalty(None, self._value_gap(values, batch.valid, transforms))
+        norm = self._step(self.critic_optimiser, self.critic_parameters, loss)
+        return {
+            "td_loss": masked_mean(error[:, :count], batch.valid),
+            "value": masked_mean(values[:, :count], batch.valid),
+            "critic_grad_norm": norm,
+        }
+
+    def _learn_actor(
+        self, batch: EpisodeBatch, rows: EpisodeBatch, seen: Tensor, transforms: list[Transform]
+    ) -> dict[str, Tensor]:
+        """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi."""
+        count = batch.obs.shape[1]
+        outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
+        noise = [torch.rand(batch.obs.shape[1:2] + outputs.shape[2:], generator=g) for g in self.generators["learner"]]
+        drawn = torch.stack(noise).to(self.device)
+        learned, used = outputs[:, :count], batch
+        if self.prior.config.augments_batches:
+            learned, used = outputs, rows
+            drawn = drawn.repeat(1, 1 + len(transforms), *[1] * (drawn.dim() - 2))
+        self.critic.requires_grad_(False)
+        value = self._value_of_policy(seen[:, : learned.shape[1], :-1], self.head.relaxed(learned, drawn), used.action)
+        self.critic.requires_grad_(True)
+        # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
+        # that Adam's epsilon slows the actor down.
+        loss = -(self.spec.horizon**0.5) * masked_mean(value, used.valid)
+        policy_loss = loss
+        loss = loss + self.config.output_penalty * masked_mean(self.head.penalty(learned), used.valid)
+        if transforms and self.prior.config.coefficient > 0:
+            loss = loss + self.prior.penalty(self._policy_gap(outputs, batch.valid, transforms), None)
+        norm = self._step(self.actor_optimiser, self.actor_parameters, loss)
+        metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
+        return metrics | {name: masked_mean(x, used.valid) for name, x in self.head.statistics(learned).items()}
+
+    def _value(self, seen: Tensor, action: Tensor) -> Tensor:
+        """Return Q [S, B, T, C] of encoded joint actions [S, B, T, N, width]."""
+        return self.critic.unroll(torch.cat([seen, action.flatten(-2)], -1))
+
+    def _value_of_policy(self, seen: Tensor, own: Tensor, stored: Tensor) -> Tensor:
+        """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
+
+        Args:
+            seen: [S, B, T, critic width].
+            own: [S, B, T, N, width] the policy's encoded actions.
+            stored: [S, B, T, N(, width)] what was done.
+        """
+        if self.config.actor_actions == "all":
+            return self._value(seen, own)
+        agents = self.spec.num_agents
+        joint = torch.where(self._own, own.unsqueeze(3), self.head.encode(stored).unsqueeze(3))
+        views = torch.cat([seen.unsqueeze(3).expand(*seen.shape[:3], agents, -1), joint.flatten(-2)], -1)
+        values = self.critic.unroll(views.flatten(2, 3)).unflatten(2, (-1, agents))
+        return values.squeeze(-1) if self.num_values == 1 else values.diagonal(dim1=-2, dim2=-1)
+
+    @torch.no_grad()
+    def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
+        """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
+        outputs = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
+        following = self.head.encode(self.head.mode(outputs))
+        next_value = self.target_critic.unroll(torch.cat([seen[:, :, 1:], following.flatten(-2)], -1))
+        return self._td_targets(batch, batch.reward, next_value)
+
+    def _policy_gap(self, outputs: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
+        """Return S_pi (Eq. 8) per seed, averaged over the copies; outputs [S, B (1 + copies), T, N, ...]."""
+        original, *copies = outputs.split(valid.shape[1], 1)
+        stop, head = self.prior.config.stop_gradient, self.head
+        parts = zip(copies, transforms, strict=True)
+        gaps = [policy_consistency_loss(head.divergence, head.pull_back(p, g), original, stop) for p, g in parts]
+        return torch.stack([masked_mean(gap, valid) for gap in gaps]).mean(0)

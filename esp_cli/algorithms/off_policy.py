@@ -1,0 +1,238 @@
+"""What MADDPG and QMIX share: collect whole episodes, store them, draw batches, take gradient steps."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from esp_cli.algorithms.episodes import EpisodeCollector
+from esp_cli.algorithms.learner import Learner, LearnerConfig, below
+from esp_cli.algorithms.losses import clip_gradients_per_seed, masked_mean, td_targets
+from esp_cli.algorithms.normalisation import ValueNormaliser
+from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
+from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.policy import HistoryPolicy
+from esp_cli.prior import PriorConfig, SymmetryPrior, value_consistency_loss
+from esp_cli.symmetry import Transform
+from esp_envs.base import Environment
+
+
+class OffPolicyConfig(LearnerConfig):
+    """Hyperparameters of both off-policy learners; every default stands here, or in the algorithm's own file."""
+
+    num_envs: int = Field(8, ge=1, description="worlds per seed, one episode each a round; paper: 1")
+    rounds: int = Field(1, ge=1, description="rounds of collecting and learning between two lines of metrics")
+    updates_per_episode: int = Field(1, ge=1, description="gradient steps per collected episode")
+    batch_episodes: int = Field(32, ge=1, description="episodes per seed of a gradient step")
+    replay_episodes: int = Field(5000, ge=1, description="episodes that each seed remembers")
+    warmup_episodes: int = Field(5, ge=0, description="episodes of random actions before learning begins")
+    epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
+    epsilon_finish: float = Field(0.05, ge=0, le=1)
+    epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
+    learning_rate: float = Field(gt=0)
+    adam_epsilon: float = Field(1e-5, gt=0)
+    max_grad_norm: float = Field(10.0, gt=0)
+    gamma: float = Field(0.99, ge=0, le=1)
+    td_lambda: float = Field(ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
+    huber_delta: float = Field(10.0, gt=0)
+    bootstrap_truncated: bool = Field(False, description="value the final state where the horizon cuts an episode")
+    reward_decay: float = Field(0.999, gt=0, lt=1, description="of the reward statistics, per episode")
+    critic_input: Literal["state", "observations"]
+    critic_sees_time: bool = Field(True, description="the critic (the mixer) also sees the share of the horizon gone")
+
+
+class OffPolicyLearner(Learner):
+    """Replay, behaviour, targets and the prior's copies; a subclass says what a gradient step is.
+
+    Arguments as of `Learner`.
+
+    Raises:
+        ValueError: the replay cannot hold what one round collects.
+    """
+
+    policy: HistoryPolicy
+    collector: EpisodeCollector
+
+    def __init__(
+        self,
+        env: Environment,
+        config: OffPolicyConfig,
+        network: NetworkConfig,
+        prior: PriorConfig,
+        generators: Sequence[torch.Generator],
+        prior_generators: Sequence[torch.Generator],
+    ) -> None:
+        spec, device = env.spec, env.device
+        self.off_policy, self.spec, self.device = config, spec, device
+        self.generators = {"learner": list(generators), "prior": list(prior_generators)}
+        self.prior = SymmetryPrior(prior, spec, device)
+        per_round = config.num_envs * (1 + self.prior.num_copies * prior.augments_replay)
+        if per_round > config.replay_episodes:
+            raise ValueError(
+                f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
+            )
+        self.policy = self.build_policy(spec, network, generators).to(device)  # type: ignore[assignment]
+        self.reward_scale = ValueNormaliser(env.num_seeds, config.reward_decay**config.num_envs).to(device)
+        self.replay = EpisodeReplay(spec, env.num_seeds, config.replay_episodes, device)
+        self.collector = EpisodeCollector(env, self.policy, self.generators["learner"])
+        self.modules = {"policy": self.policy, "reward_scale": self.reward_scale}
+        self.episodes = self.updates = 0
+        self._time = torch.linspace(0, 1, spec.horizon + 1, device=device).unsqueeze(1)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps per seed of one iteration."""
+        return self.off_policy.rounds * self.off_policy.num_envs * self.spec.horizon
+
+    @property
+    def critic_width(self) -> int:
+        """Numbers that the critic or the mixer sees of a state."""
+        spec, config = self.spec, self.off_policy
+        seen = spec.state.width if config.critic_input == "state" else spec.num_agents * spec.observation.width
+        return seen + config.critic_sees_time
+
+    def iterate(self, progress: float) -> dict[str, Tensor]:
+        """Collect episodes, learn from the replay, and return metrics, each [S]."""
+        config, sums, returns = self.off_policy, dict[str, Tensor](), []
+        learned = 0
+        for _ in range(config.rounds):
+            self.policy.head.explore(self._epsilon())
+            episodes, mean_return = self.collector.collect()
+            returns.append(mean_return)
+            self._store(episodes)
+            if self.episodes < config.warmup_episodes:
+                continue
+            for _ in range(config.num_envs * config.updates_per_episode):
+                batch = self.replay.sample(config.batch_episodes, self.generators["learner"])
+                for name, value in self.update(batch).items():
+                    sums[name] = sums.get(name, 0.0) + value.detach()
+                self.updates += 1
+                learned += 1
+        metrics = {"train/return": torch.stack(returns).mean(0), "train/epsilon": self.policy.head.epsilon.clone()}
+        metrics["train/augmented_share"] = torch.full_like(mean_return, self.prior.augmented_share)
+        if learned:
+            metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
+            metrics |= self._symmetry_errors(batch)
+        return metrics
+
+    @abstractmethod
+    def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Take one gradient step on a batch of originals and return what is logged of it, each [S]."""
+
+    @abstractmethod
+    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
+        """Return the symmetry errors, by name and [S] each, of a batch with its copies behind it."""
+
+    def _epsilon(self) -> float:
+        """Return the exploration of the next round."""
+        config = self.off_policy
+        if self.episodes < config.warmup_episodes:
+            return 1.0
+        share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
+        return config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
+
+    def _store(self, episodes: EpisodeBatch) -> None:
+        """Remember episodes and, where the prior says so, their copies; originals alone enter the statistics."""
+        valid = episodes.valid.unsqueeze(-1).expand(episodes.reward.shape)
+        self.reward_scale.update(episodes.reward.flatten(2), valid.flatten(2))
+        self.replay.add(episodes)
+        for g in self.prior.for_replay(self.generators["prior"]):
+            self.replay.add(episodes.transformed(g))
+        self.episodes += self.off_policy.num_envs
+
+    def _with_copies(self, batch: EpisodeBatch, transforms: list[Transform]) -> EpisodeBatch:
+        """Return the batch with its transformed copies behind it along the batch axis."""
+        return EpisodeBatch.concatenate([batch, *(batch.transformed(g) for g in transforms)])
+
+    def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
+        """Return what the critic or the mixer sees of every state: [S, B, T + 1, critic width]."""
+        rows = batch.state if self.off_policy.critic_input == "state" else batch.obs.flatten(-2)
+        if not self.off_policy.critic_sees_time:
+            return rows
+        return torch.cat([rows, self._time.expand(*rows.shape[:3], 1)], -1)
+
+    @torch.no_grad()
+    def _td_targets(self, batch: EpisodeBatch, reward: Tensor, next_value: Tensor) -> Tensor:
+        """Return targets [S, B, T, C] from standardised rewards and the target network's values of what followed.
+
+        Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
+        values, and with them S_Q and c, mean about the same in every task.
+        """
+        config = self.off_policy
+        ended = batch.terminated.clone()
+        if not config.bootstrap_truncated:
+            ended[:, :, -1] = True
+        reward = self.reward_scale.normalise(reward) * self.spec.horizon**-0.5
+        return td_targets(reward, next_value, ended.unsqueeze(-1), config.gamma, config.td_lambda)
+
+    def _targets_with_copies(self, target: Tensor, transforms: list[Transform]) -> Tensor:
+        """Return targets for originals and copies: a copy keeps that of its original (Prop. 1)."""
+        per_agent = target.shape[-1] > 1
+        return torch.cat([target, *(g.per_agent(target) if per_agent else target for g in transforms)], 1)
+
+    def _value_gap(self, values: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
+        """Return S_Q = E[(Q(s, a) - Q(L_g s, K_g a))^2] (supplement eq. 19) per seed, averaged over the copies.
+
+        Args:
+            values: [S, B (1 + copies), T, C], originals first.
+            valid: [S, B, T] of the originals.
+            transforms: one per copy.
+        """
+        original, *copies = values.split(valid.shape[1], 1)
+        stop = self.prior.config.stop_gradient
+        parts = zip(copies, transforms, strict=True)
+        gaps = [masked_mean(value_consistency_loss(g.values(q), original, stop), valid) for q, g in parts]
+        return torch.stack(gaps).mean(0)
+
+    def _step(self, optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor) -> Tensor:
+        """Take one step down the losses [S] of all seeds; return their gradient norms [S] before clipping."""
+        optimiser.zero_grad(set_to_none=True)
+        loss.sum().backward(inputs=parameters)
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        norm = clip_gradients_per_seed(gradients, self.off_policy.max_grad_norm)
+        optimiser.step()
+        return norm
+
+    @torch.no_grad()
+    def _symmetry_errors(self, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Measure how far the networks are from symmetry, prior or not, on fixed elements."""
+        probe = self.prior.probe
+        if not probe:
+            return {}
+        rows = self._with_copies(batch.first(PROBE_EPISODES), probe)
+        return {f"train/{name}_symmetry_error": gap for name, gap in self.gaps(rows, probe).items()}
+
+    def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
+        """Return what a resumed run needs; a complete run's replay is left out."""
+        out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}
+        return (
+            out if complete else out | {f"replay.{name}": tensor for name, tensor in self.replay.state_dict().items()}
+        )
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: tensors of another shape or name, so of another configuration.
+        """
+        super().load_state_dict(tensors)
+        replay = below(tensors, "replay")
+        if "counters" not in tensors or tensors["counters"].shape != (2,):
+            raise ValueError("the checkpoint does not fit this configuration (it has no counters)")
+        self.episodes, self.updates = tensors["counters"].tolist()
+        if replay:
+            self.replay.load_state_dict(replay)
+
+
+PROBE_EPISODES = 4
+"""Episodes per seed on which the symmetry errors are measured once an iteration."""
+
+
+def adam(parameters: Iterable[nn.Parameter], learning_rate: float, epsilon: float) -> torch.optim.Adam:
+    """Return an optimiser for networks of all seeds."""
+    return torch.optim.Adam(parameters, learning_rate, eps=epsilon, fused=True)

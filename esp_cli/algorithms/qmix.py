@@ -1,0 +1,153 @@
+"""QMIX (Rashid et al., 2018), plain or with a symmetry prior.
+
+Every agent has action values of its own, from one network that all share; a mixer that is monotonic in them makes the
+team's value Q_tot, so that each agent's best action is its part of the team's. Temporal differences on Q_tot, with
+the consistency loss of supplement eq. 19 added to them.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from esp_cli.algorithms.losses import huber, masked_mean
+from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
+from esp_cli.algorithms.replay import EpisodeBatch
+from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.exploration import EpsilonGreedy
+from esp_cli.networks.heads import best
+from esp_cli.networks.mixer import MonotonicMixer
+from esp_cli.networks.policy import HistoryPolicy
+from esp_cli.prior import PriorConfig
+from esp_cli.symmetry import Transform
+from esp_envs.base import Environment
+from esp_envs.spec import Discrete, TaskSpec
+
+
+class QmixConfig(OffPolicyConfig):
+    """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
+
+    learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
+    critic_input: Literal["state", "observations"] = Field(
+        "state", description="what the mixer sees: the task's global state, or all agents' observations in a row"
+    )
+    td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
+    mixer_width: int = Field(32, ge=1, le=1024, description="hidden units of the mixer")
+    hyper_width: int = Field(64, ge=1, le=1024, description="hidden units of the hypernetwork")
+    double_q: bool = Field(True, description="the online network chooses the next action, the target network values it")
+    target_every: int = Field(100, ge=1, description="gradient steps between hard copies into the target networks")
+
+
+PRESETS: dict[str, dict[str, dict[str, object]]] = {
+    "default": {"network": {"activation": "relu"}},
+    "paper": {
+        "qmix": {"num_envs": 1, "rounds": 20, "learning_rate": 7e-4, "td_lambda": 0.0, "critic_sees_time": False},
+        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
+        "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+    },
+}
+"""What a preset changes; "paper" is supplement table 3 with the MAPPO paper's defaults where it is silent."""
+
+VALUE_GAIN = 0.1
+"""Orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards."""
+
+
+class Qmix(OffPolicyLearner):
+    """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`.
+
+    Raises:
+        ValueError: continuous actions.
+    """
+
+    config_class = QmixConfig
+
+    def __init__(
+        self,
+        env: Environment,
+        config: QmixConfig,
+        network: NetworkConfig,
+        prior: PriorConfig,
+        generators: Sequence[torch.Generator],
+        prior_generators: Sequence[torch.Generator],
+    ) -> None:
+        super().__init__(env, config, network, prior, generators, prior_generators)
+        self.config = config
+        widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
+        self.mixer = MonotonicMixer(generators, *widths).to(self.device)
+        self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
+        self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
+        self.parameters = [*self.policy.parameters(), *self.mixer.parameters()]
+        self.optimiser = adam(self.parameters, config.learning_rate, config.adam_epsilon)
+        self.modules |= {
+            "mixer": self.mixer,
+            "target_policy": self.target_policy,
+            "target_mixer": self.target_mixer,
+        }
+        self.optimisers = {"adam": self.optimiser}
+
+    @classmethod
+    def build_policy(
+        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
+    ) -> HistoryPolicy:
+        """Return new epsilon-greedy policies.
+
+        Raises:
+            ValueError: continuous actions.
+        """
+        if not isinstance(spec.action, Discrete):
+            raise ValueError(
+                f"qmix chooses among discrete actions, but those of this {spec.name} are continuous; "
+                "use maddpg or mappo, or discrete actions"
+            )
+        return HistoryPolicy(spec, network, generators, EpsilonGreedy(spec.action, len(generators)), VALUE_GAIN)
+
+    def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Take one gradient step down L_TD + c S_Q."""
+        config, count = self.config, batch.obs.shape[1]
+        transforms = self.prior.for_batch(self.generators["prior"])
+        rows = self._with_copies(batch, transforms)
+        utilities = self.policy.unroll(rows.obs, rows.action)
+        values = self._total(utilities, rows)
+        target = self._targets(batch, utilities[:, :count].detach())
+
+        learned, valid = values[:, :count], batch.valid
+        if self.prior.config.augments_batches:
+            learned, valid, target = values, rows.valid, self._targets_with_copies(target, transforms)
+        error = huber(learned - target, config.huber_delta)
+        loss = masked_mean(error, valid)
+        if transforms and self.prior.config.coefficient > 0:
+            loss = loss + self.prior.penalty(None, self._value_gap(values, batch.valid, transforms))
+        norm = self._step(self.optimiser, self.parameters, loss)
+        if (self.updates + 1) % config.target_every == 0:
+            self.target_policy.load_state_dict(self.policy.state_dict())
+            self.target_mixer.load_state_dict(self.mixer.state_dict())
+        return {
+            "td_loss": masked_mean(error[:, :count], batch.valid),
+            "value": masked_mean(values[:, :count], batch.valid),
+            "grad_norm": norm,
+        }
+
+    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
+        """Return S_Q of a batch with its copies."""
+        values = self._total(self.policy.unroll(rows.obs, rows.action), rows)
+        count = values.shape[1] // (1 + len(transforms))
+        return {"value": self._value_gap(values, rows.valid[:, :count], transforms)}
+
+    def _total(self, utilities: Tensor, rows: EpisodeBatch) -> Tensor:
+        """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A]."""
+        chosen = utilities[:, :, :-1].gather(-1, rows.action.unsqueeze(-1)).squeeze(-1)
+        return self.mixer(chosen, self._critic_rows(rows)[:, :, :-1]).unsqueeze(-1)
+
+    @torch.no_grad()
+    def _targets(self, batch: EpisodeBatch, utilities: Tensor) -> Tensor:
+        """Return y = r + gamma Q_tot^-(s', argmax_a Q(o', a)) for the originals: [S, B, T, 1]."""
+        following = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
+        chooser = utilities[:, :, 1:] if self.config.double_q else following
+        chosen = following.gather(-1, best(chooser).unsqueeze(-1)).squeeze(-1)
+        next_value = self.target_mixer(chosen, self._critic_rows(batch)[:, :, 1:]).unsqueeze(-1)
+        return self._td_targets(batch, batch.reward.mean(-1, keepdim=True), next_value)

@@ -1,0 +1,136 @@
+"""Off-policy experience: whole episodes, kept per seed until newer ones take their place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from esp_cli.symmetry import Transform
+from esp_envs.spec import Discrete, TaskSpec
+
+
+@dataclass
+class EpisodeBatch:
+    """B whole episodes for each of S seeds; rows past the end of an episode are not valid.
+
+    Shape:
+        obs [S, B, T + 1, N, D] and state [S, B, T + 1, Ds], the last row being the final one,
+        action [S, B, T, N(, width)], reward [S, B, T, C] with C = 1 if shared, else N,
+        terminated and valid [S, B, T] bool.
+    """
+
+    obs: Tensor
+    state: Tensor
+    action: Tensor
+    reward: Tensor
+    terminated: Tensor
+    valid: Tensor
+
+    def transformed(self, g: Transform) -> EpisodeBatch:
+        """Return (L_g o, L_g s, K_g a) of whole episodes; rewards stay (Eq. 5), or move with their agents."""
+        reward = g.per_agent(self.reward) if self.reward.shape[-1] > 1 else self.reward
+        return EpisodeBatch(
+            g.obs(self.obs), g.state(self.state), g.action(self.action), reward, self.terminated, self.valid
+        )
+
+    def first(self, count: int) -> EpisodeBatch:
+        """Return the first `count` episodes of each seed; views."""
+        return self._map(lambda x: x[:, :count])
+
+    @staticmethod
+    def concatenate(parts: list[EpisodeBatch]) -> EpisodeBatch:
+        """Put batches behind each other along the batch axis."""
+        if len(parts) == 1:
+            return parts[0]
+        return EpisodeBatch(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> EpisodeBatch:
+        return EpisodeBatch(**{name: function(tensor) for name, tensor in vars(self).items()})
+
+
+class EpisodeReplay:
+    """The last `capacity` episodes of every seed, allocated at once on the training device.
+
+    All seeds write in step, so one cursor serves them all; nothing else is shared between seeds.
+
+    Args:
+        spec: the task.
+        num_seeds: S.
+        capacity: episodes per seed.
+        device: where the episodes lie.
+    """
+
+    def __init__(self, spec: TaskSpec, num_seeds: int, capacity: int, device: torch.device) -> None:
+        self.capacity, self.size, self.cursor = capacity, 0, 0
+        lead = (num_seeds, capacity)
+        steps, agents = spec.horizon, spec.num_agents
+        discrete = isinstance(spec.action, Discrete)
+        action = (agents,) if isinstance(spec.action, Discrete) else (agents, spec.action.width)
+
+        def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.empty(*lead, *shape, dtype=dtype, device=device)
+
+        self._store = EpisodeBatch(
+            obs=room(steps + 1, agents, spec.observation.width),
+            state=room(steps + 1, spec.state.width),
+            action=room(steps, *action, dtype=torch.int16 if discrete else torch.float32),
+            reward=room(steps, 1 if spec.shared_reward else agents),
+            terminated=room(steps, dtype=torch.bool),
+            valid=room(steps, dtype=torch.bool),
+        )
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the whole store."""
+        return sum(tensor.nbytes for tensor in vars(self._store).values())
+
+    def add(self, episodes: EpisodeBatch) -> None:
+        """Store episodes; the oldest give way.
+
+        Raises:
+            ValueError: more episodes at once than there is room for.
+        """
+        count = episodes.obs.shape[1]
+        if count > self.capacity:
+            raise ValueError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
+        places = (self.cursor + torch.arange(count, device=episodes.obs.device)) % self.capacity
+        for name, tensor in vars(self._store).items():
+            tensor.index_copy_(1, places, getattr(episodes, name).to(tensor.dtype))
+        self.cursor = (self.cursor + count) % self.capacity
+        self.size = min(self.size + count, self.capacity)
+
+    def select(self, places: Tensor) -> EpisodeBatch:
+        """Return the episodes at `places` [S, B]; each seed's come from its own store."""
+        num_seeds = places.shape[0]
+        rows = (places + self.capacity * torch.arange(num_seeds, device=places.device).unsqueeze(1)).flatten()
+        batch = self._store._map(lambda x: x.flatten(0, 1).index_select(0, rows).unflatten(0, places.shape))
+        if batch.action.dtype == torch.int16:
+            batch.action = batch.action.long()
+        return batch
+
+    def sample(self, count: int, generators: list[torch.Generator]) -> EpisodeBatch:
+        """Draw `count` episodes per seed, uniformly and with replacement, each seed by its own generator."""
+        places = [torch.randint(self.size, (count,), generator=g) for g in generators]
+        return self.select(torch.stack(places).to(self._store.obs.device))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the filled part and the cursor."""
+        filled = {name: tensor[:, : self.size] for name, tensor in vars(self._store).items()}
+        return filled | {"cursor": torch.tensor(self.cursor)}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: episodes of another task or another number of seeds, or more than fit.
+        """
+        size = tensors["obs"].shape[1]
+        for name, tensor in vars(self._store).items():
+            saved = tensors[name]
+            if size > self.capacity or saved.shape != tensor[:, :size].shape:
+                raise ValueError("the saved episodes do not fit into the replay of this configuration")
+            tensor[:, :size] = saved
+        self.size, self.cursor = size, int(tensors["cursor"]) % self.capacity

@@ -1,0 +1,200 @@
+"""Heads of learners that explore by a schedule: epsilon-greedy values, exploring choices, noisy bounded actions.
+
+Each has one number `epsilon` per seed, which the learner moves and which is kept with the policy, so that a policy file
+still knows how its last behaviour explored.
+Shapes: outputs [S, ..., N, outputs], action [S, ..., N] (discrete) or [S, ..., N, width].
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from esp_cli.networks.heads import Categorical, Head, best, same_disc, squash
+from esp_cli.symmetry import Transform
+from esp_envs.spec import ActionSpace, Continuous, Discrete
+
+
+class ExploringHead(Head):
+    """A head with a measure of exploration per seed.
+
+    Attributes:
+        action_width: numbers of an encoded action.
+        epsilon: [S] in [0, 1].
+    """
+
+    action_width: int
+
+    def __init__(self, num_seeds: int) -> None:
+        nn.Module.__init__(self)  # not super(): the constructor of a head beside this one wants other arguments
+        self.epsilon: Tensor
+        self.register_buffer("epsilon", torch.ones(num_seeds))
+
+    def explore(self, epsilon: float) -> None:
+        """Set the measure of exploration of all seeds."""
+        self.epsilon.fill_(epsilon)
+
+    @abstractmethod
+    def encode(self, action: Tensor) -> Tensor:
+        """Return actions as numbers that a network can read: [..., N, action_width]."""
+
+    def _epsilon(self, like: Tensor) -> Tensor:
+        return self.epsilon.view(-1, *[1] * (like.dim() - 1))
+
+
+class EpsilonGreedy(ExploringHead):
+    """Outputs are action values; the best action, or with probability epsilon a uniformly random one."""
+
+    def __init__(self, space: Discrete, num_seeds: int) -> None:
+        super().__init__(num_seeds)
+        self.num_outputs = self.action_width = space.count
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw, per seed, whether to explore and where to: uniform [S, *shape, 2]."""
+        return torch.stack([torch.rand((*shape, 2), generator=g, device=g.device) for g in generators])
+
+    def normalise(self, outputs: Tensor) -> Tensor:
+        """Return the action values as they are."""
+        return outputs
+
+    def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Explore where the first number is below epsilon; the second then names the action."""
+        whether, where = noise.unbind(-1)
+        anything = (where * self.num_outputs).long().clamp_(max=self.num_outputs - 1)
+        return torch.where(whether < self._epsilon(whether), anything, self.mode(outputs))
+
+    def mode(self, outputs: Tensor) -> Tensor:
+        """Return the action of the largest value."""
+        return best(outputs)
+
+    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
+        """Return the mean squared difference of the values: [S, B, N]."""
+        return (p - q).square().mean(-1)
+
+    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
+        """Return the values that give action a what `outputs` give to K_g a."""
+        return transform.pull_back(outputs)
+
+    def to_environment(self, action: Tensor) -> Tensor:
+        """Return the action as it is."""
+        return action
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Return one-hot rows."""
+        return one_hot(action, self.num_outputs).float()
+
+
+class ExploringCategorical(ExploringHead, Categorical):
+    """One of A actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""
+
+    def __init__(self, space: Discrete, num_seeds: int) -> None:
+        super().__init__(num_seeds)
+        self.num_outputs = self.action_width = space.count
+
+    def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
+        """Draw an action from the mixture by inverting its cumulative distribution at `noise`."""
+        share = self._epsilon(log_probs)
+        return Categorical.sample(self, ((1 - share) * log_probs.exp() + share / self.num_outputs).log(), noise)
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Return one-hot rows."""
+        return one_hot(action, self.num_outputs).float()
+
+    def relaxed(self, log_probs: Tensor, noise: Tensor) -> Tensor:
+        """Draw one-hot actions [..., A] through which gradients flow (straight-through Gumbel-softmax).
+
+        Forward: the one-hot of argmax(log p + Gumbel), which is a draw from p. Backward: the gradient of
+        softmax(log p + Gumbel) (Jang et al., 2017, at temperature 1).
+
+        Args:
+            log_probs: normalised outputs.
+            noise: uniform in [0, 1), of the same shape.
+        """
+        gumbel = -(-(noise.clamp(1e-7, 1 - 1e-7)).log()).log()
+        soft = torch.softmax(log_probs + gumbel, -1)
+        hard = one_hot(best(soft), self.num_outputs).to(soft.dtype)
+        return hard + (soft - soft.detach())
+
+    def penalty(self, log_probs: Tensor) -> Tensor:
+        """Return the mean square of the centred logits, which keeps a policy from getting too sure: [S, B, N]."""
+        return (log_probs - log_probs.mean(-1, keepdim=True)).square().mean(-1)
+
+    def statistics(self, log_probs: Tensor) -> dict[str, Tensor]:
+        """Return what is worth logging of the outputs: the entropy without epsilon, [S, B, N]."""
+        return {"entropy": self.entropy(log_probs)}
+
+
+class BoundedPoint(ExploringHead):
+    """A deterministic bounded action; behaviour adds Gaussian noise of deviation epsilon and goes back to the bounds.
+
+    Planar vectors are bounded by the unit disc, other numbers by [-1, 1]. Squash, noise and bounds commute with every
+    rotation and reflection of the action.
+    """
+
+    def __init__(self, space: Continuous, num_seeds: int) -> None:
+        super().__init__(num_seeds)
+        self.num_outputs = self.action_width = space.width
+        self.disc: Tensor
+        self.register_buffer("disc", same_disc(space), False)
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+        """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
+        full = (*shape, self.num_outputs)
+        return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
+
+    def normalise(self, outputs: Tensor) -> Tensor:
+        """Return the actions within their bounds."""
+        return squash(outputs, self.disc)
+
+    def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Return the action plus noise, back within the bounds."""
+        noisy = outputs + self._epsilon(outputs) * noise
+        return noisy / (noisy.square() @ self.disc).sqrt().clamp_min(1.0)
+
+    def mode(self, outputs: Tensor) -> Tensor:
+        """Return the action itself."""
+        return outputs
+
+    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
+        """Return |p - q|^2 / 2, the KL of two Gaussians of deviation 1 around the actions: [S, B, N]."""
+        return 0.5 * (p - q).square().sum(-1)
+
+    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
+        """Return K_g^{-1} applied to the actions."""
+        return transform.pull_back_mean(outputs)
+
+    def to_environment(self, action: Tensor) -> Tensor:
+        """Return the action as it is."""
+        return action
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Return the action's own numbers."""
+        return action
+
+    def relaxed(self, outputs: Tensor, noise: Tensor) -> Tensor:
+        """Return the action itself, through which gradients flow."""
+        return outputs
+
+    def penalty(self, outputs: Tensor) -> Tensor:
+        """Return the mean square of the action's numbers: [S, B, N]."""
+        return outputs.square().mean(-1)
+
+    def statistics(self, outputs: Tensor) -> dict[str, Tensor]:
+        """Return what is worth logging of the outputs: the share of actions at their bounds, [S, B, N]."""
+        length = (outputs.square() @ self.disc).sqrt()
+        return {"saturation": (length > SATURATED).float().mean(-1)}
+
+
+SATURATED = 0.99
+"""Length from which a bounded action counts as one at its bounds."""
+
+ActorHead = ExploringCategorical | BoundedPoint
+
+
+def build_actor_head(space: ActionSpace, num_seeds: int) -> ActorHead:
+    """Return the head of a deterministic or straight-through actor that fits an action space."""
+    return ExploringCategorical(space, num_seeds) if isinstance(space, Discrete) else BoundedPoint(space, num_seeds)

@@ -1,0 +1,94 @@
+"""MADDPG's own arithmetic: targets, the actor's gradient, target networks, and the policy's consistency."""
+
+import pytest
+import torch
+
+from tests.algorithms.off_policy import learner, turn
+
+
+def prepared(**choice):
+    trained = learner("maddpg", algo__gamma=0.5, **choice)
+    episodes, _ = trained.collector.collect()
+    trained._store(episodes)
+    return trained, episodes
+
+
+def linear_critic(trained, weights):
+    """Replace the critic by Q = weights . (joint action), blind to the rest."""
+    width = weights.numel()
+    trained.critic.unroll = lambda x: (x[..., -width:] * weights).sum(-1, keepdim=True)
+    trained.target_critic.unroll = trained.critic.unroll
+
+
+def test_targets_by_hand_on_the_last_two_transitions():
+    """The target policy's greedy actions, valued by the target critic; nothing beyond a terminal horizon."""
+    trained, episodes = prepared(task__num_agents=2, prior__kind="none")
+    trained.reward_scale.normalise = lambda x: 5.0 * x  # undoes the division by the root of 25 steps
+    linear_critic(trained, torch.arange(10.0))
+    outputs = torch.zeros(2, 2, 26, 2, 5)
+    outputs[:, :, 24, 0, 3] = outputs[:, :, 24, 1, 1] = 1.0  # encoded at 3 and 5 + 1
+    trained.target_policy.unroll = lambda obs, action: outputs
+    y = trained._targets(episodes, trained._critic_rows(episodes))
+    torch.testing.assert_close(y[:, :, 23], episodes.reward[:, :, 23] + 0.5 * 9.0)
+    torch.testing.assert_close(y[:, :, 24], episodes.reward[:, :, 24])
+
+
+@pytest.mark.parametrize(("rule", "product"), [("own", False), ("all", True)])
+def test_whose_actions_are_the_policys(rule, product):
+    """With Q = (sum of the agents' action numbers) squared, own and all see different partners."""
+    trained, episodes = prepared(task__num_agents=2, task__actions="continuous", algo__actor_actions=rule)
+    trained.critic.unroll = lambda x: x[..., -4:].sum(-1, keepdim=True).square()
+    own = torch.full((2, 2, 25, 2, 2), 0.25)
+    stored = torch.full((2, 2, 25, 2, 2), -0.25)
+    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, stored)
+    assert value.shape == (2, 2, 25, 1 if product else 2)
+    expected = 1.0 if product else 0.0  # four quarters, or two and minus two
+    torch.testing.assert_close(value, torch.full_like(value, expected))
+
+
+def test_values_of_ones_own_are_taken_where_rewards_are_ones_own():
+    trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none")
+    trained.critic.unroll = lambda x: torch.arange(3.0).expand(*x.shape[:-1], 3)
+    own = trained.head.encode(episodes.action)
+    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, episodes.action)
+    torch.testing.assert_close(value, torch.arange(3.0).expand(2, 2, 25, 3))
+
+
+def test_the_actor_climbs_the_critic_and_leaves_it_alone():
+    trained, episodes = prepared(prior__kind="none", algo__output_penalty=0.0)
+    linear_critic(trained, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0] * 3))  # every agent should move right
+    before = [p.clone() for p in trained.critic.parameters()]
+    seen = trained._critic_rows(episodes)
+    for _ in range(150):
+        trained._learn_actor(episodes, episodes, seen, [])
+    probability = trained.policy.unroll(episodes.obs[:, :, :-1], episodes.action).exp()[..., 2]
+    assert probability.mean() > 0.8
+    assert all(torch.equal(p, q) for p, q in zip(before, trained.critic.parameters(), strict=True))
+    assert all(p.requires_grad and p.grad is None for p in trained.critic.parameters())
+
+
+def test_target_networks_go_a_small_part_of_the_way():
+    trained, episodes = prepared(algo__tau=0.25)
+    start = trained.target_critic.layers[0].weight.clone()
+    trained.update(episodes)
+    torch.testing.assert_close(
+        trained.target_critic.layers[0].weight, 0.75 * start + 0.25 * trained.critic.layers[0].weight.detach()
+    )
+
+
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_the_policy_consistency_vanishes_for_a_policy_that_turns_with_the_world_alone(actions):
+    trained, episodes = prepared(task__actions=actions, prior__transforms="rot90")
+    g = turn(trained.spec)
+    rows = trained._with_copies(episodes, [g])
+    velocity = rows.obs[:, :, :-1, :, :2]
+    if actions == "discrete":
+        follow = torch.log_softmax(velocity @ torch.tensor(trained.spec.action.points).T, -1)
+        stubborn = torch.log_softmax(torch.arange(5.0), 0).expand(follow.shape)
+    else:
+        follow = velocity
+        stubborn = torch.tensor([1.0, 0.0]).expand(follow.shape)
+    assert trained._policy_gap(follow, episodes.valid, [g]).max() < 1e-6
+    assert trained._policy_gap(stubborn, episodes.valid, [g]).min() > 0.1
+    if actions == "continuous":  # (1, 0) pulled back is (0, -1): |(1, 1)|^2 / 2
+        torch.testing.assert_close(trained._policy_gap(stubborn, episodes.valid, [g]), torch.ones(2))

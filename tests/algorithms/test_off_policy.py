@@ -1,0 +1,215 @@
+"""MADDPG and QMIX with and without the prior: what must be equal bit for bit, and what must not."""
+
+import pytest
+import torch
+
+from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.training.config import resolve_config
+from tests.algorithms.off_policy import after, equal, learner, networks, turn
+
+ALGORITHMS = ["maddpg", "qmix"]
+both = pytest.mark.parametrize("algorithm", ALGORITHMS)
+
+
+@both
+def test_no_copies_and_no_coefficient_is_the_plain_algorithm_bit_for_bit(algorithm):
+    plain, _ = after(algorithm, prior__kind="none")
+    silent, _ = after(algorithm, prior__kind="consistency", prior__consistency_coef=0.0)
+    spoken, _ = after(algorithm, prior__kind="consistency", prior__consistency_coef=1e-3)
+    assert equal(plain, silent)
+    assert not equal(plain, spoken), "negative control: a coefficient does change the run"
+
+
+@both
+@pytest.mark.parametrize("kind", ["esp", "augment", "consistency"])
+@pytest.mark.parametrize("replay", ["sampled", "stored"])
+def test_each_mean_of_the_prior_changes_the_run(algorithm, kind, replay):
+    plain, _ = after(algorithm, prior__kind="none")
+    other, _ = after(algorithm, prior__kind=kind, prior__replay=replay)
+    assert not equal(plain, other)
+
+
+@both
+@pytest.mark.parametrize("network", ["mlp", "gru"])
+@pytest.mark.parametrize("kind", ["none", "esp"])
+def test_same_seed_same_run(algorithm, network, kind):
+    first, _ = after(algorithm, network__name=network, prior__kind=kind)
+    second, _ = after(algorithm, network__name=network, prior__kind=kind)
+    assert equal(first, second)
+
+
+@both
+@pytest.mark.parametrize(
+    "choice", [{"prior__kind": "none"}, {"prior__replay": "stored"}, {"network__name": "gru"}, {}], ids=str
+)
+def test_a_seed_learns_the_same_alone_and_among_others(algorithm, choice):
+    """Up to the rounding of float32: 1e-4 of a weight, 1e-5 absolutely, after eight gradient steps."""
+    together, _ = after(algorithm, seeds=(7, 8, 9), **choice)
+    alone, _ = after(algorithm, seeds=(8,), **choice)
+    for name, tensor in alone.items():
+        torch.testing.assert_close(tensor[0], together[name][1], rtol=1e-4, atol=1e-5)
+    assert not any(torch.equal(together[name][0], together[name][1]) for name in together if name.endswith("weight"))
+
+
+@both
+@pytest.mark.parametrize("network", ["mlp", "gru"])
+@pytest.mark.parametrize("replay", ["sampled", "stored"])
+def test_a_learner_restored_between_iterations_goes_on_bit_for_bit_with_its_replay(algorithm, network, replay):
+    choice = {"network__name": network, "prior__replay": replay}
+    straight, halted = learner(algorithm, **choice), learner(algorithm, **choice)
+    for _ in range(3):
+        straight.iterate(0.0)
+        halted.iterate(0.0)
+    resumed = learner(algorithm, **choice)
+    resumed.load_state_dict({name: tensor.clone() for name, tensor in halted.state_dict().items()})
+    for _ in range(3):
+        ours, theirs = straight.iterate(0.0), resumed.iterate(0.0)
+        assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert equal(straight.state_dict(), resumed.state_dict())
+    assert (straight.episodes, straight.updates) == (24, 24)
+    other = learner(algorithm, **choice)
+    other.load_state_dict({n: t for n, t in halted.state_dict().items() if not n.startswith("replay")})
+    assert other.replay.size == 0, "a complete run's checkpoint has no replay"
+
+
+@both
+def test_a_complete_run_leaves_its_replay_behind(algorithm):
+    trained = learner(algorithm)
+    trained.iterate(0.0)
+    assert any(name.startswith("replay") for name in trained.state_dict())
+    assert not any(name.startswith("replay") for name in trained.state_dict(complete=True))
+
+
+@both
+def test_another_configuration_is_refused_in_one_sentence(algorithm):
+    saved = learner(algorithm).state_dict()
+    for choice in ({"network__hidden": [9]}, {"seeds": (0, 1, 2)}):
+        with pytest.raises(ValueError, match=r"does not fit this configuration|are given for|do not fit"):
+            learner(algorithm, **choice).load_state_dict(saved)
+    del saved["counters"]
+    with pytest.raises(ValueError, match="it has no counters"):
+        learner(algorithm).load_state_dict(saved)
+
+
+@both
+def test_random_episodes_come_first_and_epsilon_falls_linearly(algorithm):
+    trained = learner(algorithm, algo__epsilon_steps=400, algo__epsilon_finish=0.2, algo__warmup_episodes=4)
+    before = networks(trained)
+    seen = [trained.iterate(0.0)["train/epsilon"] for _ in range(6)]
+    # an iteration is two rounds of two episodes of 25 steps; logged is the epsilon of its second round
+    shares = torch.stack([(torch.tensor(100.0 * k + 50) / 400).clamp(max=1) for k in range(6)])
+    expected = 1 - 0.8 * shares
+    expected[0] = 1.0
+    torch.testing.assert_close(torch.stack(seen), expected.unsqueeze(1).expand(6, 2))
+    assert not equal(before, networks(trained))
+    waiting = learner(algorithm, algo__warmup_episodes=100)
+    metrics = waiting.iterate(0.0)
+    assert equal(
+        {k: v for k, v in before.items() if "epsilon" not in k},
+        {k: v for k, v in networks(waiting).items() if "epsilon" not in k},
+    )
+    assert set(metrics) == {"train/return", "train/epsilon", "train/augmented_share"}
+
+
+@both
+def test_every_iteration_logs_what_the_page_promises(algorithm):
+    _, metrics = after(algorithm)
+    names = (
+        "return epsilon augmented_share td_loss value value_symmetry_error "
+        + {
+            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error",
+            "qmix": "grad_norm",
+        }[algorithm]
+    )
+    assert set(metrics[-1]) == {f"train/{name}" for name in names.split()}
+    assert all(value.shape == (2,) and value.isfinite().all() for value in metrics[-1].values())
+    assert metrics[-1]["train/augmented_share"].tolist() == [0.5, 0.5]
+
+
+EVERYTHING = [
+    {"prior__transforms": "d4*agents"},
+    {"prior__transforms": "c4", "prior__copies": "all"},
+    {"prior__transforms": "c4", "prior__copies": "all", "prior__replay": "stored", "algo__replay_episodes": 40},
+    {"task__convention": "pettingzoo", "prior__transforms": "agents"},
+    {"task": "predator-prey", "task__prey": "fleeing", "network__name": "gru"},
+    {"task": "predator-prey", "task__control": "prey"},
+    {"task__num_agents": 1, "algo__td_lambda": 0.5},
+    {"algo__bootstrap_truncated": True, "algo__critic_sees_time": False},
+    {"prior__stop_gradient": "original", "prior__terms": "value", "network__layer_norm": True},
+]
+CONTINUOUS = [
+    {"task__actions": "continuous", "prior__transforms": "o2"},
+    {"task__actions": "continuous", "prior__transforms": "so2", "network__name": "gru", "prior__replay": "stored"},
+    {"task": "predator-prey", "task__actions": "continuous", "prior__transforms": "d4"},
+    {"algo__actor_actions": "all", "algo__critic_input": "state"},
+]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "choice"),
+    [(a, c) for a in ALGORITHMS for c in EVERYTHING] + [("maddpg", c) for c in CONTINUOUS],
+    ids=str,
+)
+def test_every_choice_learns_without_breaking(algorithm, choice):
+    _, metrics = after(algorithm, **choice)
+    assert all(value.isfinite().all() for value in metrics[-1].values())
+
+
+@both
+def test_the_paper_preset_is_supplement_table_3(algorithm):
+    config = resolve_config("navigation", algorithm, preset="paper")
+    settings, network, prior = config.algorithm_settings, config.network, config.prior
+    names = "num_envs updates_per_episode batch_episodes replay_episodes warmup_episodes epsilon_start epsilon_finish"
+    assert [settings[name] for name in names.split()] == [1, 1, 32, 5000, 5, 1.0, 0.05]
+    assert (settings["epsilon_steps"], settings["learning_rate"], settings["gamma"]) == (50_000, 7e-4, 0.99)
+    assert (settings["adam_epsilon"], settings["max_grad_norm"], settings["huber_delta"]) == (1e-5, 10.0, 10.0)
+    assert (network.name, network.layer_norm, network.hidden) == ("gru", True, (64, 64))
+    assert (prior.transforms, prior.consistency_coef, prior.replay) == ("rot90", 0.5, "stored")
+
+
+@both
+def test_stored_copies_share_the_replay_and_sampled_ones_do_not(algorithm):
+    stored = learner(algorithm, prior__replay="stored", prior__transforms="rot90")
+    sampled = learner(algorithm, prior__transforms="rot90")
+    stored.iterate(0.0)
+    sampled.iterate(0.0)
+    assert (stored.replay.size, sampled.replay.size) == (7, 4), "8 of which 7 fit, and 4"
+    g = turn(stored.spec)
+    places = torch.arange(4).expand(2, 4)
+    original, copies = sampled.replay.select(places), stored.replay.select((places + 4) % 7)
+    assert torch.equal(copies.obs[:, :2], original.obs[:, 2:]), "the second round's episodes"
+    assert torch.equal(copies.obs[:, 2], g.obs(original.obs[:, 2])), "and behind them their copies"
+
+
+@both
+def test_the_value_consistency_vanishes_for_a_symmetric_function_alone(algorithm):
+    trained = learner(algorithm, prior__transforms="rot90")
+    trained.iterate(0.0)
+    batch = trained.replay.sample(3, trained.generators["learner"])
+    g = turn(trained.spec)
+    rows = trained._with_copies(batch, [g])
+    length = rows.state[:, :, :-1].square().sum(-1, keepdim=True)
+    first_number = rows.state[:, :, :-1, :1]
+    assert trained._value_gap(length, batch.valid, [g]).max() < 1e-6
+    assert trained._value_gap(first_number, batch.valid, [g]).min() > 1e-4
+    gaps = trained.gaps(rows, [g])
+    assert all((gap > 0).all() for gap in gaps.values()), "negative control: a fresh network is not symmetric"
+    by_hand = (first_number[:, :3] - first_number[:, 3:]).square().flatten(1).mean(1)
+    torch.testing.assert_close(trained._value_gap(first_number, batch.valid, [g]), by_hand)
+
+
+def test_the_terms_of_the_consistency_loss_are_switched():
+    def penalty(**choice):
+        spec = learner("qmix").spec
+        prior = SymmetryPrior(PriorConfig(consistency_coef=0.5, **choice), spec)
+        return prior.penalty(torch.tensor([2.0]), torch.tensor([4.0])).tolist()
+
+    assert penalty() == [3.0]
+    assert penalty(terms="policy") == [1.0]
+    assert penalty(terms="value") == [2.0]
+    assert penalty(kind="augment") == [0.0]
+
+
+def test_qmix_refuses_continuous_actions_in_one_sentence():
+    with pytest.raises(ValueError, match="qmix chooses among discrete actions"):
+        learner("qmix", task__actions="continuous")

@@ -1,0 +1,62 @@
+"""The mixer never falls when an agent's value rises, and what makes it so is its absolute values."""
+
+import torch
+from torch.nn.functional import elu
+
+from esp_cli.networks.mixer import MonotonicMixer
+from esp_cli.training.streams import generators
+
+SEEDS, AGENTS, STATE, WIDTH = (0, 1), 3, 5, 8
+
+
+def mixer(seeds=SEEDS) -> MonotonicMixer:
+    return MonotonicMixer(generators(seeds, "mixer"), AGENTS, STATE, WIDTH, 16)
+
+
+def slopes(function) -> torch.Tensor:
+    """Gradients of the team's value in each agent's, at random places: [S, B, N]."""
+    g = torch.Generator().manual_seed(0)
+    values = torch.randn(len(SEEDS), 200, AGENTS, generator=g, requires_grad=True)
+    state = 3 * torch.randn(len(SEEDS), 200, STATE, generator=g)
+    return torch.autograd.grad(function(values, state).sum(), values)[0]
+
+
+def test_the_team_value_rises_with_every_agents_value():
+    gradient = slopes(mixer())
+    assert (gradient >= 0).all()
+    assert (gradient > 0).float().mean() > 0.99
+
+
+def test_without_absolute_values_it_would_not(monkeypatch):
+    monkeypatch.setattr(torch.Tensor, "abs", lambda x: x)
+    assert (slopes(mixer()) < 0).float().mean() > 0.1
+
+
+def test_the_best_joint_action_is_made_of_the_best_own_actions():
+    g = torch.Generator().manual_seed(1)
+    utilities, state = torch.randn(2, 50, AGENTS, 4, generator=g), torch.randn(2, 50, STATE, generator=g)
+    joint = torch.cartesian_prod(*[torch.arange(4)] * AGENTS)
+    picked = utilities.unsqueeze(2).expand(-1, -1, len(joint), -1, -1)
+    rows = picked.gather(-1, joint.expand(2, 50, -1, -1).unsqueeze(-1)).squeeze(-1)
+    totals = mixer()(rows, state.unsqueeze(2).expand(-1, -1, len(joint), -1))
+    chosen = joint[totals.argmax(-1)]
+    assert torch.equal(chosen, utilities.argmax(-1))
+
+
+def test_against_its_formula():
+    mix = mixer()
+    values, state = torch.randn(2, 4, AGENTS), torch.randn(2, 4, STATE)
+    raw = mix.hypernetwork(state)
+    total = mix(values, state)
+    for s in range(2):
+        for b in range(4):
+            row = raw[s, b]
+            first, rest = row[: AGENTS * WIDTH].view(AGENTS, WIDTH).abs(), row[AGENTS * WIDTH :]
+            hidden = elu(values[s, b] @ first + rest[:WIDTH])
+            by_hand = hidden @ rest[WIDTH : 2 * WIDTH].abs() + rest[-1]
+            torch.testing.assert_close(total[s, b], by_hand)
+
+
+def test_a_seed_mixes_the_same_alone_and_among_others():
+    values, state = torch.randn(2, 40, AGENTS), torch.randn(2, 40, STATE)
+    torch.testing.assert_close(mixer()(values, state)[1:], mixer((1,))(values[1:], state[1:]))
