@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from esp_cli import __version__, console
+from esp_cli import __version__, console, machine
 from esp_cli.commands import COMMANDS
 
 if TYPE_CHECKING:
@@ -162,7 +162,5 @@ def root(
 
 def main() -> None:
     """Run the application on the command line of this process."""
-    # Read by OpenMP when torch is imported. Its threads wait for each other by spinning, by default for milliseconds: a
-    # second busy program on the same cores then slows training tenfold and more.
-    os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    machine.prepare()
     app()

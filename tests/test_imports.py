@@ -18,6 +18,7 @@ ROOT = Path(__file__).parents[1]
 
 RANKS = {
     "": 0,  # esp_cli itself: the version
+    "machine": 1,
     "symmetry": 1,
     "prior": 2,
     "networks": 2,

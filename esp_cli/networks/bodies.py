@@ -115,7 +115,8 @@ class GRU(Network):
         batch, num_steps = x.shape[1:3]
         in_time_order = x.transpose(1, 2).flatten(1, 2)
         projected = self.gru.input(self.body(in_time_order)).unflatten(1, (num_steps, batch))
-        rows = self.gru.unroll(projected, truncation).flatten(1, 2)
+        memories = self.gru.unroll(projected.transpose(0, 1).contiguous(), truncation)
+        rows = memories.transpose(0, 1).flatten(1, 2)
         return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
 
 

@@ -213,10 +213,11 @@ class SeedGRU(nn.Module):
         return torch.lerp(candidate, h, update)
 
     def unroll(self, projected: Tensor, truncation: int = 0) -> Tensor:
-        """Advance through whole episodes from empty memory: [S, T, B, 3H] -> every memory [S, T, B, H].
+        """Advance through whole episodes from empty memory: [T, S, B, 3H] -> every memory [T, S, B, H].
 
-        The same as `advance` step by step, with a backward written by hand that makes one product for the gradient of
-        the weights of all steps; gradients through time are cut every `truncation` steps (0: never).
+        The same as `advance` step by step, with a backward written by hand that works in place and makes one product
+        for the gradient of the weights of all steps; gradients through time are cut every `truncation` steps (0:
+        never).
         """
         weight, bias = self.recurrent.weight, self.recurrent.bias
         return _Unrolled.apply(projected, weight, bias, truncation)  # type: ignore[no-untyped-call]
@@ -227,42 +228,47 @@ class _Unrolled(Function):
 
     @staticmethod
     def forward(ctx, projected, weight, bias, truncation):  # type: ignore[no-untyped-def]
-        num_seeds, num_steps, batch, width = projected.shape
+        num_steps, num_seeds, batch, width = projected.shape
         hidden = width // 3
-        memories = projected.new_zeros(num_seeds, num_steps + 1, batch, hidden)
+        memories = projected.new_zeros(num_steps + 1, num_seeds, batch, hidden)
         gates = torch.empty_like(projected, memory_format=torch.contiguous_format)  # r, z, n of every step
-        recurrent = torch.empty_like(gates)  # h U + b of every step
+        inner = torch.empty_like(memories[1:])  # h U_n + b_n of every step
+        recurrent = torch.empty_like(gates[0])  # h U + b
         for t in range(num_steps):
-            memory, opened, candidate = memories[:, t], gates[:, t, :, : 2 * hidden], gates[:, t, :, 2 * hidden :]
-            torch.baddbmm(bias, memory, weight, out=recurrent[:, t])
-            torch.add(projected[:, t, :, : 2 * hidden], recurrent[:, t, :, : 2 * hidden], out=opened).sigmoid_()
+            memory, x, gate = memories[t], projected[t], gates[t]
+            opened, candidate = gate[..., : 2 * hidden], gate[..., 2 * hidden :]
+            torch.baddbmm(bias, memory, weight, out=recurrent)
+            torch.add(x[..., : 2 * hidden], recurrent[..., : 2 * hidden], out=opened).sigmoid_()
+            inner[t].copy_(recurrent[..., 2 * hidden :])
             reset, update = opened.chunk(2, -1)
-            inner = recurrent[:, t, :, 2 * hidden :]
-            torch.addcmul(projected[:, t, :, 2 * hidden :], reset, inner, out=candidate).tanh_()
-            torch.lerp(candidate, memory, update, out=memories[:, t + 1])
-        ctx.save_for_backward(memories, gates, recurrent[..., 2 * hidden :], weight)
+            torch.addcmul(x[..., 2 * hidden :], reset, inner[t], out=candidate).tanh_()
+            torch.lerp(candidate, memory, update, out=memories[t + 1])
+        ctx.save_for_backward(memories, gates, inner, weight)
         ctx.truncation = truncation
-        return memories[:, 1:]
+        return memories[1:]
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         memories, gates, inner, weight = ctx.saved_tensors
-        num_steps, hidden = grad.shape[1], grad.shape[3]
+        num_steps, hidden = grad.shape[0], grad.shape[3]
         into, back = torch.empty_like(gates), torch.empty_like(gates)  # of x W and of h U + b
-        backwards, carry = weight.transpose(1, 2), torch.zeros_like(memories[:, 0])
+        backwards, carry = weight.transpose(1, 2), torch.zeros_like(memories[0])
+        passed, gap = torch.empty_like(carry), torch.empty_like(carry)
         for t in reversed(range(num_steps)):
-            reset, update, candidate = gates[:, t].chunk(3, -1)
-            carry = carry + grad[:, t]
-            blocked = carry - carry * update
-            inward = torch.ops.aten.tanh_backward(blocked, candidate)
-            opening = torch.cat([inward * inner[:, t], carry * (memories[:, t] - candidate)], -1)
-            gate = torch.ops.aten.sigmoid_backward(opening, gates[:, t, :, : 2 * hidden])
-            into[:, t, :, : 2 * hidden], into[:, t, :, 2 * hidden :] = gate, inward
-            back[:, t, :, : 2 * hidden], back[:, t, :, 2 * hidden :] = gate, inward * reset
+            reset, update, candidate = gates[t].chunk(3, -1)
+            opening, inward = into[t, ..., : 2 * hidden], into[t, ..., 2 * hidden :]
+            carry += grad[t]
+            torch.mul(carry, update, out=passed)
+            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=inward)
+            torch.mul(inward, inner[t], out=opening[..., :hidden])
+            torch.mul(torch.sub(memories[t], candidate, out=gap), carry, out=opening[..., hidden:])
+            torch.ops.aten.sigmoid_backward.grad_input(opening, gates[t, ..., : 2 * hidden], grad_input=opening)
+            back[t, ..., : 2 * hidden].copy_(opening)
+            torch.mul(inward, reset, out=back[t, ..., 2 * hidden :])
             if ctx.truncation and t % ctx.truncation == 0:
-                carry = torch.zeros_like(carry)
+                carry.zero_()
             else:
-                carry = torch.baddbmm(carry * update, back[:, t], backwards)
-        rows = back.flatten(1, 2)
-        before = memories[:, :-1].flatten(1, 2)
+                torch.baddbmm(passed, back[t], backwards, out=carry)
+        rows = back.transpose(0, 1).flatten(1, 2)
+        before = memories[:-1].transpose(0, 1).flatten(1, 2)
         return into, torch.bmm(before.transpose(1, 2), rows), rows.sum(1, keepdim=True), None

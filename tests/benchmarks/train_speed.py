@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import time
 from pathlib import Path
 
-os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # as `esp` sets it, before torch is imported
+from esp_cli import machine
+
+machine.prepare()  # as `esp` does, before torch is imported
 
 import torch
 from rich.console import Console
