@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -29,6 +30,8 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 LineStyle = str | tuple[int, tuple[int, ...]]
 
 _LINE_STYLES: tuple[LineStyle, ...] = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+_LABEL_CHARACTERS = 44
+"""Of one line beside the vertical axis."""
 _STYLE: dict[Any, Any] = {
     "figure.dpi": 100,
     "savefig.dpi": 150,
@@ -138,7 +141,7 @@ def learning_curves(
             axes.axhline(line.value, linestyle=line.style, color=line.colour, linewidth=1.0, zorder=1)
         _label_lines(axes, lines)
         axes.set_xlabel("environment steps per seed")
-        axes.set_ylabel(ylabel)
+        axes.set_ylabel(fill(ylabel, _LABEL_CHARACTERS))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         # below the axes: inside, it would cover a curve sooner or later
         columns = 2 if len(curves) > 1 else 1
