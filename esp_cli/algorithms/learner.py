@@ -95,6 +95,12 @@ class Learner(ABC):
             progress: share of the run that is done, 0 to 1, for schedules.
         """
 
+    def anneal(self, remaining: float) -> None:
+        """Set the learning rate of every optimiser to this share of what it was made with."""
+        for optimiser in self.optimisers.values():
+            for group in optimiser.param_groups:
+                group["lr"] = group.setdefault("initial_lr", group["lr"]) * remaining
+
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return everything that a resumed run needs to go on bit for bit, as flat tensors.
 

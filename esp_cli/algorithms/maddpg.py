@@ -51,6 +51,7 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
             "rounds": 20,
             "learning_rate": 7e-4,
             "actor_learning_rate": 7e-4,
+            "anneal_learning_rate": False,
             "critic_sees_time": False,
             "output_penalty": 0.0,
         },

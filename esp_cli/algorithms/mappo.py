@@ -185,8 +185,8 @@ class Mappo(Learner):
         """Learn from a rollout: epochs of minibatches, each one gradient step."""
         config = self.config
         remaining = 1.0 - progress
-        for group in self.optimiser.param_groups:
-            group["lr"] = config.learning_rate * (remaining if config.anneal_learning_rate else 1.0)
+        if config.anneal_learning_rate:
+            self.anneal(remaining)
         entropy_coef = config.entropy_coef * (remaining if config.anneal_entropy else 1.0)
 
         batch, metrics = self._prepare(rollout)

@@ -35,6 +35,7 @@ class OffPolicyConfig(LearnerConfig):
     epsilon_finish: float = Field(0.05, ge=0, le=1)
     epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
     learning_rate: float = Field(gt=0)
+    anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run; paper: off")
     adam_epsilon: float = Field(1e-5, gt=0)
     max_grad_norm: float = Field(10.0, gt=0)
     gamma: float = Field(0.99, ge=0, le=1)
@@ -99,6 +100,8 @@ class OffPolicyLearner(Learner):
     def iterate(self, progress: float) -> dict[str, Tensor]:
         """Collect episodes, learn from the replay, and return metrics, each [S]."""
         config, sums, returns = self.off_policy, dict[str, Tensor](), []
+        if config.anneal_learning_rate:
+            self.anneal(1.0 - progress)
         learned = 0
         for _ in range(config.rounds):
             self.policy.head.explore(self._epsilon())

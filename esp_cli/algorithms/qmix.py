@@ -46,7 +46,14 @@ class QmixConfig(OffPolicyConfig):
 PRESETS: dict[str, dict[str, dict[str, object]]] = {
     "default": {"network": {"activation": "relu"}},
     "paper": {
-        "qmix": {"num_envs": 1, "rounds": 20, "learning_rate": 7e-4, "td_lambda": 0.0, "critic_sees_time": False},
+        "qmix": {
+            "num_envs": 1,
+            "rounds": 20,
+            "learning_rate": 7e-4,
+            "anneal_learning_rate": False,
+            "td_lambda": 0.0,
+            "critic_sees_time": False,
+        },
         "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
         "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
     },

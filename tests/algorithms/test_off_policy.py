@@ -213,3 +213,13 @@ def test_the_terms_of_the_consistency_loss_are_switched():
 def test_qmix_refuses_continuous_actions_in_one_sentence():
     with pytest.raises(ValueError, match="qmix chooses among discrete actions"):
         learner("qmix", task__actions="continuous")
+
+
+@both
+@pytest.mark.parametrize(("anneal", "share"), [(True, 0.25), (False, 1.0)])
+def test_the_learning_rate_falls_linearly_where_asked(algorithm, anneal, share):
+    trained = learner(algorithm, algo__anneal_learning_rate=anneal)
+    for progress in (0.5, 0.75):  # the share is of the first rate, not of the last
+        trained.iterate(progress)
+    for optimiser in trained.optimisers.values():
+        assert [group["lr"] for group in optimiser.param_groups] == [pytest.approx(1e-3 * share)]
