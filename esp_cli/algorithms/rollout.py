@@ -60,17 +60,16 @@ class Collector:
         noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators).to(device)
         obs = torch.empty(*lead, spec.num_agents, spec.observation.width, device=device)
         state = torch.empty(*lead, spec.state.width, device=device)
-        log_prob = torch.empty(*lead, spec.num_agents, device=device)
-        reward = torch.empty_like(log_prob)
+        reward = torch.empty(*lead, spec.num_agents, device=device)
         terminated = torch.empty(lead, dtype=torch.bool, device=device)
         ended = torch.empty_like(terminated)
-        actions, finals = [], {}
+        outputs, actions, finals = [], [], {}
         for t in range(num_steps):
             obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
-            outputs, self.memory = self.policy.step(self.observation.obs, self.memory)
-            action = self.policy.head.sample(outputs, noise[:, t])
-            log_prob[:, :, t] = self.policy.head.log_prob(outputs, action)
+            output, self.memory = self.policy.step(self.observation.obs, self.memory)
+            action = self.policy.head.sample(output, noise[:, t])
             step = self.env.step(self.policy.head.to_environment(action))
+            outputs.append(output)
             actions.append(action)
             reward[:, :, t], terminated[:, :, t] = step.reward, step.terminated
             ended[:, :, t] = step.terminated | step.truncated
@@ -79,6 +78,7 @@ class Collector:
             self._finish(step.reward, ended[:, :, t], step.final is not None)
             self.observation = step.next
         action_rows = torch.stack(actions, 2)
+        log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
         return Rollout(obs, state, action_rows, log_prob, reward, terminated, ended, self.observation, finals)
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
