@@ -15,7 +15,7 @@ from tests.learning.pointing import SEEDS, AlwaysRight, Pointing, score
 
 ROUNDS = 40
 LOOK_EVERY = 10
-SETTINGS = {"num_envs": 8, "gamma": 0.0, "learning_rate": 3e-3, "epsilon_steps": 1000}
+SETTINGS = {"num_envs": 8, "gamma": 0.0, "learning_rate": 3e-3, "epsilon_steps": 1000, "anneal_learning_rate": False}
 """An iteration is eight episodes of four steps; gamma 0, as the next target does not depend on the action."""
 
 
