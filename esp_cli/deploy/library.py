@@ -1,9 +1,9 @@
 """Trained policies for other programs: numpy in, numpy out.
 
-    from esp_cli import load_policy
+from esp_cli import load_policy
 
-    policy = load_policy("formation")
-    wheels = policy.act(obs)
+policy = load_policy("formation")
+wheels = policy.act(obs)
 """
 
 from __future__ import annotations
@@ -111,7 +111,9 @@ class LoadedPolicy:
         except (TypeError, ValueError):
             raise ValueError(f"the {what} is no array of numbers; give (..., {width}): {meaning}") from None
         if array.ndim == 0 or array.shape[-1] != width:
-            raise ValueError(f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}")
+            raise ValueError(
+                f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}"
+            )
         if not np.isfinite(array).all():
             place = tuple(int(k) for k in np.argwhere(~np.isfinite(array))[0])
             raise ValueError(f"the {what} holds {array[place]} at {place}; give finite numbers")
