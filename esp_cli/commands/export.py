@@ -107,12 +107,10 @@ def _best(trained: TrainedPolicy, episodes: int) -> int:
 def _print(exported: Exported, title: str) -> None:
     rows = []
     for result in exported.formats:
-        agreement = result.agreement
-        numbers = (
-            (agreement.observations, f"{agreement.max_difference:.1e}", "-" if agreement.other_actions is None else agreement.other_actions)
-            if agreement
-            else ("-", "-", "-")
-        )
+        numbers = ("-", "-", "-")
+        if (found := result.agreement) is not None:
+            others = "-" if found.other_actions is None else str(found.other_actions)
+            numbers = (str(found.observations), f"{found.max_difference:.1e}", others)
         rows.append((result.name, ", ".join(result.files), result.size, *numbers))
         if result.note:
             console.note(result.note)
@@ -120,6 +118,6 @@ def _print(exported: Exported, title: str) -> None:
     console.table(headings, rows, title=title, caption="compared with the policy itself, in float32")
     costs: list[tuple[str, object]] = [("parameters", exported.parameters), ("operations an action", exported.flops)]
     if exported.c is not None:
-        costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and 1 to 2 kB of code")]
+        costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and about 1 kB of code")]
         costs += [("RAM of the C source, bytes", exported.c.ram_bytes)]
     console.table(("cost", "value>"), costs)

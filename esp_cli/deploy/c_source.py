@@ -16,7 +16,7 @@ class CSource:
     """The two files, and what they take of a microcontroller.
 
     Attributes:
-        flash_bytes: of the weights; the code comes on top (1 to 2 kB).
+        flash_bytes: of the weights; the code comes on top (about 1 kB without libm).
         ram_bytes: of the scratch and of one agent's memory; the stack needs some 100 more.
     """
 

@@ -9,6 +9,8 @@ from esp_cli.deploy.check import Sample
 from esp_cli.deploy.program import Program
 from esp_cli.networks.heads import BoundedGaussian
 from esp_cli.training.loading import TrainedPolicy
+from esp_envs.epuck.formation import FADING_M
+from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, MAX_WHEEL_SPEED, WHEEL_RADIUS_M
 from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 
 EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
@@ -25,7 +27,15 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
         sample: of what it does; its first row, with empty memory, is the worked example.
     """
     config, spec = alone.config, alone.spec
-    std = {}
+    std, robot = {}, {}
+    if spec.name == "formation":
+        robot["robot"] = {
+            "body_radius_m": BODY_RADIUS_M,
+            "wheel_radius_m": WHEEL_RADIUS_M,
+            "axle_m": AXLE_M,
+            "max_wheel_speed_rad_s": MAX_WHEEL_SPEED,
+            "fading_m": FADING_M,
+        }
     if isinstance(alone.policy.head, BoundedGaussian):
         head = alone.policy.head
         std = {"latent_std": head.log_std[0].exp()[head.item].tolist()}
@@ -51,6 +61,7 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
             "flops_per_action": program.flops,
             **std,
         },
+        **robot,
         "observation": _rows(spec.observation),
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},

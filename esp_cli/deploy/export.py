@@ -19,8 +19,6 @@ from esp_cli.deploy.program import Program, program_of
 from esp_cli.deploy.torch_file import torch_archive
 from esp_cli.training.checkpoint import write_bytes_atomic
 from esp_cli.training.loading import TrainedPolicy
-from esp_envs.epuck.formation import FADING_M
-from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, MAX_WHEEL_SPEED, WHEEL_RADIUS_M
 
 STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
 """Of the e-puck2's microcontroller, an STM32F407."""
@@ -111,13 +109,6 @@ def _epuck(job: _Job) -> Files:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
     if job.program.memory_width:
         raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
-    job.description["robot"] = {
-        "body_radius_m": BODY_RADIUS_M,
-        "wheel_radius_m": WHEEL_RADIUS_M,
-        "axle_m": AXLE_M,
-        "max_wheel_speed_rad_s": MAX_WHEEL_SPEED,
-        "fading_m": FADING_M,
-    }
     return {**_numpy(job), "esp_epuck.py": _takeaway("esp_epuck.py")}
 
 
@@ -234,7 +225,7 @@ def cost_lines(c: CSource, program: Program) -> list[str]:
     return [
         "| of a microcontroller | | e-puck2 (STM32F407) |",
         "|---|---|---|",
-        f"| flash: weights, and 1 to 2 kB of code | {c.flash_bytes} bytes | {STM32F4_FLASH_BYTES} |",
+        f"| flash: weights, and about 1 kB of code | {c.flash_bytes} bytes | {STM32F4_FLASH_BYTES} |",
         f"| RAM: scratch and one agent's memory | {c.ram_bytes} bytes | {STM32F4_RAM_BYTES} |",
         f"| operations an action | {program.flops} | |",
     ]

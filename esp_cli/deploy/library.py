@@ -95,7 +95,7 @@ class LoadedPolicy:
         if rng is not None:
             generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
             noise = policy.head.noise((1, count), [generator])
-        seen = torch.tensor(rows.reshape(1, 1, count, -1))
+        seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
         action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise)
         width = (self.spec.action.width,) if isinstance(self.spec.action, Continuous) else ()
         return action.numpy().reshape((*lead, *width)), after.numpy().reshape((*lead, self.memory_width))
