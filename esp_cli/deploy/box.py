@@ -6,6 +6,7 @@ A checkout has the box beside the packages, an installed wheel inside `esp_cli`.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -165,7 +166,7 @@ def open_policy(
         ValueError: nothing there, damaged, or of another version.
     """
     choosy = algo is not None or prior is not None
-    if where.exists() and not choosy:
+    if os.path.exists(where) and not choosy:  # noqa: PTH110 - Path.exists() fails on a name that is too long
         return load_policy(where)
     if str(where) in task_names() or any(entry.name == str(where) for entry in read_box(folder)):
         return load_entry(find(str(where), algo, prior, folder), folder)
