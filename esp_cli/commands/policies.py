@@ -33,12 +33,22 @@ def policies(
                 f"{e.seed} of {e.chosen_from}",
                 f"{e.score.mean:.2f}",
                 console.format_interval(e.score.ci95),
+                e.score.episodes,
                 e.convention,
             )
             for e in found
         ]
-        headings = ("policy", "version>", "steps>", "seed>", "return>", "95 % interval>", "reward convention")
-        caption = f"greedy episodes, interval over {found[0].score.episodes} of them; the seed is the best of its run"
+        headings = (
+            "policy",
+            "version>",
+            "steps>",
+            "seed>",
+            "return>",
+            "95 % interval>",
+            "episodes>",
+            "reward convention",
+        )
+        caption = "greedy, interval over episodes; the seed is the best of its run, found on other episodes"
         console.table(headings, rows, caption=caption)
         for entry in found if task else ():
             console.say(f"{entry.name}: {entry.command}")
