@@ -6,7 +6,6 @@ A checkout has the box beside the packages, an installed wheel inside `esp_cli`.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.checkpoint import CheckpointError, parse_json_object
-from esp_cli.training.config import RunConfig, one_sentence
+from esp_cli.training.config import RunConfig, one_sentence, shortened
 from esp_cli.training.loading import TrainedPolicy, load_policy
 from esp_cli.training.run_folder import write_json_atomic
 from esp_envs.registry import task_names
@@ -166,7 +165,11 @@ def open_policy(
         ValueError: nothing there, damaged, or of another version.
     """
     choosy = algo is not None or prior is not None
-    if os.path.exists(where) and not choosy:  # noqa: PTH110 - Path.exists() fails on a name that is too long
+    try:
+        there = where.exists()
+    except OSError as error:  # a name that no file can have
+        raise ValueError(f"there is no policy {shortened(str(where))}: {error.strerror}") from None
+    if there and not choosy:
         return load_policy(where)
     if str(where) in task_names() or any(entry.name == str(where) for entry in read_box(folder)):
         return load_entry(find(str(where), algo, prior, folder), folder)

@@ -96,8 +96,8 @@ def test_what_is_no_policy_is_told_in_one_sentence(copied: Path, tmp_path: Path,
     assert not (copied / "exploded").exists(), "loading ran code"
 
 
-def test_a_name_that_no_file_can_have_is_told_in_one_sentence(tmp_path: Path) -> None:
-    assert "error" not in refused("eval", "x" * 5000)
+def test_a_name_that_no_file_can_have_is_told_in_one_sentence() -> None:
+    assert refused("eval", "x" * 5000).endswith("...: File name too long")
 
 
 def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> None:
