@@ -17,14 +17,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 RANKS = {
-    "": 0,  # esp_cli itself: the version
-    "machine": 1,
+    "machine": 0,
     "symmetry": 1,
     "prior": 2,
     "networks": 2,
     "algorithms": 3,
     "training": 4,
     "deploy": 5,
+    "": 5.5,  # esp_cli itself: the version, and what other programs use of deploy
     "experiments": 6,
     "commands": 7,
     "app": 8,

@@ -6,6 +6,8 @@ from typing import Any
 
 from esp_cli import console
 from esp_cli.commands.options import (
+    BoxAlgoOption,
+    BoxPriorOption,
     EpisodesOption,
     JsonOption,
     PhysicsOption,
@@ -15,6 +17,7 @@ from esp_cli.commands.options import (
 )
 
 EPILOG = """Examples:\n
+    esp eval navigation --algo mappo --prior none\n
     esp eval runs/cn-mappo\n
     esp eval runs/cn-mappo --episodes 320 --json result.json\n
     esp eval runs/fc-mappo --physics mujoco-3d --set task.sensor_noise_m=0.005"""
@@ -25,16 +28,19 @@ def evaluate(
     episodes: EpisodesOption = 320,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
+    algo: BoxAlgoOption = None,
+    prior: BoxPriorOption = None,
     json: JsonOption = None,
 ) -> None:
     """Play episodes greedily and stochastically; print mean, s.e.m., 95 % interval, anchors and task metrics.
 
     A policy may be judged under other settings of its task than it was trained under: another physics, more noise.
     """
+    from esp_cli.deploy.box import open_policy
     from esp_cli.experiments.judgement import judge
-    from esp_cli.training.loading import load_policy, transfer
+    from esp_cli.training.loading import transfer
 
-    trained = transfer(load_policy(policy), parse_task_settings(settings or [], physics))
+    trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
     result = judge(trained, episodes)

@@ -178,4 +178,18 @@ TransformsOption = Annotated[
         "--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses.", metavar="LIST"
     ),
 ]
-PolicyArgument = Annotated[Path, typer.Argument(help="Run folder or policy file.", metavar="RUN|POLICY")]
+PolicyArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="Run folder, policy file, or a trained policy that comes along: its task or its name (`esp policies`).",
+        metavar="RUN|POLICY",
+    ),
+]
+BoxAlgoOption = Annotated[
+    str | None,
+    typer.Option("--algo", "-a", help="Of the policies that come along, the one by this algorithm.", metavar="ALGO"),
+]
+BoxPriorOption = Annotated[
+    Literal["esp", "augment", "consistency", "none"] | None,
+    typer.Option("--prior", help="Of the policies that come along, one with this prior (none: the plain learner)."),
+]

@@ -11,6 +11,8 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import (
+    BoxAlgoOption,
+    BoxPriorOption,
     OutOption,
     PhysicsOption,
     PolicyArgument,
@@ -19,6 +21,7 @@ from esp_cli.commands.options import (
 )
 
 EPILOG = """Examples:\n
+    esp render formation -o f.gif\n
     esp render runs/cn-mappo -o cn.gif\n
     esp render runs/cn-mappo -o cn.gif --episodes 5 --size 320 --speed 0.5\n
     esp render runs/fc-mappo -o formation.gif --speed 4x\n
@@ -65,6 +68,8 @@ def render(
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
+    algo: BoxAlgoOption = None,
+    prior: BoxPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
     kind = out.suffix.lower()
@@ -74,13 +79,14 @@ def render(
         raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
     if out.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
+    from esp_cli.deploy.box import open_policy
     from esp_cli.experiments import films, rendering
-    from esp_cli.training.loading import load_policy, transfer
+    from esp_cli.training.loading import transfer
     from esp_cli.training.trainer import build_environment
 
     if kind == ".mp4":
         films.mp4_library()  # a missing one is told before all the work, not after it
-    trained = transfer(load_policy(policy), parse_task_settings(settings or [], physics))
+    trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
     seed = trained.config.seeds[0] if seed is None else seed

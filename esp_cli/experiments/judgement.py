@@ -35,14 +35,14 @@ def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
         anchor_metrics (the same of each anchor), task_settings.
     """
     seeds = trained.config.seeds
-    greedy = _play(trained, PolicyController(trained.policy), "greedy", episodes)
+    greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
     drawn = PolicyController(trained.policy, generators(seeds, "judgement", "noise"))
-    stochastic = _play(trained, drawn, "stochastic", episodes)
+    stochastic = play_batches(trained, drawn, "stochastic", episodes)
     names = task_class(trained.config.task).heuristics
-    anchors = {"random": _play(trained, RandomController(), "random", episodes)}
+    anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
-        anchors[key] = _play(trained, HeuristicController(name), "heuristic", episodes)
+        anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
     return {
         "task": trained.config.task,
         "task_version": trained.spec.version,
@@ -74,8 +74,15 @@ def _means(episodes: Episodes) -> dict[str, float]:
     return {name: float(value.mean()) for name, value in episodes.metrics.items()}
 
 
-def _play(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
-    """Play the episodes in batches whose worlds depend on the seeds and the batch alone."""
+def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
+    """Play episodes in batches whose worlds depend on the seeds, the stream and the batch alone.
+
+    Args:
+        trained: the policy, and so the task.
+        controller: who acts.
+        stream: names the worlds.
+        episodes: per seed.
+    """
     parts = []
     batch = max(1, min(episodes, MAX_WORLDS // len(trained.config.seeds)))
     for begin in range(0, episodes, batch):

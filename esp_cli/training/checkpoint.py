@@ -140,6 +140,7 @@ def load_checkpoint(
     path: str | os.PathLike[str],
     format_name: str = CHECKPOINT_FORMAT,
     version: int = CHECKPOINT_VERSION,
+    sha256: str | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read and verify what :func:`save_checkpoint` wrote.
 
@@ -147,6 +148,7 @@ def load_checkpoint(
         path: file to read.
         format_name: kind of file that is expected.
         version: newest version of that format that the caller understands.
+        sha256: of the whole file, where somebody else vouches for it (the file's own is verified in any case).
 
     Returns:
         The tensors by name, on the CPU, and the description without the container's own keys.
@@ -155,7 +157,10 @@ def load_checkpoint(
         CheckpointError: the file is missing, unreadable, truncated, damaged, foreign or of another format.
     """
     try:
-        return _decode(_read(Path(path)), format_name, version)
+        content = _read(Path(path))
+        if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+            raise CheckpointError("is not the file that its manifest names: their SHA-256 differ; get both anew")
+        return _decode(content, format_name, version)
     except CheckpointError as error:
         raise CheckpointError(f"{path} {error}") from None
     except OSError as error:

@@ -29,9 +29,9 @@ class RunConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    task: str
-    algorithm: str
-    preset: str = "default"
+    task: str = Field(max_length=100)
+    algorithm: str = Field(max_length=100)
+    preset: str = Field("default", max_length=100)
     steps: int = Field(ge=1, description="environment steps per seed")
     seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=1000, description="as many as --seeds takes")
     task_settings: dict[str, Any] = Field(default_factory=dict)
@@ -132,10 +132,15 @@ def _validated(model: type[BaseModel], values: Mapping[str, object], section: st
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str) -> str:
     """Say what is wrong with the first bad setting, and what could stand there."""
     first = error.errors()[0]
-    name = ".".join([section, *(str(part) for part in first["loc"])])
+    name = shortened(".".join([section, *(str(part) for part in first["loc"])]))
     if first["type"] == "extra_forbidden":
         return f"unknown setting '{name}'; {section} has {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"the setting '{name}' is missing"
     message = first["msg"].removeprefix("Value error, ")
-    return f"bad value {first['input']!r} for '{name}': {message[0].lower()}{message[1:]}"
+    return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
+
+
+def shortened(text: str, length: int = 80) -> str:
+    """Return a text that fits into a sentence, whatever a file or a command line put into it."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."

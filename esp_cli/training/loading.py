@@ -13,6 +13,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
+from esp_cli import __version__
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
@@ -44,8 +45,13 @@ class TrainedPolicy:
     notes: tuple[str, ...] = ()
 
 
-def parse_config(data: object, source: Path) -> RunConfig:
+def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
     """Read a stored configuration.
+
+    Args:
+        data: as JSON gave it.
+        source: the run folder or file, for the message.
+        writer: version of esp that stored it, where that is known.
 
     Raises:
         ValueError: it is damaged or of another version.
@@ -53,21 +59,28 @@ def parse_config(data: object, source: Path) -> RunConfig:
     try:
         config = RunConfig.model_validate(data)
     except ValidationError as error:
-        raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}") from None
+        # Another version may have had another name for a setting; of one version that is damage.
+        other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
+        raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     if config.algorithm not in ALGORITHMS:
         raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
     return config
 
 
-def load_policy(path: Path) -> TrainedPolicy:
+def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
     """Load the policy of a run folder (its newest checkpoint) or of a policy file.
+
+    Args:
+        path: of the folder or file.
+        sha256: that a manifest states of the file.
 
     Raises:
         ValueError: nothing there, not one of ours, damaged, or of another version of the task.
     """
-    if path.is_file():
-        tensors, meta = load_checkpoint(path, format_name=POLICY_FORMAT)
-        return _build(path, parse_config(meta.get("config"), path), tensors, meta)
+    if sha256 is not None or path.is_file():
+        tensors, meta = load_checkpoint(path, format_name=POLICY_FORMAT, sha256=sha256)
+        writer = meta.get("esp_version", __version__)
+        return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
     folder = RunFolder.open(path)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CheckpointWarning)
@@ -105,6 +118,25 @@ def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedP
     return replace(trained, config=config, spec=spec)
 
 
+def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
+    """Return one seed's policy alone, on the CPU and with products in float32, as it goes into other hands.
+
+    Products in bfloat16 are a matter of the machine that trained; the weights are float32 there too.
+
+    Raises:
+        ValueError: the run has no such seed.
+    """
+    seeds = trained.config.seeds
+    if seed not in seeds:
+        raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
+    network = trained.config.network.model_copy(update={"precision": "float32"})
+    config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
+    policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
+    index = seeds.index(seed)
+    policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in trained.policy.state_dict().items()})
+    return replace(trained, config=config, policy=policy)
+
+
 def _build(
     path: Path, config: RunConfig, tensors: dict[str, Tensor], meta: Mapping[str, Any], notes: tuple[str, ...] = ()
 ) -> TrainedPolicy:
@@ -113,21 +145,42 @@ def _build(
     step = meta.get("step")
     if type(step) is not int or step < 0:
         raise ValueError(f"{path} is damaged: it does not say after how many steps it was written")
+    misfit = f"{path}: the weights do not fit the configuration beside them"
+    # Before worlds are made for every seed, and networks of that size: a damaged configuration may ask for more of
+    # either than the machine has.
+    if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
+        raise ValueError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
+    try:
+        resolve_task_settings(config.task, config.task_settings)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     spec = build_environment(config, 1, "shape").spec
     version = meta.get("task_version", spec.version)
     if version != spec.version:
-        raise ValueError(f"{path} was trained on {config.task} version {version}, but this is version {spec.version}")
-    misfit = f"{path}: the weights do not fit the configuration beside them"
-    # Before anything of that size is made: a damaged configuration may ask for more than the machine has.
+        raise ValueError(
+            f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
+            "which a policy sees, does or earns something else; use the esp that it was trained with, or train anew"
+        )
     widths = (spec.observation.width, *config.network.hidden)
     needed = len(config.seeds) * sum(inputs * outputs for inputs, outputs in pairwise(widths))
     if min(widths) < 1 or needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
     build = ALGORITHMS[config.algorithm].build_policy
     policy = build(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
+    _fill(policy, tensors, path, misfit)
+    return TrainedPolicy(config, policy, spec, step, path, notes)
+
+
+def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -> None:
+    """Put weights into a policy that was built for them."""
+    for name, own in policy.state_dict().items():
+        # torch would convert them without a word
+        if name in tensors and tensors[name].dtype != own.dtype:
+            raise ValueError(f"{misfit} ({name} is {tensors[name].dtype}, where {own.dtype} is needed)")
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1].strip()
         raise ValueError(f"{misfit} ({reason})") from None
-    return TrainedPolicy(config, policy, spec, step, path, notes)
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise ValueError(f"{path} holds weights that are not finite; use another copy of it, or train anew")

@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from esp_cli import __version__
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
@@ -24,6 +25,7 @@ from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.registry import make
+from esp_envs.spec import TaskSpec
 
 CHECKPOINT_SECONDS = float(os.environ.get("ESP_CHECKPOINT_SECONDS", "30"))
 """Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
@@ -243,12 +245,26 @@ class Trainer:
 
     def _policy_meta(self) -> dict[str, Any]:
         """Describe the policy file so that it can be used without the run folder."""
-        return {
-            "task": self.config.task,
-            "task_version": self.learner.collector.env.spec.version,
-            "network": self.config.network.name,
-            "activation": self.config.network.activation,
-            "step": self.step,
-            "greedy_returns": [None if math.isnan(x) else x for x in self.final_returns()["greedy"].tolist()],
-            "config": self.config.model_dump(mode="json"),
-        }
+        returns = self.final_returns()["greedy"].tolist()
+        return policy_description(self.config, self.learner.collector.env.spec, self.step, returns)
+
+
+def policy_description(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
+    """Return what a policy file says of itself.
+
+    Args:
+        config: of the run, or of the one seed of it that the file holds.
+        spec: of the task.
+        step: environment steps per seed behind it.
+        returns: of greedy episodes, one per seed; NaN where it stopped.
+    """
+    return {
+        "task": config.task,
+        "task_version": spec.version,
+        "network": config.network.name,
+        "activation": config.network.activation,
+        "step": step,
+        "greedy_returns": [None if math.isnan(x) else x for x in returns],
+        "config": config.model_dump(mode="json"),
+        "esp_version": __version__,
+    }

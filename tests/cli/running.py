@@ -118,7 +118,10 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a key nobody knows": (lambda run: edit_config(run, colour="red"), "unknown setting 'config.colour'"),
     "a task nobody has": (lambda run: edit_config(run, task="chess"), "unknown task 'chess'"),
     "an algorithm nobody has": (lambda run: edit_config(run, algorithm="magic"), "was trained by 'magic'"),
-    "task settings of another": (lambda run: edit_config(run, task_settings={"wind": 1}), "no setting 'wind'"),
+    "task settings of another": (
+        lambda run: edit_config(run, task_settings={"wind": 1}),
+        "unknown setting 'task.wind'",
+    ),
     "a network larger than the file": (
         lambda run: edit_config(run, network={"hidden": [4096] * 16}),
         "the weights do not fit the configuration",

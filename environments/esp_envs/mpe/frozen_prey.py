@@ -63,7 +63,7 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
             names = [name for name in file.keys() if name.startswith("actor.layers.")]  # noqa: SIM118 - no iterator
             tensors = {name: file.get_tensor(name) for name in names}
         header = json.loads(metadata.get("esp", "null"))
-    except (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ValueError(f"the prey policy {path} is no intact safetensors file ({error}); export it again") from error
     if not isinstance(header, dict):
         raise ValueError(f"the file {path} has no 'esp' entry, so it is no policy of this project; export a prey")

@@ -38,7 +38,9 @@ class PredatorPreySettings(ParticleSettings):
     prey: Literal["random", "fleeing", "still", "policy"] = Setting(
         "random", description="who drives the prey while the predators learn"
     )
-    prey_policy: str | None = Setting(None, description="safetensors policy file, for prey 'policy' only")
+    prey_policy: str | None = Setting(
+        None, max_length=255, description="safetensors policy file, for prey 'policy' only"
+    )
     prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
 
     @model_validator(mode="after")

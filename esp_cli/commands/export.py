@@ -1,0 +1,123 @@
+"""`esp export`: take a trained policy away, or put it into the box of policies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.options import (
+    BoxAlgoOption,
+    BoxPriorOption,
+    ForceOption,
+    JsonOption,
+    OutOption,
+    PolicyArgument,
+)
+
+if TYPE_CHECKING:
+    from esp_cli.deploy.export import Exported
+    from esp_cli.training.loading import TrainedPolicy
+
+EPILOG = """Examples:\n
+    esp export formation -f c -o formation-c\n
+    esp export runs/cn-mappo -f onnx -f numpy -o cn-export\n
+    esp export formation -f webots -o controllers/esp_epuck_webots\n
+    esp export runs/cn-mappo -f policy -o checkpoints"""
+
+FORMATS = ("onnx", "torch", "c", "numpy", "webots", "ros2", "policy")
+
+
+def export(
+    policy: PolicyArgument,
+    formats: Annotated[
+        list[str],
+        typer.Option(
+            "--format",
+            "-f",
+            help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy, for the box.",
+            metavar="FORMAT",
+        ),
+    ],
+    out: OutOption,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
+    ] = None,
+    algo: BoxAlgoOption = None,
+    prior: BoxPriorOption = None,
+    episodes: Annotated[
+        int, typer.Option("--episodes", "-e", min=2, help="Per seed, to find the best; as many others judge a policy.")
+    ] = 320,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Of a policy in the box; by default TASK-ALGO-PRIOR.")
+    ] = None,
+    force: ForceOption = False,
+    json: JsonOption = None,
+) -> None:
+    """Write a policy for other programs (ONNX, torch.export, C99, numpy) or robots, checked against the policy itself.
+
+    Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
+    """
+    for unknown in set(formats) - set(FORMATS):
+        raise ValueError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
+    from esp_cli.deploy.box import open_policy
+    from esp_cli.deploy.export import export as write
+    from esp_cli.experiments.boxing import add_to_box
+    from esp_cli.training.loading import single_seed
+
+    if "policy" in formats and len(formats) > 1:
+        raise ValueError(
+            "-f policy puts a policy into a box; leave out the other formats, or export them by themselves"
+        )
+    if name is not None and "policy" not in formats:
+        raise ValueError("--name is for -f policy alone; leave it out")
+    trained = open_policy(policy, algo, prior)
+    for text in trained.notes:
+        console.note(text)
+    if "policy" in formats:
+        entry = add_to_box(trained, out, episodes, seed, name)
+        low, high = entry.score.ci95
+        console.note(
+            f"{entry.name}: seed {entry.seed} of {entry.chosen_from}, return {entry.score.mean:.2f} "
+            f"[{low:.2f}, {high:.2f}] over {entry.score.episodes} episodes -> {out / entry.file}"
+        )
+        if json is not None:
+            console.write_json(json, entry.model_dump(mode="json"))
+        return
+    chosen = _best(trained, episodes) if seed is None else seed
+    exported = write(single_seed(trained, chosen), formats, out, force)
+    if json != "-":
+        _print(exported, f"{policy}, seed {chosen}")
+        console.note(f"{out} has a README, and the worked example in policy.json")
+    if json is not None:
+        console.write_json(json, exported)
+
+
+def _best(trained: TrainedPolicy, episodes: int) -> int:
+    from esp_cli.experiments.boxing import best_seed
+
+    seeds = trained.config.seeds
+    best = best_seed(trained, episodes)
+    if len(seeds) > 1:
+        console.note(f"seed {best} is the best of {len(seeds)} over {episodes} episodes each; --seed names another")
+    return best
+
+
+def _print(exported: Exported, title: str) -> None:
+    rows = []
+    for result in exported.formats:
+        numbers = ("-", "-", "-")
+        if (found := result.agreement) is not None:
+            others = "-" if found.other_actions is None else str(found.other_actions)
+            numbers = (str(found.observations), f"{found.max_difference:.1e}", others)
+        rows.append((result.name, ", ".join(result.files), result.size, *numbers))
+        if result.note:
+            console.note(result.note)
+    headings = ("format", "files", "bytes>", "observations>", "largest difference>", "other choices>")
+    console.table(headings, rows, title=title, caption="compared with the policy itself, in float32")
+    costs: list[tuple[str, object]] = [("parameters", exported.parameters), ("operations an action", exported.flops)]
+    if exported.c is not None:
+        costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and about 1 kB of code")]
+        costs += [("RAM of the C source, bytes", exported.c.ram_bytes)]
+    console.table(("cost", "value>"), costs)

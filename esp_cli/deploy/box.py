@@ -1,0 +1,196 @@
+"""The box of trained policies that comes with the application: files in `checkpoints/` and a manifest of them.
+
+A checkout has the box beside the packages, an installed wheel inside `esp_cli`. A policy in it is found by its name
+(`formation-mappo-esp`) or by its task, and then by algorithm and prior.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training.checkpoint import CheckpointError, parse_json_object
+from esp_cli.training.config import RunConfig, one_sentence, shortened
+from esp_cli.training.loading import TrainedPolicy, load_policy
+from esp_cli.training.run_folder import write_json_atomic
+from esp_envs.registry import task_names
+
+BOX_FORMAT, BOX_VERSION = "esp-checkpoints", 1
+MANIFEST = "manifest.json"
+_FOLDER = "checkpoints"
+_MAX_MANIFEST_BYTES = 4 * 2**20
+_NAME = r"[a-z0-9]+(-[a-z0-9]+)*"
+_PRIORS = ("esp", "none", "augment", "consistency")
+"""In the order in which a task's policies are preferred; algorithms are in that of their registry."""
+
+
+class Score(BaseModel):
+    """How well the policy does greedily; mean, s.e.m. and interval are over episodes, as there is one seed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mean: float
+    sem: float
+    ci95: tuple[float, float]
+    episodes: int = Field(ge=2)
+
+
+class Entry(BaseModel):
+    """One policy of the box, as the manifest describes it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=f"^{_NAME}$", max_length=100)
+    file: str = Field(pattern=rf"^{_NAME}\.safetensors$", max_length=120)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    task: str
+    task_version: int
+    convention: str
+    algorithm: str
+    prior: Literal["esp", "augment", "consistency", "none"]
+    seed: int
+    chosen_from: int = Field(ge=1, description="seeds of the run, of which this one did best")
+    step: int = Field(ge=0, description="environment steps behind it")
+    score: Score
+    metrics: dict[str, float]
+    command: str = Field(description="that trains such a run")
+    esp_version: str
+    config: dict[str, Any]
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether it goes by the name that its task, algorithm and prior give, and not by one of its own."""
+        return self.name == standard_name(self.task, self.algorithm, self.prior)
+
+
+def standard_name(task: str, algorithm: str, prior: str) -> str:
+    """Return the name under which a policy goes into the box."""
+    return f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
+
+
+def box_folder() -> Path:
+    """Return the folder of the box: beside the packages in a checkout, else inside `esp_cli`."""
+    package = Path(__file__).parents[1]
+    inside = package / _FOLDER
+    return inside if inside.is_dir() else package.parent / _FOLDER
+
+
+def read_box(folder: Path | None = None) -> tuple[Entry, ...]:
+    """Return what the manifest lists; nothing where there is no manifest.
+
+    Args:
+        folder: of the box; by default that of this installation.
+
+    Raises:
+        ValueError: the manifest is damaged or of a newer version.
+    """
+    file = (folder or box_folder()) / MANIFEST
+    if not file.is_file():
+        return ()
+    if file.stat().st_size > _MAX_MANIFEST_BYTES:
+        raise ValueError(f"{file} is foreign: it is larger than any manifest")
+    try:
+        manifest = parse_json_object(file.read_bytes(), "text")
+    except CheckpointError as error:
+        raise ValueError(f"{file} {error}") from None
+    version = manifest.get("version")
+    if manifest.get("format") != BOX_FORMAT or type(version) is not int:
+        raise ValueError(f"{file} is foreign: it is no manifest of policies of esp")
+    if version > BOX_VERSION:
+        raise ValueError(f"{file} was written by a newer esp; update esp to use these policies")
+    listed = manifest.get("policies")
+    if not isinstance(listed, list):
+        raise ValueError(f"{file} is damaged: it lists no policies")
+    try:
+        entries = tuple(Entry.model_validate(item) for item in listed)
+    except ValidationError as error:
+        raise ValueError(f"{file} is damaged: {one_sentence(error, Entry, 'policy')}") from None
+    if len({entry.name for entry in entries}) < len(entries):
+        raise ValueError(f"{file} is damaged: it names a policy twice")
+    return entries
+
+
+def write_box(folder: Path, entries: tuple[Entry, ...]) -> None:
+    """Write the manifest of a box, sorted by name."""
+    listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
+    write_json_atomic(folder / MANIFEST, {"format": BOX_FORMAT, "version": BOX_VERSION, "policies": listed})
+
+
+def find(name: str, algo: str | None = None, prior: str | None = None, folder: Path | None = None) -> Entry:
+    """Find a policy of the box.
+
+    Args:
+        name: its own, or that of a task; of a task's policies MAPPO's and those with the prior come first.
+        algo: only those that this algorithm trained.
+        prior: only those that this kind of prior helped to train ("none": the plain learner).
+        folder: of the box; by default that of this installation.
+
+    Raises:
+        ValueError: there is none.
+    """
+    entries = read_box(folder)
+    named = [e for e in entries if e.name == name]
+    asked = named or [e for e in entries if e.task == name]
+    found = [e for e in asked if algo in (None, e.algorithm) and prior in (None, e.prior)]
+    if found:
+        return min(found, key=_rank)
+    wanted = " ".join([name, *(f"--algo {algo}" for _ in [0] if algo), *(f"--prior {prior}" for _ in [0] if prior)])
+    there = ", ".join(e.name for e in asked or entries) or "no policy at all"
+    raise ValueError(f"no policy fits {wanted}; the box has {there}; train one with esp train, and name its run folder")
+
+
+def _rank(entry: Entry) -> tuple[bool, int, int]:
+    algorithms = list(ALGORITHMS)
+    algorithm = algorithms.index(entry.algorithm) if entry.algorithm in algorithms else len(algorithms)
+    return not entry.is_standard, algorithm, _PRIORS.index(entry.prior)
+
+
+def open_policy(
+    where: Path, algo: str | None = None, prior: str | None = None, folder: Path | None = None
+) -> TrainedPolicy:
+    """Open a run folder, a policy file, or a policy of the box by its name or its task's.
+
+    What lies at the path goes before what has the name, unless algorithm or prior say that the box is meant.
+
+    Args:
+        where: path or name.
+        algo: of the box's policies, only those that this algorithm trained.
+        prior: likewise this kind of prior.
+        folder: of the box; by default that of this installation.
+
+    Raises:
+        ValueError: nothing there, damaged, or of another version.
+    """
+    choosy = algo is not None or prior is not None
+    try:
+        there = where.exists()
+    except OSError as error:  # a name that no file can have
+        raise ValueError(f"there is no policy {shortened(str(where))}: {error.strerror}") from None
+    if there and not choosy:
+        return load_policy(where)
+    if str(where) in task_names() or any(entry.name == str(where) for entry in read_box(folder)):
+        return load_entry(find(str(where), algo, prior, folder), folder)
+    if choosy:
+        raise ValueError(f"--algo and --prior choose among a task's policies, but {where} is no task; leave them out")
+    return load_policy(where)
+
+
+def load_entry(entry: Entry, folder: Path | None = None) -> TrainedPolicy:
+    """Load a policy of the box.
+
+    Raises:
+        ValueError: its file is missing, another than the manifest names, or of another version.
+    """
+    trained = load_policy((folder or box_folder()) / entry.file, entry.sha256)
+    described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
+    if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
+        raise ValueError(f"{trained.source} holds another policy than its manifest says; get both anew")
+    return trained
+
+
+def config_of(entry: Entry) -> RunConfig:
+    """Return the configuration of the run that an entry was chosen from."""
+    return RunConfig.model_validate(entry.config)

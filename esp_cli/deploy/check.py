@@ -1,0 +1,213 @@
+"""Whether an export does what the policy does: both act on the same observations, thousands of them."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from esp_cli.deploy.c_source import FLAGS
+from esp_cli.deploy.onnx_file import library
+from esp_cli.deploy.program import Floats, Program
+from esp_cli.networks.policy import Policy
+from esp_cli.training.loading import TrainedPolicy
+from esp_cli.training.trainer import build_environment
+
+OBSERVATIONS = 10_000
+"""On which every export is compared with its policy."""
+TOLERANCE = 1e-4
+"""Largest difference of an output, as a share of the largest output (or of 1); float32 in another order gives 1e-6."""
+_STEPS = 50
+
+Numbers = NDArray[Any]
+Runner = Callable[[Floats, Floats], tuple[Numbers, Numbers, Numbers]]
+"""(observation [B, D], memory [B, H]) -> (action [B] or [B, width], outputs [B, O], memory after [B, H])."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the policy itself does: row by row observation, memory, outputs, action and memory after it."""
+
+    obs: Floats
+    memory: Floats
+    outputs: Floats
+    action: Numbers
+    after: Floats
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far an export is from the policy.
+
+    Attributes:
+        observations: compared.
+        max_difference: of an output, an action's number or the memory after it.
+        other_actions: choices that differ, each of them a tie within rounding; None where the head does not choose.
+    """
+
+    observations: int
+    max_difference: float
+    other_actions: int | None
+
+
+@torch.no_grad()
+def take_sample(alone: TrainedPolicy, program: Program, count: int = OBSERVATIONS) -> Sample:
+    """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones."""
+    met = _met(alone, count // 2)
+    missing = count - len(met[0])
+    rng = np.random.default_rng(0)
+    obs = rng.standard_normal((missing, program.num_inputs), np.float32)
+    memory = rng.uniform(-1, 1, (missing, program.memory_width)).astype(np.float32)
+    if program.previous and program.head == "choose":
+        memory[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=missing)]
+    rows = torch.cat([met[0], torch.from_numpy(obs)]), torch.cat([met[1], torch.from_numpy(memory)])
+    action, after = alone.policy.act(rows[0][None, None], rows[1][None])
+    outputs = _raw_outputs(alone.policy, *rows)
+    width = action.shape[3:]
+    parts = (rows[0], rows[1], outputs, action.reshape(len(rows[0]), *width), after[0])
+    return Sample(*(part.numpy() for part in parts))
+
+
+def _met(alone: TrainedPolicy, count: int) -> tuple[Tensor, Tensor]:
+    """Play a little and return the first observations and memories that the policy meets."""
+    steps = min(_STEPS, alone.spec.horizon)
+    env = build_environment(alone.config, math.ceil(count / (steps * alone.spec.num_agents)), "export")
+    observation = env.reset()
+    memory = alone.policy.initial_memory(env.num_envs, observation.obs)
+    seen, carried = [], []
+    for _ in range(steps):
+        seen.append(observation.obs.flatten(0, 2))
+        carried.append(memory[0])
+        action, memory = alone.policy.act(observation.obs, memory)
+        observation = env.step(action).next
+    return torch.cat(seen)[:count], torch.cat(carried)[:count]
+
+
+def _raw_outputs(policy: Policy, obs: Tensor, memory: Tensor) -> Tensor:
+    """Return what the actor's last layer says, before its head normalises it: [B, O]."""
+    hidden, previous = memory.split([policy.actor.memory_width, memory.shape[1] - policy.actor.memory_width], 1)
+    return policy.actor.step(torch.cat([obs, previous], 1)[None], hidden[None])[0][0]
+
+
+def compare(sample: Sample, runner: Runner) -> Agreement:
+    """Compare an export with the policy.
+
+    Raises:
+        RuntimeError: they do not agree, which is a bug.
+    """
+    action, outputs, after = runner(sample.obs, sample.memory)
+    largest = max(1.0, float(np.abs(sample.outputs).max()))
+    gap = float(np.abs(outputs - sample.outputs).max())
+    differing = np.zeros(len(sample.obs), bool)
+    if sample.action.dtype.kind == "i":
+        differing = action != sample.action
+        first, second = np.sort(sample.outputs[differing], 1)[:, ::-1][:, :2].T
+        ties = bool((first - second <= 2 * TOLERANCE * largest).all())
+        same = ~differing  # after another choice the memory holds another previous action
+    else:
+        gap = max(gap, float(np.abs(action - sample.action).max()))
+        ties, same = True, ~differing
+    if sample.after.size:
+        gap = max(gap, float(np.abs(after[same] - sample.after[same]).max()))
+    if not gap <= TOLERANCE * largest or not ties:
+        raise RuntimeError(f"the export differs from the policy by {gap:g} of {largest:g}; this is a bug")
+    others = int(differing.sum()) if sample.action.dtype.kind == "i" else None
+    return Agreement(len(sample.obs), gap, others)
+
+
+def numpy_runner(file: Path) -> Runner:
+    """Run a written Python file."""
+    spec = spec_from_file_location(f"esp_exported_{id(file)}", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        action, after = module.POLICY.step(obs, memory)
+        return action, module.POLICY.outputs(obs, memory)[0], after
+
+    return run
+
+
+def onnx_runner(file: Path) -> Runner:
+    """Run a written ONNX model with onnxruntime."""
+    session = library("onnxruntime").InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    names = [value.name for value in session.get_inputs()]
+
+    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        given = {"observation": obs, "memory": memory}
+        results = session.run(None, {name: given[name] for name in names})
+        return results[0], results[1], results[2] if len(results) > 2 else memory
+
+    return run
+
+
+def torch_runner(file: Path) -> Runner:
+    """Run a written torch.export archive."""
+    module = torch.export.load(file).module()
+
+    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        given = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
+        with torch.no_grad():
+            results = [result.numpy() for result in module(*given)]
+        return results[0], results[1], results[2] if len(results) > 2 else memory
+
+    return run
+
+
+def compiler() -> str | None:
+    """Return this machine's C compiler, or None."""
+    return shutil.which("cc")
+
+
+def c_runner(file: Path, program: Program) -> Runner:
+    """Compile a written C source with every warning an error, and call it row by row.
+
+    Raises:
+        RuntimeError: it does not compile, which is a bug.
+    """
+    shared = file.with_suffix(".so")
+    command = [compiler() or "cc", *FLAGS, "-shared", "-fPIC", str(file), "-o", str(shared), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the exported C does not compile; this is a bug\n{done.stderr}")
+    code = ctypes.CDLL(str(shared))
+    pointer = ctypes.POINTER(ctypes.c_float)
+    code.esp_policy_outputs.restype = pointer
+    choose = program.head == "choose"
+    act = code.esp_policy_act
+    act.restype = ctypes.c_int if choose else None
+
+    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        obs, after = np.ascontiguousarray(obs), memory.copy()
+        outputs = np.empty((len(obs), program.num_outputs), np.float32)
+        action: Numbers = np.empty(len(obs), np.int64) if choose else np.empty_like(outputs)
+        for k in range(len(obs)):
+            given = [obs[k], *([after[k]] if program.memory_width else []), *([] if choose else [action[k]])]
+            chosen = act(*(array.ctypes.data_as(pointer) for array in given))
+            if choose:
+                action[k] = chosen
+            outputs[k] = np.ctypeslib.as_array(code.esp_policy_outputs(), (program.num_outputs,))
+        return action, outputs, after
+
+    return run
+
+
+def example_runs(folder: Path) -> bool:
+    """Compile and run the worked example of a C export; return whether it gives the expected action."""
+    program = folder / "example"
+    files = [str(folder / name) for name in ("policy_example.c", "policy.c")]
+    subprocess.run([compiler() or "cc", *FLAGS, *files, "-o", str(program), "-lm"], check=True, capture_output=True)
+    return subprocess.run([str(program)], check=False, capture_output=True).returncode == 0

@@ -1,0 +1,264 @@
+"""Exports of a policy: written, checked against the policy itself, and only then put where they are wanted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from esp_cli.deploy import check
+from esp_cli.deploy.c_source import CSource, c_source, example_source
+from esp_cli.deploy.card import describe, readme, summary
+from esp_cli.deploy.check import Agreement, Sample, take_sample
+from esp_cli.deploy.numpy_file import numpy_source
+from esp_cli.deploy.onnx_file import onnx_model
+from esp_cli.deploy.program import Program, program_of
+from esp_cli.deploy.torch_file import torch_archive
+from esp_cli.training.checkpoint import write_bytes_atomic
+from esp_cli.training.loading import TrainedPolicy
+
+STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
+"""Of the e-puck2's microcontroller, an STM32F407."""
+
+Files = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Export:
+    """One format, as it was written.
+
+    Attributes:
+        name: of the format.
+        files: names of the files.
+        size: of them together, bytes.
+        agreement: with the policy; None where it could not be run here.
+        note: why it could not.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    size: int
+    agreement: Agreement | None
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class Exported:
+    """All formats, and what an action costs.
+
+    Attributes:
+        formats: as they were written.
+        parameters: learned numbers.
+        flops: operations for one action.
+        c: flash and RAM of the C source, where it was written.
+    """
+
+    formats: tuple[Export, ...]
+    parameters: int
+    flops: int
+    c: CSource | None
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What every format is written from."""
+
+    alone: TrainedPolicy
+    program: Program
+    sample: Sample
+    description: dict[str, Any]
+
+    @property
+    def comment(self) -> str:
+        return summary(self.alone, self.program)
+
+    @property
+    def text(self) -> str:
+        return json.dumps(self.description)
+
+
+def _onnx(job: _Job) -> Files:
+    return {"policy.onnx": onnx_model(job.program, job.text)}
+
+
+def _torch(job: _Job) -> Files:
+    return {"policy.pt2": torch_archive(job.program, job.text)}
+
+
+def _numpy(job: _Job) -> Files:
+    return {"policy.py": numpy_source(job.program, job.comment, job.text).encode()}
+
+
+def _c(job: _Job) -> Files:
+    written, example = c_source(job.program, job.comment), job.description["example"]
+    action = example["action"] if isinstance(example["action"], list) else [example["action"]]
+    return {
+        "policy.h": written.header.encode(),
+        "policy.c": written.source.encode(),
+        "policy_example.c": example_source(job.program, example["observation"], action).encode(),
+    }
+
+
+def _epuck(job: _Job) -> Files:
+    """Return the numpy policy with what a robot's program needs beside it."""
+    spec = job.alone.spec
+    if spec.name != "formation":
+        raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
+    if job.program.memory_width:
+        raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
+    return {**_numpy(job), "esp_epuck.py": _takeaway("esp_epuck.py")}
+
+
+def _takeaway(name: str) -> bytes:
+    # read, not imported: it imports what only a robot's machine has
+    return (Path(__file__).parent / "takeaway" / name).read_bytes()
+
+
+def _webots(job: _Job) -> Files:
+    return {**_epuck(job), "esp_epuck_webots.py": _takeaway("esp_epuck_webots.py")}
+
+
+def _ros2(job: _Job) -> Files:
+    return {**_epuck(job), "esp_epuck_ros2.py": _takeaway("esp_epuck_ros2.py")}
+
+
+WRITERS: dict[str, Callable[[_Job], Files]] = {
+    "onnx": _onnx,
+    "torch": _torch,
+    "c": _c,
+    "numpy": _numpy,
+    "webots": _webots,
+    "ros2": _ros2,
+}
+"""Format -> what writes its files. Adding one is a line here, one in `_runner` and one in `_USE`."""
+
+
+def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
+    """Write one seed's policy in some formats, with `policy.json` and a README, after checking each.
+
+    Args:
+        alone: one seed's policy.
+        formats: of `WRITERS`.
+        folder: where to; made where it is missing.
+        force: replace files of an earlier export.
+
+    Raises:
+        ValueError: something is in the way, a library is missing, or the policy has no such export.
+    """
+    formats = tuple(dict.fromkeys(formats))
+    program = program_of(alone.policy)
+    sample = take_sample(alone, program)
+    job = _Job(alone, program, sample, describe(alone, program, sample))
+    written = {name: WRITERS[name](job) for name in formats}
+    c = c_source(program, "") if "c" in formats else None
+    results = tuple(_checked(name, files, job) for name, files in written.items())
+    sections = [_section(result, job, c) for result in results]
+    beside = {
+        "policy.json": (json.dumps(job.description, indent=2) + "\n").encode(),
+        "README.md": readme(alone, job.description, sections).encode(),
+    }
+    _write({name: content for files in written.values() for name, content in files.items()} | beside, folder, force)
+    return Exported(results, program.num_parameters, program.flops, c)
+
+
+def _write(files: Files, folder: Path, force: bool) -> None:
+    """Put files into a folder, each as a whole."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{folder} is a file; name a folder for the export with --out")
+    taken = sorted(name for name in files if (folder / name).exists())
+    if taken and not force:
+        raise ValueError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        write_bytes_atomic(folder / name, content)
+
+
+def _checked(name: str, files: Files, job: _Job) -> Export:
+    """Run a format's files in a folder of their own beside the policy."""
+    size = sum(map(len, files.values()))
+    if name == "c" and check.compiler() is None:
+        return Export(name, tuple(files), size, None, "there is no C compiler cc here, so the source was not run")
+    with TemporaryDirectory(prefix="esp-export-") as scratch:
+        folder = Path(scratch)
+        for file, content in files.items():
+            (folder / file).write_bytes(content)
+        agreement = check.compare(job.sample, _runner(name, folder, job.program))
+        if name == "c" and not check.example_runs(folder):
+            raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
+    return Export(name, tuple(files), size, agreement)
+
+
+def _runner(name: str, folder: Path, program: Program) -> check.Runner:
+    if name == "onnx":
+        return check.onnx_runner(folder / "policy.onnx")
+    if name == "torch":
+        return check.torch_runner(folder / "policy.pt2")
+    if name == "c":
+        return check.c_runner(folder / "policy.c", program)
+    return check.numpy_runner(folder / "policy.py")
+
+
+def _section(result: Export, job: _Job, c: CSource | None) -> str:
+    """Return the README's section on a format."""
+    remembers = job.program.memory_width > 0
+    use = _USE[result.name][remembers]
+    told = [f"## {', '.join(f'`{file}`' for file in result.files)}", "", use, ""]
+    if result.agreement is None:
+        told.append(f"Not compared with the policy: {result.note}.")
+    else:
+        agreement = result.agreement
+        told.append(
+            f"Compared with the policy on {agreement.observations} observations: largest difference "
+            f"{agreement.max_difference:.1e}"
+            + (f", {agreement.other_actions} other choices (ties)." if job.program.head == "choose" else ".")
+        )
+    if result.name == "c" and c is not None:
+        told += ["", *cost_lines(c, job.program)]
+    return "\n".join([*told, ""])
+
+
+def cost_lines(c: CSource, program: Program) -> list[str]:
+    """Return what the C source takes of a microcontroller, as a table."""
+    return [
+        "| of a microcontroller | | e-puck2 (STM32F407) |",
+        "|---|---|---|",
+        f"| flash: weights, and about 1 kB of code | {c.flash_bytes} bytes | {STM32F4_FLASH_BYTES} |",
+        f"| RAM: scratch and one agent's memory | {c.ram_bytes} bytes | {STM32F4_RAM_BYTES} |",
+        f"| operations an action | {program.flops} | |",
+    ]
+
+
+_NUMPY_USE = (
+    "Needs numpy alone. `import policy; action = policy.act(obs)` takes rows [..., D]; running the file checks its "
+    "worked example."
+)
+_ROBOT_USE = (
+    " Supervisor-given positions in, wheel speeds out. **It was run against a mocked interface over simulated robots, "
+    "and never on hardware**: lift the robots before the first start. The file's head says what it expects."
+)
+_USE = {
+    "onnx": (
+        "Input `observation` [rows, D]; outputs `action` and `outputs` (of the last layer).",
+        "Inputs `observation` [rows, D] and `memory` [rows, H], zeros at first; outputs `action`, `outputs` (of the "
+        "last layer) and `memory_out`, the next step's `memory`.",
+    ),
+    "torch": (
+        '`torch.export.load("policy.pt2").module()(observation)` returns action and outputs of the last layer.',
+        '`torch.export.load("policy.pt2").module()(observation, memory)` returns action, outputs of the last layer and '
+        "the next memory.",
+    ),
+    "c": (
+        "C99, float32, no allocation: `esp_policy_act(observation, ...)`. Link with libm; "
+        "`cc policy_example.c policy.c -lm && ./a.out` checks the worked example.",
+        "C99, float32, no allocation: `esp_policy_reset(memory)` once an episode, then `esp_policy_act(observation, "
+        "memory, ...)`, with a memory for each agent. Link with libm; `cc policy_example.c policy.c -lm && ./a.out` "
+        "checks the worked example.",
+    ),
+    "numpy": (_NUMPY_USE, f"{_NUMPY_USE} It remembers: `action, memory = policy.step(obs, memory)`."),
+    "webots": (f"A Webots controller around the numpy policy.{_ROBOT_USE}",) * 2,
+    "ros2": (f"A ROS 2 node around the numpy policy.{_ROBOT_USE}",) * 2,
+}
+"""How a format is used: by a policy that remembers nothing, and by one that does."""

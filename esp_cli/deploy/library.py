@@ -1,0 +1,142 @@
+"""Trained policies for other programs: numpy in, numpy out.
+
+from esp_cli import load_policy
+
+policy = load_policy("formation")
+wheels = policy.act(obs)
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from esp_cli.deploy.box import open_policy
+from esp_cli.training.loading import TrainedPolicy, single_seed
+from esp_envs.spec import Continuous, Layout, TaskSpec
+
+Floats = NDArray[np.float32]
+Action = NDArray[np.int64] | NDArray[np.float32]
+
+
+class LoadedPolicy:
+    """One seed's policy, ready to act; agents share it, so every row of observations is an agent of its own.
+
+    Shape letters as in `esp_envs.spec`; `...` stands for any leading axes, none among them.
+
+    Attributes:
+        spec: of its task: layout of an observation, meaning of the actions.
+        memory_width: numbers that it carries from step to step; 0 for one that remembers nothing.
+        source: the file or run folder that it came from.
+    """
+
+    def __init__(self, trained: TrainedPolicy, seed: int | None = None) -> None:
+        alone = single_seed(trained, trained.config.seeds[0] if seed is None else seed)
+        self.trained = alone
+        self.spec: TaskSpec = alone.spec
+        self.source = alone.source
+        self.memory_width = int(alone.policy.initial_memory(1, torch.empty(0)).shape[-1])
+
+    def act(self, obs: ArrayLike, rng: np.random.Generator | None = None) -> Action:
+        """Return what each agent does, for a policy that remembers nothing.
+
+        Args:
+            obs: [..., D] as `spec.observation` lays it out.
+            rng: draws the actions; without it the policy is greedy.
+
+        Returns:
+            [...] int64, indices of `spec.action.names`, or [..., width] float32 within the task's bounds.
+
+        Raises:
+            ValueError: another shape, numbers that are not finite, or a policy that has to remember.
+        """
+        if self.memory_width:
+            raise ValueError(
+                f"{self.source} is recurrent; begin an episode with memory = policy.initial_memory(num_agents), and "
+                "act with action, memory = policy.step(obs, memory)"
+            )
+        rows = self._checked_obs(obs)
+        return self.step(rows, self.initial_memory(*rows.shape[:-1]), rng)[0]
+
+    def initial_memory(self, *lead: int) -> Floats:
+        """Return the memory with which an episode begins: zeros [*lead, H]."""
+        return np.zeros((*lead, self.memory_width), np.float32)
+
+    @torch.no_grad()
+    def step(self, obs: ArrayLike, memory: ArrayLike, rng: np.random.Generator | None = None) -> tuple[Action, Floats]:
+        """Return what each agent does, and its next memory.
+
+        Args:
+            obs: [..., D] as `spec.observation` lays it out.
+            memory: [..., H] of `initial_memory`, or of the step before.
+            rng: draws the actions; without it the policy is greedy.
+
+        Returns:
+            Actions as of `act`, and memory [..., H]; the arguments stay as they are.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        rows = self._checked_obs(obs)
+        carried = self._checked(memory, self.memory_width, "memory", "as policy.initial_memory gives it")
+        lead = rows.shape[:-1]
+        if carried.shape[:-1] != lead:
+            raise ValueError(
+                f"the memory has shape {carried.shape}, but observations of shape {rows.shape} need "
+                f"{(*lead, self.memory_width)}: one row for each agent"
+            )
+        count = math.prod(lead)  # told to reshape, as it cannot be guessed where a width is 0
+        policy, noise = self.trained.policy, None
+        if rng is not None:
+            generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+            noise = policy.head.noise((1, count), [generator])
+        seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
+        action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise)
+        width = (self.spec.action.width,) if isinstance(self.spec.action, Continuous) else ()
+        return action.numpy().reshape((*lead, *width)), after.numpy().reshape((*lead, self.memory_width))
+
+    def _checked_obs(self, obs: ArrayLike) -> Floats:
+        layout = self.spec.observation
+        return self._checked(obs, layout.width, "observation", field_list(layout))
+
+    def _checked(self, values: ArrayLike, width: int, what: str, meaning: str) -> Floats:
+        """Return [..., width] float32 after checking that it is that."""
+        try:
+            array = np.asarray(values, np.float32)
+        except (TypeError, ValueError):
+            raise ValueError(f"the {what} is no array of numbers; give (..., {width}): {meaning}") from None
+        if array.ndim == 0 or array.shape[-1] != width:
+            raise ValueError(
+                f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}"
+            )
+        if not np.isfinite(array).all():
+            place = tuple(int(k) for k in np.argwhere(~np.isfinite(array))[0])
+            raise ValueError(f"the {what} holds {array[place]} at {place}; give finite numbers")
+        return array
+
+
+def load_policy(
+    where: str | os.PathLike[str], algo: str | None = None, prior: str | None = None, seed: int | None = None
+) -> LoadedPolicy:
+    """Load a trained policy; loading never runs code.
+
+    Args:
+        where: a task ("formation") or a name in the box of trained policies, a policy file, or a run folder.
+        algo: of a task's policies, the one that this algorithm trained.
+        prior: likewise this kind of prior; "none" is the plain learner.
+        seed: which seed of a run acts; by default its first.
+
+    Raises:
+        ValueError: nothing there, damaged, of another version, or no such seed.
+    """
+    return LoadedPolicy(open_policy(Path(where), algo, prior), seed)
+
+
+def field_list(layout: Layout) -> str:
+    """Return the fields of a layout in a few words: "heading 2, goal 2 (m)"."""
+    return ", ".join(f"{f.name} {f.width}" + (f" ({f.unit})" if f.unit else "") for f in layout.fields)

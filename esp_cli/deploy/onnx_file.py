@@ -1,0 +1,152 @@
+"""A program as an ONNX model, built node by node; needs the extra `export`."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from esp_cli import __version__
+from esp_cli.deploy.program import NORM_EPSILON, SQUASH_EPSILON, Activation, Affine, Floats, Norm, Program
+
+OPSET = 17
+"""The first with layer normalisation; runtimes since 2022 read it."""
+IR_VERSION = 8
+
+
+def library(name: str) -> Any:
+    """Import onnx or onnxruntime.
+
+    Raises:
+        ValueError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise ValueError(
+            f"an ONNX export needs the package {name}; install the extra with pip install 'esp-marl[export]'"
+        ) from None
+
+
+def onnx_model(program: Program, description: str) -> bytes:
+    """Write a program as an ONNX model.
+
+    Inputs: `observation` [rows, D] and, of a recurrent policy, `memory` [rows, H]. Outputs: `action` ([rows] int64 or
+    [rows, width] float32), `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H].
+
+    Args:
+        program: the policy.
+        description: JSON that goes into the model's metadata.
+
+    Raises:
+        ValueError: onnx is not installed.
+    """
+    onnx = library("onnx")
+    graph = _Graph(onnx)
+    float_type, int_type = onnx.TensorProto.FLOAT, onnx.TensorProto.INT64
+    value = onnx.helper.make_tensor_value_info
+    inputs = [value("observation", float_type, ["rows", program.num_inputs])]
+    x, hidden = "observation", ""
+    if program.memory_width:
+        inputs.append(value("memory", float_type, ["rows", program.memory_width]))
+        hidden = graph.cut("memory", 0, program.hidden)
+    if program.previous:
+        x = graph.node("Concat", [x, graph.cut("memory", program.hidden, program.memory_width)], axis=1)
+    for layer in program.layers:
+        if isinstance(layer, Affine):
+            x = graph.affine(x, layer)
+        elif isinstance(layer, Activation):
+            x = graph.node("Relu" if layer.name == "relu" else "Tanh", [x])
+        elif isinstance(layer, Norm):
+            arrays = [graph.constant(array) for array in layer.arrays]
+            x = graph.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=NORM_EPSILON)
+        else:
+            x = hidden = graph.recur(graph.affine(x, layer.input), graph.affine(hidden, layer.recurrent), hidden)
+    graph.name(x, "outputs")
+    outputs = [value("outputs", float_type, ["rows", program.num_outputs])]
+    if program.head == "choose":
+        done = graph.name(graph.node("ArgMax", [x], axis=-1, keepdims=0), "action")
+        outputs.insert(0, value("action", int_type, ["rows"]))
+    else:
+        done = graph.name(graph.squash(x, program.groups), "action")
+        outputs.insert(0, value("action", float_type, ["rows", program.num_outputs]))
+    if program.memory_width:
+        after = graph.node("Concat", [hidden, graph.encode(done, program)], axis=1) if program.previous else hidden
+        graph.name(after, "memory_out")
+        outputs.append(value("memory_out", float_type, ["rows", program.memory_width]))
+    model = onnx.helper.make_model(
+        onnx.helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.constants),
+        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="esp",
+        producer_version=__version__,
+    )
+    onnx.helper.set_model_props(model, {"esp": description})
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString()
+
+
+class _Graph:
+    """Nodes and constants as they come; each method returns the name of what it makes."""
+
+    def __init__(self, onnx: Any) -> None:
+        self.onnx = onnx
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def node(self, kind: str, inputs: list[str], **attributes: object) -> str:
+        name = f"t{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, inputs, [name], **attributes))
+        return name
+
+    def constant(self, array: Any) -> str:
+        name = f"c{len(self.constants)}"
+        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def name(self, value: str, name: str) -> str:
+        """Give a value a second name, as an output of the model."""
+        self.nodes.append(self.onnx.helper.make_node("Identity", [value], [name]))
+        return name
+
+    def cut(self, value: str, begin: int, end: int) -> str:
+        """Return columns of a matrix."""
+        bounds = [self.constant(np.array([k], np.int64)) for k in (begin, end, 1)]
+        return self.node("Slice", [value, *bounds])
+
+    def affine(self, x: str, layer: Affine) -> str:
+        return self.node("Gemm", [x, self.constant(layer.weight), self.constant(layer.bias)])
+
+    def recur(self, p: str, q: str, hidden: str) -> str:
+        """Return the next hidden state from both projections."""
+        (pr, pz, pn), (qr, qz, qn) = self._thirds(p), self._thirds(q)
+        reset = self.node("Sigmoid", [self.node("Add", [pr, qr])])
+        update = self.node("Sigmoid", [self.node("Add", [pz, qz])])
+        candidate = self.node("Tanh", [self.node("Add", [pn, self.node("Mul", [reset, qn])])])
+        return self.node("Add", [candidate, self.node("Mul", [update, self.node("Sub", [hidden, candidate])])])
+
+    def _thirds(self, value: str) -> list[str]:
+        names = [f"t{len(self.nodes)}_{k}" for k in range(3)]
+        self.nodes.append(self.onnx.helper.make_node("Split", [value], names, axis=1))
+        return names
+
+    def squash(self, x: str, groups: tuple[int, ...]) -> str:
+        """Return u tanh|u| / |u| for each group."""
+        width = sum(groups)
+        same: Floats = np.zeros((width, width), np.float32)
+        place = 0
+        for size in groups:
+            same[place : place + size, place : place + size] = 1
+            place += size
+        squares = self.node("MatMul", [self.node("Mul", [x, x]), self.constant(same)])
+        length = self.node("Sqrt", [self.node("Add", [squares, self.constant(np.array(SQUASH_EPSILON, np.float32))])])
+        return self.node("Mul", [x, self.node("Div", [self.node("Tanh", [length]), length])])
+
+    def encode(self, action: str, program: Program) -> str:
+        """Return an action as the memory holds it."""
+        if program.head == "squash":
+            return action
+        column = self.node("Unsqueeze", [action, self.constant(np.array([1], np.int64))])
+        every = self.constant(np.arange(program.num_outputs, dtype=np.int64)[None])
+        return self.node("Cast", [self.node("Equal", [column, every])], to=self.onnx.TensorProto.FLOAT)

@@ -1,0 +1,92 @@
+"""What e-pucks see and do, for an exported policy of formation change; needs numpy alone.
+
+Positions are metres in the arena's frame (x right, y up), headings radians counter-clockwise from x.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+
+class Pilot:
+    """Drives a team: where everybody is in, wheel speeds out.
+
+    Args:
+        description: DESCRIPTION of the exported policy.
+        act: its act(obs).
+    """
+
+    def __init__(self, description: dict[str, Any], act: Callable[[Any], Any]) -> None:
+        self.robot, settings = description["robot"], description["task"]["settings"]
+        self.act = act
+        self.control_period_s = float(description["task"]["control_period_s"])
+        self.nearness = settings["sight"] == "nearness"
+        self.pillar_radius_m = settings["obstacle_radius_m"]
+        names = [field["field"] for field in description["observation"]]
+        self.sees_pillar = "obstacle" in names
+        self.seen_robots = min(settings["neighbours"], settings["num_agents"] - 1)
+        options = description["action"].get("options")
+        self.pairs = np.array([option["means"] for option in options]) if options else None
+
+    def observations(self, poses: Any, goals: Any, pillars: Any = ()) -> Any:
+        """Return what every robot sees [N, D].
+
+        Args:
+            poses: [N, 3] x, y, heading of every robot.
+            goals: [N, 2] x, y.
+            pillars: [M, 2] x, y of their centres.
+        """
+        poses, goals = np.asarray(poses, float), np.asarray(goals, float)
+        pillars = np.asarray(pillars, float).reshape(-1, 2)
+        if poses.ndim != 2 or poses.shape[1] != 3 or goals.shape != (len(poses), 2):
+            raise ValueError(f"poses {poses.shape} and goals {goals.shape} should be [N, 3] and [N, 2]")
+        position, heading = poses[:, :2], poses[:, 2]
+        parts = [np.stack([np.cos(heading), np.sin(heading)], -1)]
+        if self.sees_pillar:
+            parts.append(self._pillar(position, pillars))
+        parts.append(goals - position)
+        if self.seen_robots:
+            parts.append(self._others(position))
+        return np.concatenate(parts, -1).astype(np.float32)
+
+    def wheels(self, poses: Any, goals: Any, pillars: Any = ()) -> Any:
+        """Return left and right wheel speed [N, 2] of every robot, rad/s; arguments as of `observations`."""
+        action = self.act(self.observations(poses, goals, pillars))
+        chosen = np.clip(action, -1, 1) if self.pairs is None else self.pairs[action]
+        return np.asarray(chosen, float) * self.robot["max_wheel_speed_rad_s"]
+
+    def twist(self, wheels: Any) -> Any:
+        """Return forward speed (m/s) and turning rate (rad/s) [..., 2] of wheel speeds [..., 2]."""
+        rim = np.asarray(wheels, float) * self.robot["wheel_radius_m"]
+        return np.stack([rim.sum(-1) / 2, (rim[..., 1] - rim[..., 0]) / self.robot["axle_m"]], -1)
+
+    def _pillar(self, position: Any, pillars: Any) -> Any:
+        """Return the nearest pillar as each robot sees it [N, 2]."""
+        if not len(pillars):
+            if self.nearness:
+                return np.zeros_like(position)
+            raise ValueError("this policy sees the offset of the nearest pillar, so it needs one; name its position")
+        ways = pillars[None] - position[:, None]
+        way = ways[np.arange(len(position)), np.linalg.norm(ways, axis=-1).argmin(-1)]
+        return self._seen(way, self.pillar_radius_m + self.robot["body_radius_m"])
+
+    def _others(self, position: Any) -> Any:
+        """Return the nearest other robots as each robot sees them [N, 2 * seen]."""
+        if len(position) <= self.seen_robots:
+            raise ValueError(f"each robot sees {self.seen_robots} others, but there are {len(position)} robots in all")
+        ways = position[None] - position[:, None]
+        apart = np.linalg.norm(ways, axis=-1)
+        np.fill_diagonal(apart, np.inf)
+        nearest = apart.argsort(-1, kind="stable")[:, : self.seen_robots]
+        seen = np.take_along_axis(ways, nearest[..., None], 1)
+        return self._seen(seen, 2 * self.robot["body_radius_m"]).reshape(len(position), -1)
+
+    def _seen(self, way: Any, reach_m: float) -> Any:
+        """Return offsets as they are, or as nearness: their direction, 1 long at a touch, fading with the gap."""
+        if not self.nearness:
+            return way
+        distance = np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+        return way / distance * np.exp(-np.maximum(distance - reach_m, 0) / self.robot["fading_m"])

@@ -1,0 +1,107 @@
+"""Runs an exported policy with numpy alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class NumpyPolicy:
+    """One greedy policy; every row of observations is an agent of its own.
+
+    Args:
+        program: layers and head.
+        weights: of the layers, as little-endian float32.
+    """
+
+    def __init__(self, program: dict[str, Any], weights: bytes) -> None:
+        self.program = program
+        self.hidden, self.previous = program["hidden"], program["previous"]
+        numbers = np.frombuffer(weights, "<f4").astype(np.float32)
+        self.layers: list[tuple[str, list[Any]]] = []
+        for layer in program["layers"]:
+            arrays = []
+            for shape in _shapes(layer):
+                count = int(np.prod(shape))
+                arrays.append(numbers[:count].reshape(shape))
+                numbers = numbers[count:]
+            self.layers.append((layer["kind"], arrays))
+        if numbers.size:
+            raise ValueError("the weights do not fit the layers; export the policy again")
+
+    def act(self, obs: Any) -> Any:
+        """Return the actions [...] or [..., width] of agents that see obs [..., D]."""
+        if self.hidden:
+            raise ValueError("this policy remembers: begin with initial_memory(), and call step(obs, memory)")
+        return self.step(obs, np.zeros((*np.shape(obs)[:-1], 0), np.float32))[0]
+
+    def initial_memory(self, *lead: int) -> Any:
+        """Return the memory with which an episode begins: zeros [*lead, H]."""
+        return np.zeros((*lead, self.hidden + self.previous), np.float32)
+
+    def step(self, obs: Any, memory: Any) -> tuple[Any, Any]:
+        """Return actions, and the memory [..., H] after them."""
+        outputs, hidden = self.outputs(obs, memory)
+        if self.program["head"] == "choose":
+            action = outputs.argmax(-1)
+            done = np.eye(outputs.shape[-1], dtype=np.float32)[action]
+        else:
+            action = done = self._squash(outputs)
+        return action, np.concatenate([hidden, done], -1) if self.previous else hidden
+
+    def outputs(self, obs: Any, memory: Any) -> tuple[Any, Any]:
+        """Return what the last layer says (logits, values or unbounded actions), and the hidden state after it."""
+        x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
+        if x.shape[-1:] != (self.program["num_inputs"],):
+            raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
+        if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
+            raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")
+        hidden = memory[..., : self.hidden]
+        x = np.concatenate([x, memory[..., self.hidden :]], -1)
+        for kind, arrays in self.layers:
+            if kind == "affine":
+                x = x @ arrays[0] + arrays[1]
+            elif kind == "relu":
+                x = np.maximum(x, 0)
+            elif kind == "tanh":
+                x = np.tanh(x)
+            elif kind == "norm":
+                centred = x - x.mean(-1, keepdims=True)
+                x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
+                x = x * arrays[0] + arrays[1]
+            else:
+                x = hidden = _recur(x, hidden, arrays)
+        return x, hidden
+
+    def _squash(self, outputs: Any) -> Any:
+        """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
+        parts, place = [], 0
+        for width in self.program["groups"]:
+            part = outputs[..., place : place + width]
+            length = np.sqrt((part * part).sum(-1, keepdims=True) + np.float32(1e-18))
+            parts.append(part * (np.tanh(length) / length))
+            place += width
+        return np.concatenate(parts, -1)
+
+
+def _recur(x: Any, hidden: Any, arrays: list[Any]) -> Any:
+    """Advance the gated recurrent unit by one step."""
+    p, q = x @ arrays[0] + arrays[1], hidden @ arrays[2] + arrays[3]
+    (pr, pz, pn), (qr, qz, qn) = np.split(p, 3, -1), np.split(q, 3, -1)
+    half = np.float32(0.5)  # s(x) = (1 + tanh(x / 2)) / 2 overflows nowhere
+    reset, update = half + half * np.tanh(half * (pr + qr)), half + half * np.tanh(half * (pz + qz))
+    candidate = np.tanh(pn + reset * qn)
+    return candidate + update * (hidden - candidate)
+
+
+def _shapes(layer: dict[str, Any]) -> list[tuple[int, ...]]:
+    """Return the shapes of a layer's arrays, in their order."""
+    if layer["kind"] == "affine":
+        return [(layer["inputs"], layer["outputs"]), (layer["outputs"],)]
+    if layer["kind"] == "norm":
+        return [(layer["width"],)] * 2
+    if layer["kind"] == "gru":
+        wide = 3 * layer["hidden"]
+        return [(layer["inputs"], wide), (wide,), (layer["hidden"], wide), (wide,)]
+    return []

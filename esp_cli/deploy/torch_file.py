@@ -1,0 +1,85 @@
+"""A program as a torch.export archive (.pt2): a graph of plain operations that torch or ExecuTorch runs."""
+
+from __future__ import annotations
+
+from io import BytesIO
+
+import torch
+from torch import Tensor, nn
+
+from esp_cli.deploy.program import NORM_EPSILON, SQUASH_EPSILON, Activation, Affine, Norm, Program
+
+
+class TorchProgram(nn.Module):
+    """The program in torch's own operations.
+
+    Shape:
+        observation: [rows, D]; memory: [rows, H], for recurrent policies.
+        Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
+    """
+
+    def __init__(self, program: Program) -> None:
+        super().__init__()
+        self.program = program
+        for k, layer in enumerate(program.layers):
+            for i, array in enumerate(layer.arrays):
+                self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
+
+    def forward(self, observation: Tensor, memory: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Act."""
+        program, x = self.program, observation
+        hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
+        if program.previous and memory is not None:
+            x = torch.cat([x, memory[:, program.hidden :]], 1)
+        for k, layer in enumerate(program.layers):
+            arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
+            if isinstance(layer, Affine):
+                x = torch.addmm(arrays[1], x, arrays[0])
+            elif isinstance(layer, Activation):
+                x = torch.relu(x) if layer.name == "relu" else torch.tanh(x)
+            elif isinstance(layer, Norm):
+                x = nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], NORM_EPSILON)
+            else:
+                x = hidden = _recur(x, hidden, arrays)
+        if program.head == "choose":
+            action = x.argmax(-1)
+            done = nn.functional.one_hot(action, program.num_outputs).float()
+        else:
+            action = done = _squash(x, program.groups)
+        if memory is None:
+            return action, x
+        return action, x, torch.cat([hidden, done], 1) if program.previous else hidden
+
+
+def torch_archive(program: Program, description: str) -> bytes:
+    """Write a program as an archive of torch.export, for any number of rows.
+
+    Args:
+        program: the policy.
+        description: JSON that goes into the archive as `policy.json`.
+    """
+    rows = torch.export.Dim("rows", min=1)
+    arguments = [torch.zeros(2, program.num_inputs)]
+    if program.memory_width:
+        arguments.append(torch.zeros(2, program.memory_width))
+    shapes = tuple({0: rows} for _ in arguments)
+    exported = torch.export.export(TorchProgram(program).eval(), tuple(arguments), dynamic_shapes=shapes)
+    content = BytesIO()
+    torch.export.save(exported, content, extra_files={"policy.json": description})
+    return content.getvalue()
+
+
+def _recur(x: Tensor, hidden: Tensor, arrays: list[Tensor]) -> Tensor:
+    """Advance the gated recurrent unit by one step."""
+    pr, pz, pn = torch.addmm(arrays[1], x, arrays[0]).chunk(3, -1)
+    qr, qz, qn = torch.addmm(arrays[3], hidden, arrays[2]).chunk(3, -1)
+    reset, update = torch.sigmoid(pr + qr), torch.sigmoid(pz + qz)
+    candidate = torch.tanh(pn + reset * qn)
+    return candidate + update * (hidden - candidate)
+
+
+def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
+    """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
+    parts = x.split(list(groups), -1)
+    lengths = [(part.square().sum(-1, keepdim=True) + SQUASH_EPSILON).sqrt() for part in parts]
+    return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)

@@ -1,0 +1,112 @@
+"""`esp export` and `esp policies`: what is asked for is written, and mistakes are told in a sentence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from esp_cli.deploy import check
+from esp_cli.deploy.box import MANIFEST, box_folder, read_box
+from tests.cli.running import DAMAGE, esp, refused
+
+
+def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None:
+    result = esp("export", finished, "-f", "numpy", "-f", "onnx", "-o", tmp_path / "out", "--episodes", 4)
+    assert "is the best of 2 over 4 episodes each" in result.stderr
+    for part in ("policy.py", "policy.onnx", "10000", "operations an action"):
+        assert part in result.stdout
+    files = {file.name for file in (tmp_path / "out").iterdir()}
+    assert files == {"policy.py", "policy.onnx", "policy.json", "README.md"}
+    assert json.loads((tmp_path / "out" / "policy.json").read_text())["policy"]["seed"] in (3, 7)
+
+
+@pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None:
+    result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7, "--json", "-")
+    written = json.loads(result.stdout)
+    (only,) = written["formats"]
+    assert (only["name"], only["agreement"]["observations"]) == ("c", 10_000)
+    assert written["c"]["flash_bytes"] == 4 * written["parameters"]
+    assert json.loads((tmp_path / "policy.json").read_text())["policy"]["seed"] == 7
+
+
+def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(check, "compiler", lambda: None)
+    result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7)
+    assert "there is no C compiler cc here" in result.stderr
+    assert "Not compared with the policy" in (tmp_path / "README.md").read_text()
+
+
+def test_a_policy_goes_into_a_box_and_is_used_from_there(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = tmp_path / "checkpoints"
+    result = esp("export", finished, "-f", "policy", "-o", box, "--episodes", 4)
+    (entry,) = read_box(box)
+    assert f"{entry.name}: seed {entry.seed} of 2" in result.stderr
+    monkeypatch.setattr("esp_cli.deploy.box.box_folder", lambda: box)
+    judged = json.loads(esp("eval", "navigation", "--episodes", 4, "--json", "-").stdout)
+    assert judged["greedy"]["mean"] == pytest.approx(entry.score.mean)
+    assert entry.name in esp("policies", "navigation").stdout
+    esp("render", entry.name, "-o", tmp_path / "n.png")
+    assert (tmp_path / "n.png").stat().st_size
+    said = refused("eval", "navigation", "--algo", "qmix")
+    assert "no policy fits navigation --algo qmix; the box has navigation-mappo-esp" in said
+    assert "holds no policy of formation" in refused("policies", "formation")
+    (box / MANIFEST).write_text("{")
+    assert "is not valid JSON" in refused("eval", "navigation")
+
+
+def test_the_box_that_comes_along_is_listed() -> None:
+    listed = json.loads(esp("policies", "--json", "-").stdout)
+    assert [item["name"] for item in listed] == [entry.name for entry in read_box()]
+    shown = esp("policies").stdout
+    assert all(entry.name in shown for entry in read_box())
+    assert (box_folder() / MANIFEST).is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy, webots, ros2, policy"),
+        (["-f", "policy", "-f", "c"], "-f policy puts a policy into a box; leave out the other formats"),
+        (["-f", "c", "--name", "mine"], "--name is for -f policy alone"),
+        (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
+        (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
+        (["-f", "ros2", "--seed", "3"], "drive e-pucks, but this policy is for navigation"),
+        ([], "Missing option '--format'"),
+    ],
+)
+def test_a_bad_option_is_told_in_one_sentence(
+    finished: Path, tmp_path: Path, options: list[str], sentence: str
+) -> None:
+    assert sentence in refused("export", finished, "-o", tmp_path / "out", *options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["nothing there", "a pickle file", "a truncated policy file"])
+def test_what_is_no_policy_is_told_in_one_sentence(copied: Path, tmp_path: Path, kind: str) -> None:
+    damage, sentence = DAMAGE[kind]
+    assert sentence in refused("export", damage(copied), "-f", "numpy", "-o", tmp_path / "out")
+    assert not (copied / "exploded").exists(), "loading ran code"
+
+
+def test_a_name_that_no_file_can_have_is_told_in_one_sentence() -> None:
+    assert refused("eval", "x" * 5000).endswith("...: File name too long")
+
+
+def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> None:
+    arguments = ("export", finished, "-f", "numpy", "-o", tmp_path, "--seed", 3)
+    esp(*arguments)
+    before = (tmp_path / "policy.py").read_bytes()
+    assert "has README.md already" in refused(*arguments)
+    shutil.copy(tmp_path / "policy.py", tmp_path / "mine.py")
+    (tmp_path / "policy.py").write_text("")
+    esp(*arguments, "--force")
+    assert (tmp_path / "policy.py").read_bytes() == before
+    assert (tmp_path / "mine.py").exists()
