@@ -99,3 +99,11 @@ def _cells(verdict: dict[str, Any] | None) -> tuple[str, str, str, str]:
         return console.format_mean(verdict["mean"], verdict["sem"]), interval, "", ""
     gap_interval = console.format_interval(gap["ci95"]) if gap["ci95"] else "-"
     return console.format_mean(verdict["mean"], verdict["sem"]), interval, f"{gap['mean']:+.2f}", gap_interval
+
+
+def print_tables(results: dict[str, Any]) -> None:
+    """Print every table of a study's results."""
+    from esp_cli.experiments.tables import all_tables
+
+    for table in all_tables(results):
+        console.table(table.headings, table.rows, title=table.title, caption=table.caption)
