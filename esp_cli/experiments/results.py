@@ -99,7 +99,7 @@ def _results(
     mode: Mode,
     thresholds: Sequence[float],
 ) -> dict[str, Any]:
-    configs = {cell.name: _flat(cell.config.model_dump(mode="json")) for cell in study.cells}
+    configs = {cell.name: flat(cell.config.model_dump(mode="json")) for cell in study.cells}
     first = next(iter(configs.values()))
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
     cells = []
@@ -279,10 +279,10 @@ def _rounded(values: Any) -> list[float | None]:
     return [None if x is None or not math.isfinite(x) else round(float(x), _DIGITS) for x in values]
 
 
-def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return a configuration with dotted names, so that two of them can be held against each other."""
     out: dict[str, Any] = {}
     for key, value in config.items():
         name = f"{prefix}{key}"
-        out |= _flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
+        out |= flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
     return out

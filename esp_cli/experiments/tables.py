@@ -155,7 +155,7 @@ def times_table(results: Mapping[str, Any]) -> Table:
     total = sum(cell["seconds"] for cell in done)
     versions = sorted({cell["esp_version"] for cell in done if cell.get("esp_version")}) or [results["esp_version"]]
     rows = (
-        ("command", f"`{results['command']}`"),
+        ("command", results["command"]),
         ("version of esp", ", ".join(versions)),
         ("runs finished", f"{sum(c['status'] == 'finished' for c in results['cells'])} of {len(results['cells'])}"),
         ("training, all runs", f"{format_duration(total)} of one core"),
