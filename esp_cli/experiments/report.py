@@ -82,7 +82,7 @@ def write_report(material: Material, out: Path) -> list[Path]:
         "tables": all_tables(material.results),
         "charts": [chart(panel, labels) for panel in panels],
         "legend": [(label, *_legend(labels, label)) for label in labels],
-        "pictures": [(png.stem, _data_uri(svg, "image/svg+xml")) for png, svg in pictures],
+        "pictures": [(png.stem, _data_uri(svg, "image/svg+xml")) for png, svg in pictures[1:]],  # curves are charts
         "films": [(name, _data_uri(path, "image/gif")) for name, path in _films(material)],
         "runs": [_run(cell) for cell in material.study.cells],
     }
