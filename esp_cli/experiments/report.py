@@ -153,7 +153,7 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> list[tu
         for k, name in enumerate(dict.fromkeys(cell["panel"] for cell in finished)):
             own = [cell for cell in finished if cell["panel"] == name]
             groups = [Bar(cell["variant"], returns_of(cell, results["mode"])) for cell in own]
-            anchors = own[0].get("anchors") or {}
+            anchors = {key: round(value, 1) for key, value in (own[0].get("anchors") or {}).items()}
             label = f"{results['mode']} return"
             baseline = anchors.get("random", 0.0)
             pictures.append(bars(groups, out / f"bars-{k + 1}", name, label, baseline, anchors))

@@ -245,7 +245,8 @@ def aggregates(results: Mapping[str, Any]) -> dict[str, dict[str, Estimate]]:
         if len(scores) < max(2, len(own)):
             continue
         out[variant] = {"iqm": aggregate(scores, "iqm"), "mean": aggregate(scores, "mean")}
-        if len(pairs) == len(own) and all(np.isfinite(y).all() for _, y in pairs.values()):
+        alike = len({x.size for x, _ in pairs.values()}) == 1
+        if len(pairs) == len(own) and alike and all(np.isfinite(y).all() for _, y in pairs.values()):
             out[variant]["improvement"] = average_improvement(pairs)
     return out
 

@@ -62,7 +62,7 @@ class Study(BaseModel):
     Attributes:
         kind: what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand.
         title: one line for people.
-        command: the command that plans it again.
+        command: the command that plans it again; one a line where several added to it.
         episodes: per seed, of the judgement of a trained policy.
         esp_version: of the program that planned it.
         cells: in the order in which they are run and shown.
@@ -132,13 +132,15 @@ class StudyFolder:
         if there.kind != study.kind or there.episodes != study.episodes or changed:
             raise StudyError(
                 f"{path} holds another study{f' ({changed[0]} differs)' if changed else ''}; go on with it by "
-                f"'{there.command}', or choose another --out"
+                f"'{there.command.splitlines()[-1]}', or choose another --out"
             )
         wanted = {cell.name for cell in study.cells}
         rest = tuple(cell for cell in there.cells if cell.name not in wanted)
         if not wanted - set(known):
             return cls(path, there)
-        return cls._written(path, study.model_copy(update={"cells": study.cells + rest}))
+        commands = [*there.command.splitlines(), study.command] if rest else [study.command]
+        merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
+        return cls._written(path, study.model_copy(update=merged))
 
     @classmethod
     def open(cls, path: Path) -> StudyFolder:

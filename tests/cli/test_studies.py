@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -16,6 +17,7 @@ from esp_cli.commands.study_options import parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.experiments.scheduler import Scheduler, Snapshot
 from esp_cli.experiments.study import StudyFolder
+from esp_cli.training.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
 from tests.experiments.studies import small_study, stand_in
@@ -115,22 +117,13 @@ def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, f
     folder = StudyFolder.create(tmp_path / "s", small_study())
     assert "a study is reported by itself" in refused("report", folder.path, finished)
     assert "no run has an evaluation yet" in esp("report", folder.path).stderr
-    out = tmp_path / "t"
-    options = [*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out]
-    StudyFolder.create(out, small_study())
+    options = [*TINY, "--steps", 200, *TINY_OPTIONS, "--out", tmp_path / "s"]
     assert "holds another study" in refused(*options)
-    held = StudyFolder.create(tmp_path / "u", small_study())
-    before = held.study.command
-    with held.lock():
-        options = ["reproduce", "table1", "--tasks", "navigation", "--algos", "mappo", "--steps", 200, "--seeds", 3]
-        settings = [
-            x
-            for k, v in (("network.hidden", [8]), ("evaluation.episodes", 2), ("evaluation.every_steps", 100))
-            for x in ("--set", f"{k}={json.dumps(v)}")
-        ]
-        told = refused(*options, "--episodes", 4, *settings, "--out", held.path)
-    assert "is in use by process" in told
-    assert StudyFolder.open(held.path).study.command == before
+    options[-1] = tmp_path / "t"
+    (tmp_path / "t").mkdir()
+    with contextlib.closing(os.fdopen(acquire(tmp_path / "t" / "study.lock"))):
+        assert "is in use by process" in refused(*options)
+    assert not (tmp_path / "t" / "runs").exists()
 
 
 def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(

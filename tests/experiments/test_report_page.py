@@ -17,12 +17,9 @@ from esp_cli.experiments.report import Material, write_report
 from esp_cli.experiments.results import collect, read_curve_of
 from tests.experiments.studies import small_study, write_study
 
-BROWSER = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
-needs_browser = pytest.mark.skipif(
-    BROWSER is None, reason="no Chromium here: apt-get install chromium (or ESP_CI_BROWSER=1 .ci/install-osmesa)"
-)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: .ci/install-chromium, or apt-get")
 HOSTILE = "</script><script>console.error('run')</script>&\"'"
 HOVER = """
 <script>

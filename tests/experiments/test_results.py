@@ -100,6 +100,14 @@ def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     assert TABLES["aggregates"](one) is None
 
 
+def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
+    ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
+    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends))
+    for cell in found["cells"][2:]:
+        cell["seeds"], cell["returns"] = cell["seeds"][:2], {"greedy": cell["returns"]["greedy"][:2]}
+    assert set(aggregates(found)["MAPPO-ESP"]) == {"iqm", "mean"}
+
+
 def test_the_mean_probability_of_improvement_by_hand():
     # two wins of two, and one of two: 3 of 4; redrawn within each task, the first always gives 1
     found = average_improvement({"a": ([1.0, 2.0], [0.0, 0.0]), "b": ([1.0, 0.0], [0.0, 1.0])})

@@ -23,8 +23,9 @@ def test_a_study_is_read_as_it_was_written_and_going_on_changes_nothing(tmp_path
 
 
 def test_a_study_grows_by_cells_and_keeps_the_others(tmp_path):
-    first = StudyFolder.create(tmp_path / "s", small_study()).study
-    more = StudyFolder.create(tmp_path / "s", small_study(tasks=("predator-prey",))).study
+    first = StudyFolder.create(tmp_path / "s", small_study(command="esp a")).study
+    more = StudyFolder.create(tmp_path / "s", small_study(tasks=("predator-prey",), command="esp b")).study
+    assert more.command == "esp a\nesp b"
     assert [cell.config.task for cell in more.cells] == ["predator-prey"] * 2 + ["navigation"] * 2
     assert more.cells[2:] == first.cells
     assert StudyFolder.open(tmp_path / "s").study == more
