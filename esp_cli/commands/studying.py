@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
         build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1]}))
     folder = StudyFolder.create(out, study)
     with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
+        begun = time.monotonic()
         names = {cell.name for cell in study.cells}
         cells = [cell for cell in folder.study.cells if cell.name in names]
         scheduler = Scheduler(folder, cells, min(jobs, len(cells)), (sys.executable, "-c", _BOOT))
@@ -69,6 +71,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
     if not complete:
         console.note(f"stopped; go on with: {study.command}")
         raise typer.Exit(130)
+    console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     _report(folder, choices.json)
     failed = [run.cell.name for run in scheduler.runs if run.status == "failed"]
     if failed:

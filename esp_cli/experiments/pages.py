@@ -4,7 +4,8 @@
     ... written by `esp report --fill PAGE`, never by hand ...
     <!-- end of results -->
 
-The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`.
+The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`. A comment that does not
+begin its line is none of these, as this example is not.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ from pathlib import Path
 from esp_cli.experiments.results import read_results
 from esp_cli.experiments.tables import TABLES
 
-_BLOCK = re.compile(r"(<!-- results: (?P<file>\S+) (?P<table>\S+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+_BLOCK = re.compile(
+    r"^(<!-- results: (?P<file>\S+) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)", re.DOTALL | re.MULTILINE
+)
 
 
 def filled(page: Path) -> str:

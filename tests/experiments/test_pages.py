@@ -34,6 +34,13 @@ def test_what_stands_between_the_marks_is_computed_and_the_rest_stays(page):
     assert files_of(page) == ["measured/a.json"]
 
 
+def test_an_indented_example_stays_as_it_is(page):
+    example = "```\n  <!-- results: measured/no.json paper -->\n  <!-- end of results -->\n```\n"
+    page.write_text(example + page.read_text())
+    assert filled(page).startswith(example)
+    assert files_of(page) == ["measured/a.json"]
+
+
 def test_filling_twice_changes_nothing_and_a_changed_number_does(page):
     page.write_text(filled(page))
     assert filled(page) == page.read_text()
