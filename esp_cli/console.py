@@ -22,6 +22,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from esp_cli.formatting import format_count as format_count  # noqa: PLC0414 # also console's
+from esp_cli.formatting import format_duration as format_duration  # noqa: PLC0414 # also console's
+from esp_cli.formatting import format_interval as format_interval  # noqa: PLC0414 # also console's
+from esp_cli.formatting import format_mean as format_mean  # noqa: PLC0414 # also console's
+
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
 
@@ -130,40 +135,6 @@ def _plain(value: object) -> object:
         if callable(convert):
             return _plain(convert())
     raise TypeError(f"{type(value).__name__} has no place in JSON")
-
-
-def format_mean(mean: float, sem: float | None = None, digits: int = 2) -> str:
-    """Return "mean ± standard error", or the mean alone where one sample leaves no error to state."""
-    if sem is None or not math.isfinite(sem):
-        return f"{mean:.{digits}f}"
-    return f"{mean:.{digits}f} ± {sem:.{digits}f}"
-
-
-def format_interval(interval: Sequence[float], digits: int = 2) -> str:
-    """Return an interval (low, high) as "[low, high]"."""
-    low, high = interval
-    return f"[{low:.{digits}f}, {high:.{digits}f}]"
-
-
-def format_count(count: float) -> str:
-    """Return a count in the short form that `--steps` takes: 500000 -> "500k", 1500000 -> "1.5M", 950 -> "950"."""
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        scaled = float(f"{count / size:.3g}")  # rounded first, so that 999,999 is 1M and not 1000k
-        if abs(scaled) >= 1:
-            return f"{scaled:g}{letter}"
-    return f"{count:.3g}"
-
-
-def format_duration(seconds: float) -> str:
-    """Return a time to wait in its two largest units: "8 s", "2 min 05 s", "1 h 03 min"."""
-    if not math.isfinite(seconds):
-        return "?"
-    whole = max(0, round(seconds))
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 class TrainingProgress:

@@ -11,6 +11,8 @@ COMMANDS: dict[str, str] = {
     "train": "esp_cli.commands.train:train",
     "eval": "esp_cli.commands.eval:evaluate",
     "render": "esp_cli.commands.render:render",
+    "ablate": "esp_cli.commands.ablate:ablate",
+    "reproduce": "esp_cli.commands.reproduce:reproduce",
     "export": "esp_cli.commands.export:export",
     "policies": "esp_cli.commands.policies:policies",
     "report": "esp_cli.commands.report:report",

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -24,7 +20,9 @@ from esp_cli.commands.options import (
     TaskOption,
     TransformsOption,
     parse_assignments,
+    resolve_device,
 )
+from esp_cli.commands.stopping import stop_requests
 
 if TYPE_CHECKING:
     from esp_cli.training.config import RunConfig
@@ -87,7 +85,7 @@ def train(
         }
         given = {name: value for name, value in chosen.items() if value is not None}
         overrides = {**given, **parse_assignments(settings or [])}
-        config = resolve_config(task, algo, preset, steps, seeds, _device(device), overrides)
+        config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), overrides)
         build_learner(config)  # refuses what does not go together while there is no run folder yet
         name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
@@ -108,23 +106,14 @@ def _refuse_beside_resume(context: typer.Context) -> None:
         )
 
 
-def _device(wanted: str) -> str:
-    import torch
-
-    available = torch.cuda.is_available()
-    if wanted == "cuda" and not available:
-        raise ValueError("there is no CUDA device here; use --device cpu or auto")
-    return "cuda" if wanted != "cpu" and available else "cpu"
-
-
 def _run(folder: RunFolder, tensorboard: bool) -> None:
     """Train in a locked run folder until the end or an interrupt, then say what came out and what to do next."""
     from esp_cli.training.loading import parse_config
     from esp_cli.training.trainer import Trainer
 
     config = parse_config(folder.config, folder.path)
-    _device(config.device)
-    with folder.lock(), _stop_requests() as requests:
+    resolve_device(config.device)
+    with folder.lock(), stop_requests("stopping after this iteration") as requests:
         trainer = Trainer(config, folder, tensorboard)
         if trainer.is_complete and folder.policy_path.is_file():
             console.note(f"{folder.path} is complete at {console.format_count(trainer.step)} steps")
@@ -182,22 +171,3 @@ def _report(trainer: Trainer, folder: RunFolder) -> None:
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
     console.note(f"next: esp eval {folder.path}    esp render {folder.path} -o out.gif")
-
-
-@contextmanager
-def _stop_requests() -> Iterator[list[int]]:
-    """Turn the first Ctrl-C (or termination signal) into a request; a second one interrupts at once."""
-    requests: list[int] = []
-
-    def handler(number: int, _frame: FrameType | None) -> None:
-        if requests:
-            raise KeyboardInterrupt
-        requests.append(number)
-        console.note("stopping after this iteration (press Ctrl-C again to stop at once)")
-
-    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield requests
-    finally:
-        for number, old in previous.items():
-            signal.signal(number, old)

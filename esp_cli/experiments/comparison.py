@@ -106,7 +106,7 @@ def _entry(curve: RunCurve, reference: RunCurve, at: Sequence[int], thresholds: 
     entry["returns"] = {str(step): _returns(curve, reference, step) for step in at}
     passed = {str(limit): steps_to_threshold(curve.steps, curve.values, limit) for limit in thresholds}
     entry["steps_to"] = {limit: {"mean": s.of_mean, "per_seed": list(s.per_seed)} for limit, s in passed.items()}
-    entry["area_under_curve"] = _summary(area_under_curve(curve.steps, curve.values)) if len(curve.steps) > 1 else None
+    entry["area_under_curve"] = summarise(area_under_curve(curve.steps, curve.values)) if len(curve.steps) > 1 else None
     return entry | {"config": curve.config.model_dump(mode="json")}
 
 
@@ -114,24 +114,41 @@ def _returns(curve: RunCurve, reference: RunCurve, step: int) -> dict[str, Any] 
     values, others = curve.at(step), reference.at(step)
     if values is None:
         return None
-    out = _summary(values)
-    if curve is not reference and others is not None and np.isfinite(values).all() and np.isfinite(others).all():
-        paired = curve.config.seeds == reference.config.seeds
-        gap = difference(values, others, paired)
-        chance = probability_of_improvement(values, others, paired)
-        out["difference"] = {"mean": gap.value, "ci95": gap.ci95, "paired": paired}
-        out["probability_of_improvement"] = chance.value
+    out = summarise(values)
+    if curve is not reference and others is not None:
+        out |= versus(values, others, curve.config.seeds == reference.config.seeds) or {}
     return out
 
 
-def _summary(values: NDArray[np.float64]) -> dict[str, Any]:
-    """Summarise one number per seed; seeds that stopped are left out and counted."""
+def summarise(values: NDArray[np.float64]) -> dict[str, Any]:
+    """Summarise one number per seed; seeds that stopped (NaN) are left out and counted."""
     good = values[np.isfinite(values)]
     if not good.size:
         return {"mean": None, "sem": None, "ci95": None, "per_seed": [None] * len(values)}
     mean, sem = mean_and_sem(good)
     per_seed = [float(x) if np.isfinite(x) else None for x in values]
     return {"mean": mean, "sem": sem, "ci95": bootstrap_interval(good), "per_seed": per_seed}
+
+
+def versus(values: NDArray[np.float64], others: NDArray[np.float64], paired: bool) -> dict[str, Any] | None:
+    """Return the difference from another run and the probability of improvement over it.
+
+    None where a seed of either stopped: those that are left are no fair sample.
+
+    Args:
+        values: one number per seed [S], NaN where it stopped.
+        others: likewise, of the run that it is compared with.
+        paired: both have the same seeds.
+    """
+    if not (np.isfinite(values).all() and np.isfinite(others).all()):
+        return None
+    gap = difference(values, others, paired)
+    chance = probability_of_improvement(values, others, paired)
+    return {
+        "difference": {"mean": gap.value, "ci95": gap.ci95, "paired": paired},
+        "probability_of_improvement": chance.value,
+        "probability_of_improvement_ci95": chance.ci95,
+    }
 
 
 def plot(

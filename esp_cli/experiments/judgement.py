@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from esp_cli import __version__
 from esp_cli.experiments.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.training.evaluation import (
     Controller,
@@ -29,8 +30,8 @@ def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
     """Play `episodes` episodes per seed with each controller.
 
     Returns:
-        A JSON-able dict: task, task_version, convention, episodes, greedy and stochastic (each mean, sem, ci95 over
-        seeds, per_seed), anchors (random, heuristic, and the task's other heuristics by name; one number each),
+        A JSON-able dict: esp_version, task, task_version, convention, episodes, greedy and stochastic (each mean, sem,
+        ci95 over seeds, per_seed), anchors (random, heuristic, and the task's other heuristics; one number each),
         heuristics (their names, the one called "heuristic" first), metrics (of the greedy policy) and metrics_per_seed,
         anchor_metrics (the same of each anchor), task_settings.
     """
@@ -44,6 +45,7 @@ def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
         key = "heuristic" if index == 0 else name
         anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
     return {
+        "esp_version": __version__,
         "task": trained.config.task,
         "task_version": trained.spec.version,
         "convention": trained.spec.convention,

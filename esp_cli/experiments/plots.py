@@ -122,18 +122,7 @@ def learning_curves(
         raise ValueError("there is no curve to draw")
     with _figure(path, title) as (figure, axes, files):
         for index, curve in enumerate(curves):
-            mean, low, high = curve_band(curve.values, band)
-            steps = np.asarray(curve.steps, dtype=np.float64)
-            if steps.shape != mean.shape:
-                raise ValueError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
-            num_seeds = np.shape(curve.values)[1]
-            colour = PALETTE[index % len(PALETTE)]
-            style = _LINE_STYLES[index % len(_LINE_STYLES)]
-            marker = "o" if steps.size == 1 else None
-            label = f"{curve.label} ({_seeds(num_seeds)})"
-            axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=label)
-            if num_seeds > 1:
-                axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
+            draw_curve(axes, curve, index, band)
         if ylim is not None:
             axes.set_ylim(*ylim)
         lines = _lines(anchors, references)
@@ -149,6 +138,36 @@ def learning_curves(
             loc="outside lower left", ncols=columns, title=_caption(band, [np.shape(c.values)[1] for c in curves])
         )
     return files
+
+
+def draw_curve(axes: Axes, curve: Curve, index: int, band: Band) -> None:
+    """Draw a curve with its band into axes.
+
+    Args:
+        axes: where to.
+        curve: the curve.
+        index: which colour and line style it has.
+        band: what the shade is.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    mean, low, high = curve_band(curve.values, band)
+    steps = np.asarray(curve.steps, dtype=np.float64)
+    if steps.shape != mean.shape:
+        raise ValueError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
+    num_seeds = np.shape(curve.values)[1]
+    colour, style = appearance(index)
+    marker = "o" if steps.size == 1 else None
+    label = f"{curve.label} ({_seeds(num_seeds)})"
+    axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=label)
+    if num_seeds > 1:
+        axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
+
+
+def appearance(index: int) -> tuple[str, LineStyle]:
+    """Return the colour and the line style of the curve with this index."""
+    return PALETTE[index % len(PALETTE)], _LINE_STYLES[index % len(_LINE_STYLES)]
 
 
 def bars(
@@ -213,15 +232,32 @@ def bars(
 def _figure(
     path: str | os.PathLike[str], title: str, height: float = 4.6
 ) -> Iterator[tuple[Figure, Axes, tuple[Path, Path]]]:
-    """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched."""
+    """Set up a figure with one pair of axes, written at the end."""
+    with written_figure(path, (7.2, height)) as (figure, files):
+        axes = figure.add_subplot()
+        axes.set_title(title, loc="left", fontweight="bold")
+        yield figure, axes, files
+
+
+@contextmanager
+def written_figure(
+    path: str | os.PathLike[str], size: tuple[float, float]
+) -> Iterator[tuple[Figure, tuple[Path, Path]]]:
+    """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched.
+
+    Args:
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        size: width and height, inches.
+
+    Raises:
+        ValueError: the files cannot be written.
+    """
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg"} else path.name
     png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.2, height), layout="constrained")
-        axes = figure.add_subplot()
-        axes.set_title(title, loc="left", fontweight="bold")
-        yield figure, axes, (png, svg)
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure, (png, svg)
         try:
             # dates and versions would make every file differ from the last
             figure.savefig(png, metadata={"Software": None})

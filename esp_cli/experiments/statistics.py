@@ -155,6 +155,43 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
     return Estimate(float(u) / (first.size * second.size), _interval((first, second), _share_of_wins))
 
 
+def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Estimate:
+    """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap.
+
+    Args:
+        pairs: by task, one finite number per seed [S] of each of the two; the same S everywhere, so that tasks count
+            alike.
+
+    Raises:
+        ValueError: no task, no value, one that is not finite, or groups that differ in size.
+    """
+    wins = {task: _wins(*_pair(x, y, True)) for task, (x, y) in pairs.items()}
+    if len({group.size for group in wins.values()}) > 1:
+        raise ValueError("the tasks have to have the same number of seeds, so that they count alike")
+    return aggregate(wins, "mean")
+
+
+def leader(
+    ours: tuple[float, float | None, int], others: tuple[float, float | None, int]
+) -> Literal["first", "second", "neither"] | None:
+    """Return which of two published means is higher, by Welch's t-test at 5 %; None where an error is missing.
+
+    Args:
+        ours: mean, standard error of the mean, and number of seeds.
+        others: likewise.
+    """
+    (mean, sem, count), (other_mean, other_sem, other_count) = ours, others
+    if sem is None or other_sem is None or min(count, other_count) < 2:
+        return None
+    deviation, other_deviation = sem * np.sqrt(count), other_sem * np.sqrt(other_count)
+    if deviation == other_deviation == 0:
+        return None
+    test = stats.ttest_ind_from_stats(mean, deviation, count, other_mean, other_deviation, other_count, equal_var=False)
+    if test.pvalue >= 1 - CONFIDENCE:
+        return "neither"
+    return "first" if mean > other_mean else "second"
+
+
 def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> StepsToThreshold:
     """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
 

@@ -26,6 +26,10 @@ Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
 
 
+_TAIL_BYTES = 2**18
+"""Longer than any row."""
+
+
 class MetricsError(ValueError):
     """A metrics file cannot be written or read; the text is one sentence for the user."""
 
@@ -138,6 +142,18 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         MetricsError: the file is missing, or damaged elsewhere than at its end.
     """
     return [row for _, row in _rows(Path(path))]
+
+
+def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
+    try:
+        with Path(path).open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _TAIL_BYTES))
+            lines = file.read().split(b"\n")
+    except OSError:
+        return {}
+    return next((row for row in map(_parse, reversed(lines)) if row is not None), {})
 
 
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:

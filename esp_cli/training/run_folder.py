@@ -15,11 +15,9 @@ lock, and the next one goes on from the newest checkpoint that is good.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import re
-import socket
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -35,6 +33,7 @@ from esp_cli.training.checkpoint import (
     save_checkpoint,
     write_bytes_atomic,
 )
+from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
 
 RUN_FORMAT = "esp-run"
@@ -98,6 +97,11 @@ class RunFolder:
     def policy_path(self) -> Path:
         """The file of the trained policy."""
         return self.path / _POLICY
+
+    @property
+    def lock_path(self) -> Path:
+        """The file that the process which trains holds."""
+        return self.path / _LOCK
 
     @property
     def tensorboard_path(self) -> Path:
@@ -180,23 +184,15 @@ class RunFolder:
         Raises:
             RunFolderError: another process, or this one, holds it already, or the file system cannot lock.
         """
-        with _told(f"cannot lock {self.path}"):
-            descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            with _told(f"cannot lock {self.path}"):
-                try:
-                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    holder = _holder(os.pread(descriptor, 4096, 0))
-                    raise RunFolderError(f"{self.path} is in use by {holder}; wait for it, or stop it first") from None
-                owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-                # In this order, so that whoever is refused meanwhile finds a name and not an empty file.
-                os.pwrite(descriptor, owner.encode(), 0)
-                os.ftruncate(descriptor, len(owner.encode()))
+            descriptor = acquire(self.lock_path)
+        except LockError as error:
+            raise RunFolderError(str(error)) from None
+        try:
+            with _told(f"cannot tidy up {self.path}"):
                 self._remove_half_written()
             yield
         finally:
-            # the file stays: removing it would let two processes hold two files of one name
             os.close(descriptor)
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
@@ -334,15 +330,6 @@ def _is_leftover(entry: Path) -> bool:
     if entry.name == _METRICS:
         return entry.is_file() and entry.stat().st_size == 0
     return entry.name == _LOCK or entry.name.startswith(TEMPORARY_PREFIX)
-
-
-def _holder(content: bytes) -> str:
-    """Name the process that a lock file names."""
-    try:
-        owner = json.loads(content)
-        return f"process {int(owner['pid'])} on {str(owner['host'])[:64]!r}"
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return "another process"
 
 
 def _step(path: Path) -> int:

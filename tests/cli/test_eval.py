@@ -12,7 +12,7 @@ import torch
 from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
-BESIDE = {"source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
+BESIDE = {"esp_version", "source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
 
 
 def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, tmp_path: Path) -> None:

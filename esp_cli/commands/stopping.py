@@ -1,0 +1,36 @@
+"""Ctrl-C in two steps, shared by the commands that take long: a request first, an interrupt second."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from esp_cli import console
+
+
+@contextmanager
+def stop_requests(sentence: str) -> Iterator[list[int]]:
+    """Turn the first Ctrl-C (or termination signal) into a request; a second one interrupts at once.
+
+    Args:
+        sentence: what the first one is answered with.
+
+    Yields:
+        A list that is empty until the request comes.
+    """
+    requests: list[int] = []
+
+    def handler(number: int, _frame: FrameType | None) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+        console.note(f"{sentence} (press Ctrl-C again to stop at once)")
+
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield requests
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)

@@ -1,0 +1,128 @@
+"""The options that the studies share, and the parsers behind them."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from esp_cli.commands.options import parse_assignments, parse_count, resolve_device
+
+if TYPE_CHECKING:
+    from esp_cli.experiments.catalogue import Request
+
+DEFAULT_SEEDS = tuple(range(10))
+DEFAULT_EPISODES = 320
+DEFAULT_PRESET = "default"
+
+TasksOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's.", metavar="TASK"
+    ),
+]
+AlgosOption = Annotated[
+    list[str] | None,
+    typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's.", metavar="ALGO"),
+]
+StudyStepsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--steps",
+        "-n",
+        help="Environment steps per seed; several give a row each. 500k and 3M name the paper's rows, which formation "
+        "has at 200k and 1M; formation=500k is taken as it is.",
+        metavar="STEPS",
+    ),
+]
+StudyOutOption = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.", metavar="DIR")
+]
+PresetOption = Annotated[
+    str, typer.Option("--preset", help="'default' (measured best) or 'paper' (the paper's settings).")
+]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=1, help="Runs side by side, one thread each; by default one a core.")
+]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
+]
+
+
+def parse_names(items: Sequence[str] | None) -> tuple[str, ...] | None:
+    """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix")."""
+    names = tuple(name.strip() for item in items or () for name in item.split(",") if name.strip())
+    return names or None
+
+
+def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, int], ...] | None:
+    """Read numbers of steps: ["500k", "formation=1M"] -> ((None, 500000), ("formation", 1000000)).
+
+    Raises:
+        ValueError: no number of steps.
+    """
+    found: list[tuple[str | None, int]] = []
+    for item in parse_names(items) or ():
+        task, equals, text = item.rpartition("=")
+        found.append((task if equals else None, parse_count(text)))
+    return tuple(dict.fromkeys(found)) or None
+
+
+@dataclass(frozen=True)
+class StudyChoices:
+    """What a study command was called with, as typer hands it over; see the options above."""
+
+    tasks: list[str] | None
+    algos: list[str] | None
+    steps: list[str] | None
+    seeds: tuple[int, ...]
+    out: Path | None
+    preset: str
+    settings: list[str] | None
+    device: str
+    episodes: int
+    jobs: int | None
+    dry_run: bool
+    json: str | None
+
+    def request(self, words: Sequence[str], out: Path) -> Request:
+        """Return what a study is asked for.
+
+        Args:
+            words: the command without its options, such as ("reproduce", "table1").
+            out: study folder.
+
+        Raises:
+            ValueError: a name, number or setting that cannot be read.
+        """
+        from esp_cli.experiments.catalogue import Request
+
+        return Request(
+            tasks=parse_names(self.tasks),
+            algorithms=parse_names(self.algos),
+            steps=parse_study_steps(self.steps),
+            seeds=self.seeds,
+            preset=self.preset,
+            overrides=parse_assignments(self.settings or []),
+            device=resolve_device(self.device),
+            episodes=self.episodes,
+            command=shlex.join(["esp", *words, *self._options(), "--out", str(out)]),
+        )
+
+    def _options(self) -> list[str]:
+        """Return the options that decide what is run, in the form in which they are written."""
+        words: list[str] = []
+        for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
+            names = parse_names(items)
+            words += [flag, ",".join(names)] if names else []
+        whole = self.seeds == tuple(range(len(self.seeds)))
+        if self.seeds != DEFAULT_SEEDS:
+            words += ["--seeds", str(len(self.seeds)) if whole else ",".join(map(str, self.seeds)) + ","]
+        words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
+        words += [word for item in self.settings or [] for word in ("--set", item)]
+        words += ["--device", self.device] if self.device != "cpu" else []
+        return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])

@@ -1,0 +1,116 @@
+"""Live progress of a study: a bar for every running process and one for the whole, or plain lines in a pipe."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from esp_cli import console
+
+if TYPE_CHECKING:
+    from esp_cli.experiments.scheduler import Run, Snapshot
+
+LINE_INTERVAL_S = 60.0
+"""Seconds between two plain lines where standard error is no terminal."""
+_SAID = {"training": "training", "judging": "judging", "elsewhere": "waiting for", "finished": "finished"}
+
+
+class StudyProgress:
+    """Shows snapshots of a scheduler.
+
+    Args:
+        clock: seconds; of a test.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seen: dict[str, str] = {}
+        self._bars: dict[str, TaskID] = {}
+        self._last_line_s = -math.inf
+        self._live: Progress | None = None
+
+    def __enter__(self) -> StudyProgress:
+        if console.err.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"))
+            self._live = Progress(*columns, console=console.err)
+            self._total = self._live.add_task("whole study", total=1.0, status="")
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def update(self, snapshot: Snapshot) -> None:
+        """Show where all runs are; what changed since the last time is said in a line of its own."""
+        self._say_changes(snapshot)
+        if self._live is not None:
+            self._draw(self._live, snapshot)
+        elif (now := self._clock()) - self._last_line_s >= LINE_INTERVAL_S:
+            self._last_line_s = now
+            for run in snapshot.runs:
+                if run.status in ("training", "judging", "elsewhere"):
+                    console.note(f"  {run.cell.name}  {run_status(run)}")
+            console.note(whole_status(snapshot))
+
+    def _say_changes(self, snapshot: Snapshot) -> None:
+        for run in snapshot.runs:
+            name, before = run.cell.name, self._seen.get(run.cell.name)
+            self._seen[name] = run.status
+            if before == run.status or (before is None and run.status in ("waiting", "finished")):
+                continue
+            if run.status == "failed":
+                console.error(f"{name} failed: {run.message}; the others go on")
+            elif run.status == "training" and run.step:
+                console.note(f"resuming {name} at {console.format_count(run.step)}")
+            elif run.status in _SAID:
+                spent = f" after {console.format_duration(run.trained_s)}" if run.status == "finished" else ""
+                elsewhere = ", which another process still trains" if run.status == "elsewhere" else ""
+                console.note(f"{_SAID[run.status]} {name}{spent}{elsewhere}")
+
+    def _draw(self, live: Progress, snapshot: Snapshot) -> None:
+        for run in snapshot.runs:
+            name, active = run.cell.name, run.status in ("training", "judging", "elsewhere")
+            if active and name not in self._bars:
+                self._bars[name] = live.add_task(name, total=run.cell.config.steps, status="")
+            if name in self._bars:
+                if active:
+                    live.update(self._bars[name], completed=run.step, status=run_status(run))
+                else:
+                    live.remove_task(self._bars.pop(name))
+        live.update(self._total, completed=share(snapshot), status=whole_status(snapshot))
+
+
+def share(snapshot: Snapshot) -> float:
+    """Return the share of all environment steps that is done."""
+    total = sum(run.cell.config.steps for run in snapshot.runs)
+    done = sum(run.cell.config.steps if run.status == "finished" else run.step for run in snapshot.runs)
+    return done / total if total else 1.0
+
+
+def run_status(run: Run) -> str:
+    """Return steps, rate and time left of a run in one line."""
+    if run.status == "judging":
+        return "playing its judgement"
+    steps = f"{console.format_count(run.step)}/{console.format_count(run.cell.config.steps)}"
+    rate = run.rate
+    if rate is None:
+        return steps
+    left_s = (run.cell.config.steps - run.step) * len(run.cell.config.seeds) / rate
+    return f"{steps}  {console.format_count(rate)} steps/s  {console.format_duration(left_s)} left"
+
+
+def whole_status(snapshot: Snapshot) -> str:
+    """Return how many runs are done, and the time left of the whole study, in one line."""
+    left = "?" if snapshot.left_s is None else console.format_duration(snapshot.left_s)
+    failed = snapshot.count("failed")
+    parts = [f"{share(snapshot):.0%}", f"{snapshot.count('finished')}/{len(snapshot.runs)} runs finished"]
+    parts += [f"{failed} failed"] if failed else []
+    return "  ".join([*parts, f"{left} left"])

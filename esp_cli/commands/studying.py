@@ -1,0 +1,164 @@
+"""What the study commands do: plan, say what it costs, run with live progress, tabulate."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.stopping import stop_requests
+from esp_cli.commands.study_options import StudyChoices
+from esp_cli.commands.study_progress import StudyProgress
+
+if TYPE_CHECKING:
+    from esp_cli.experiments.cost import Cost
+    from esp_cli.experiments.scheduler import Snapshot
+    from esp_cli.experiments.study import Study, StudyFolder
+
+_BOOT = "from esp_cli.experiments.workers import follow_parent; follow_parent(); from esp_cli.app import main; main()"
+"""The application as a child process: it stops cleanly when the study that started it ends."""
+_MEBIBYTE = 2**20
+
+
+def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
+    """Plan a study and run it, or with --dry-run say what it would cost.
+
+    Args:
+        kind: of the catalogue.
+        words: the command without its options.
+        choices: of the user.
+
+    Raises:
+        ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
+    """
+    from esp_cli.experiments.catalogue import plan
+    from esp_cli.experiments.scheduler import Scheduler, available_cores
+    from esp_cli.experiments.study import StudyFolder
+    from esp_cli.training.trainer import build_learner
+
+    out = choices.out or Path("runs") / kind
+    study = plan(kind, choices.request(words, out))
+    jobs = choices.jobs or (1 if study.cells[0].config.device == "cuda" else available_cores())
+    if choices.dry_run:
+        _dry_run(study, StudyFolder(out, study), jobs, choices.json)
+        return
+    for cell in study.cells:  # refuses what does not go together while there is no folder yet
+        build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1]}))
+    folder = StudyFolder.create(out, study)
+    with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
+        begun = time.monotonic()
+        names = {cell.name for cell in study.cells}
+        cells = [cell for cell in folder.study.cells if cell.name in names]
+        scheduler = Scheduler(folder, cells, min(jobs, len(cells)), (sys.executable, "-c", _BOOT))
+        finished = sum(run.status == "finished" for run in scheduler.runs)
+        console.note(
+            f"{study.title}: {len(cells)} runs, {finished} of them finished, "
+            f"{scheduler.jobs} side by side -> {folder.path}"
+        )
+        with StudyProgress() as progress:
+
+            def listen(snapshot: Snapshot) -> bool:
+                progress.update(snapshot)
+                return not requests
+
+            complete = scheduler.run(listen)
+    if not complete:
+        console.note(f"stopped; go on with: {study.command}")
+        raise typer.Exit(130)
+    console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
+    _report(folder, choices.json)
+    failed = [run.cell.name for run in scheduler.runs if run.status == "failed"]
+    if failed:
+        raise ValueError(
+            f"{len(failed)} of {len(cells)} runs failed ({', '.join(failed)}); see log.txt in their folders below "
+            f"{folder.path / 'runs'}; the same command tries them again"
+        )
+
+
+def _report(folder: StudyFolder, json: str | None) -> None:
+    """Print the table of a study and say what to do next."""
+    from esp_cli.commands.report import print_tables
+    from esp_cli.experiments.results import collect
+
+    results = collect(folder)
+    if json != "-":
+        print_tables(results)
+    if json is not None:
+        console.write_json(json, results)
+    console.note(f"next: esp report {folder.path}")
+
+
+def _dry_run(study: Study, folder: StudyFolder, jobs: int, json: str | None) -> None:
+    """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
+    from esp_cli.experiments.cost import probe
+    from esp_cli.experiments.scheduler import Scheduler, makespan
+
+    states = Scheduler(folder, study.cells, jobs, ()).runs
+    costs: list[Cost] = []
+    with console.TrainingProgress(len(states), description="measure") as progress:
+        for run in states:
+            costs.append(probe(run.cell.config, study.episodes))
+            progress.update(len(costs))
+    left = [_left_s(run, cost) for run, cost in zip(states, costs, strict=True)]
+    waiting = [seconds for seconds in left if seconds > 0]
+    kept = sum(cost.disk_bytes for cost in costs)
+    peak = kept + sum(sorted((cost.peak_bytes - cost.disk_bytes for cost in costs), reverse=True)[:jobs])
+    plan: dict[str, Any] = {
+        "kind": study.kind,
+        "title": study.title,
+        "out": folder.path,
+        "jobs": jobs,
+        "seconds": makespan([], waiting, jobs),
+        "core_seconds": sum(left),
+        "disk_bytes": kept,
+        "disk_peak_bytes": peak,
+        "runs": [
+            {
+                "name": run.cell.name,
+                "status": run.status,
+                "step": run.step,
+                "seconds_left": seconds,
+                "seconds": cost.training_s + cost.judgement_s,
+                "config": run.cell.config,
+            }
+            for run, cost, seconds in zip(states, costs, left, strict=True)
+        ],
+    }
+    if json is not None:
+        console.write_json(json, plan)
+    if json == "-":
+        return
+    rows = [
+        (
+            run.cell.name,
+            f"{console.format_count(run.cell.config.steps)} x {len(run.cell.config.seeds)}",
+            run.status if run.status == "finished" else f"at {console.format_count(run.step)}" if run.step else "new",
+            console.format_duration(seconds),
+        )
+        for run, seconds in zip(states, left, strict=True)
+    ]
+    console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=study.title)
+    console.say(
+        f"{len(waiting)} runs to do: {console.format_duration(plan['core_seconds'])} on one core, "
+        f"{console.format_duration(plan['seconds'])} with {jobs} side by side, if nothing else runs here"
+    )
+    free = shutil.disk_usage(next(p for p in (folder.path, *folder.path.absolute().parents) if p.exists())).free
+    console.say(
+        f"disk: {kept / _MEBIBYTE:.0f} MiB when done, at most {peak / _MEBIBYTE:.0f} MiB on the way; "
+        f"{free / _MEBIBYTE:.0f} MiB are free -> {folder.path}"
+    )
+    if peak > free:
+        console.note("the disk is too small for that; choose another --out, or fewer --jobs")
+
+
+def _left_s(run: Any, cost: Cost) -> float:
+    """Return the seconds that are left of a run."""
+    if run.status == "finished":
+        return 0.0
+    return cost.training_s * (1 - run.step / run.cell.config.steps) + cost.judgement_s

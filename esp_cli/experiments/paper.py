@@ -1,0 +1,52 @@
+"""What the paper reports, from one data file: table 1, the supplement's rows for other numbers of agents, figure 5c."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+NUM_SEEDS = 10
+"""Seeds behind every number of the paper."""
+_FILE = Path(__file__).with_name("paper.json")
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A number of the paper.
+
+    Attributes:
+        mean: episode reward, mean over ten seeds.
+        sem: standard error of the mean; None where it was read off a figure.
+    """
+
+    mean: float
+    sem: float | None
+
+
+def reported(key: tuple[str, ...] | None) -> Reported | None:
+    """Return a number of the paper by its place, such as ("table1", "navigation", "500000", "mappo", "esp").
+
+    None where the paper has no such number.
+    """
+    place: Any = _content()
+    for part in key or (None,):
+        place = place.get(part) if isinstance(place, dict) else None
+    return Reported(*place) if isinstance(place, list) else None
+
+
+def horizons(task: str) -> tuple[int, ...]:
+    """Return the numbers of steps at which table 1 states a task's returns, ascending; none where it does not."""
+    return tuple(sorted(int(steps) for steps in _content()["table1"].get(task, {})))
+
+
+def tasks() -> tuple[str, ...]:
+    """Return the tasks of table 1 in its order."""
+    return tuple(_content()["table1"])
+
+
+@cache
+def _content() -> dict[str, Any]:
+    return json.loads(_FILE.read_text(encoding="utf-8"))

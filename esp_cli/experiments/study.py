@@ -1,0 +1,229 @@
+"""A study: a named list of runs in one folder, each of which is compared with another one and with the paper.
+
+Layout::
+
+    study.json          what is to be run, and the command that said so
+    runs/NAME/          one run folder per cell, see esp_cli.training.run_folder
+    runs/NAME/judgement.json   the trained policies beside the anchors, on episodes of their own
+    runs/NAME/log.txt   what the processes that trained and judged it said
+    study.lock          held by the process that works on the study
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from esp_cli import __version__
+from esp_cli.training.config import RunConfig, one_sentence
+from esp_cli.training.locking import acquire
+from esp_cli.training.run_folder import RunFolder, write_json_atomic
+
+STUDY_FORMAT = "esp-study"
+STUDY_VERSION = 1
+_STUDY, _RUNS, _LOCK, _JUDGEMENT, _LOG = "study.json", "runs", "study.lock", "judgement.json", "log.txt"
+
+
+class StudyError(ValueError):
+    """A study folder cannot be made, opened or used; the text is one sentence for the user."""
+
+
+class Cell(BaseModel):
+    """One run of a study, and where it stands in tables and pictures.
+
+    Attributes:
+        name: of its folder.
+        panel: the picture that its curve is in, and one axis of the table.
+        variant: its name in that picture, and the other axis.
+        config: what is run.
+        reference: name of the cell that it is compared with; None for such a cell itself.
+        paper: place of the paper's number, see `paper.reported`; None where there is none that compares.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    panel: str
+    variant: str
+    config: RunConfig
+    reference: str | None = None
+    paper: tuple[str, ...] | None = None
+
+
+class Study(BaseModel):
+    """A named list of runs.
+
+    Attributes:
+        kind: what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand.
+        title: one line for people.
+        command: the command that plans it again; one a line where several added to it.
+        episodes: per seed, of the judgement of a trained policy.
+        esp_version: of the program that planned it.
+        cells: in the order in which they are run and shown.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str
+    title: str
+    command: str
+    episodes: int = Field(ge=1)
+    esp_version: str = __version__
+    rows: Literal["panels", "variants"] = Field(description="what the rows of the table are; the other are columns")
+    cells: tuple[Cell, ...]
+
+    def cell(self, name: str) -> Cell:
+        """Return a cell by its name."""
+        return next(cell for cell in self.cells if cell.name == name)
+
+    @property
+    def panels(self) -> list[str]:
+        """The panels in order."""
+        return list(dict.fromkeys(cell.panel for cell in self.cells))
+
+    @property
+    def variants(self) -> list[str]:
+        """The variants in order."""
+        return list(dict.fromkeys(cell.variant for cell in self.cells))
+
+
+class StudyFolder:
+    """A folder that holds a study; use :meth:`create` or :meth:`open`.
+
+    Attributes:
+        path: the folder.
+        study: all that was ever planned in it.
+    """
+
+    def __init__(self, path: Path, study: Study) -> None:
+        self.path, self.study = path, study
+
+    @staticmethod
+    def is_one(path: Path) -> bool:
+        """Return whether a folder holds a study."""
+        return (path / _STUDY).is_file()
+
+    @classmethod
+    def create(cls, path: Path, study: Study) -> StudyFolder:
+        """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
+
+        Raises:
+            StudyError: the folder holds another study, or something foreign.
+        """
+        # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
+        study = Study.model_validate_json(study.model_dump_json())
+        if path.is_file():
+            raise StudyError(f"{path} is a file; choose another --out")
+        if not cls.is_one(path):
+            foreign = [entry.name for entry in path.iterdir() if entry.name != _LOCK] if path.is_dir() else []
+            if foreign:
+                raise StudyError(f"{path} is not empty and no study (it has {foreign[0]!r}); choose another --out")
+            path.mkdir(parents=True, exist_ok=True)
+            return cls._written(path, study)
+        there = cls.open(path).study
+        known = {cell.name: cell for cell in there.cells}
+        changed = [cell.name for cell in study.cells if cell.name in known and cell != known[cell.name]]
+        if there.kind != study.kind or there.episodes != study.episodes or changed:
+            raise StudyError(
+                f"{path} holds another study{f' ({changed[0]} differs)' if changed else ''}; go on with it by "
+                f"'{there.command.splitlines()[-1]}', or choose another --out"
+            )
+        wanted = {cell.name for cell in study.cells}
+        rest = tuple(cell for cell in there.cells if cell.name not in wanted)
+        if not wanted - set(known):
+            return cls(path, there)
+        commands = [*there.command.splitlines(), study.command] if rest else [study.command]
+        merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
+        return cls._written(path, study.model_copy(update=merged))
+
+    @classmethod
+    def open(cls, path: Path) -> StudyFolder:
+        """Open an existing study.
+
+        Raises:
+            StudyError: it is missing, damaged, foreign, or of a newer version.
+        """
+        file = path / _STUDY
+        try:
+            data = json.loads(file.read_bytes())
+        except OSError as error:
+            raise StudyError(f"{path} is no study: cannot read {file} ({error.strerror or error})") from None
+        except (ValueError, RecursionError):
+            raise StudyError(f"{file} is damaged: it is not JSON") from None
+        if not isinstance(data, dict) or data.pop("format", None) != STUDY_FORMAT:
+            raise StudyError(f"{file} is foreign: it is not a study of esp")
+        version = data.pop("version", None)
+        if type(version) is not int or version > STUDY_VERSION:
+            raise StudyError(f"{file} was written by a newer esp; update esp to use this study")
+        try:
+            return cls(path, Study.model_validate(data))
+        except ValidationError as error:
+            raise StudyError(f"{file}: {one_sentence(error, Study, 'study')}") from None
+
+    @classmethod
+    def _written(cls, path: Path, study: Study) -> StudyFolder:
+        content = {"format": STUDY_FORMAT, "version": STUDY_VERSION, **study.model_dump(mode="json")}
+        write_json_atomic(path / _STUDY, content)
+        return cls(path, study)
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the study, so that no second process works on it.
+
+        Raises:
+            LockError: another process holds it.
+        """
+        descriptor = acquire(self.path / _LOCK)
+        try:
+            yield
+        finally:
+            os.close(descriptor)
+
+    def run_path(self, cell: Cell) -> Path:
+        """Return the run folder of a cell."""
+        return self.path / _RUNS / cell.name
+
+    def log_path(self, cell: Cell) -> Path:
+        """Return the file that the processes of a cell write to."""
+        return self.run_path(cell) / _LOG
+
+    def judgement_path(self, cell: Cell) -> Path:
+        """Return the file that holds the judgement of a cell's trained policy."""
+        return self.run_path(cell) / _JUDGEMENT
+
+    def prepare(self, cell: Cell) -> RunFolder:
+        """Make the run folder of a cell, or open the one that is there.
+
+        Raises:
+            ValueError: what is there is damaged or another run.
+        """
+        path, wanted = self.run_path(cell), cell.config.model_dump(mode="json")
+        if not (path / "config.json").exists():
+            return RunFolder.create(path, wanted)
+        folder = RunFolder.open(path)
+        if folder.config != wanted:
+            raise StudyError(f"{path} holds a run of another configuration; move it away, or choose another --out")
+        return folder
+
+    def is_trained(self, cell: Cell) -> bool:
+        """Return whether a cell's training is done; the policy file is the last that a run writes."""
+        return (self.run_path(cell) / "policy.safetensors").is_file()
+
+    def is_finished(self, cell: Cell) -> bool:
+        """Return whether nothing is left to do for a cell."""
+        return self.is_trained(cell) and read_judgement(self.run_path(cell)) is not None
+
+
+def read_judgement(run: Path) -> dict[str, Any] | None:
+    """Read the judgement of the trained policy in a run folder; None where there is none, or half of one."""
+    try:
+        found = json.loads((run / _JUDGEMENT).read_bytes())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None

@@ -1,0 +1,65 @@
+"""A lock file that one process holds: the kernel lets go of it when the process ends, however it ends."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import socket
+from pathlib import Path
+
+
+class LockError(ValueError):
+    """A lock is held by somebody else, or cannot be taken; the text is one sentence for the user."""
+
+
+def acquire(file: Path) -> int:
+    """Take a lock and write into its file who holds it; closing the returned descriptor lets go of it.
+
+    The file stays when the lock is let go: removing it would let two processes hold two files of one name.
+
+    Raises:
+        LockError: another process, or this one, holds it already, or the file system cannot lock.
+    """
+    try:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise LockError(f"cannot lock {file.parent}: {error.strerror or error}") from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+        # In this order, so that whoever is refused meanwhile finds a name and not an empty file.
+        os.pwrite(descriptor, owner.encode(), 0)
+        os.ftruncate(descriptor, len(owner.encode()))
+    except BlockingIOError:
+        holder = _holder(os.pread(descriptor, 4096, 0))
+        os.close(descriptor)
+        raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
+    except OSError as error:
+        os.close(descriptor)
+        raise LockError(f"cannot lock {file.parent}: {error.strerror or error}") from None
+    return descriptor
+
+
+def is_held(file: Path) -> bool:
+    """Return whether a process holds a lock; only for whoever alone may start those that take it."""
+    try:
+        descriptor = os.open(file, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _holder(content: bytes) -> str:
+    """Name the process that a lock file names."""
+    try:
+        owner = json.loads(content)
+        return f"process {int(owner['pid'])} on {str(owner['host'])[:64]!r}"
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return "another process"

@@ -1,0 +1,206 @@
+"""`esp ablate` and `esp reproduce`: plans, costs, and studies that survive being killed."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from esp_cli import console
+from esp_cli.commands.study_options import parse_names, parse_study_steps
+from esp_cli.commands.study_progress import StudyProgress, share, whole_status
+from esp_cli.experiments.scheduler import Scheduler, Snapshot
+from esp_cli.experiments.study import StudyFolder
+from esp_cli.training.locking import acquire
+from esp_cli.training.metrics import read_metrics
+from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
+from tests.experiments.studies import small_study, stand_in
+
+ROOT = Path(__file__).parents[2]
+TINY = ("reproduce", "table1", "--tasks", "navigation", "--algos", "mappo", "--seeds", "2", "--episodes", "4")
+KILLED_STEPS = 1500
+"""Thirty iterations: time enough to kill it twice."""
+
+
+def test_names_and_steps_are_read_from_lists() -> None:
+    assert parse_names(["mappo, qmix", "maddpg"]) == ("mappo", "qmix", "maddpg")
+    assert parse_names(None) is parse_names([","]) is None
+    assert parse_study_steps(["500k,formation=1M", "3M"]) == (
+        (None, 500_000),
+        ("formation", 1_000_000),
+        (None, 3_000_000),
+    )
+    with pytest.raises(ValueError, match="'soon' is no number of steps"):
+        parse_study_steps(["formation=soon"])
+
+
+def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> None:
+    out, plan = tmp_path / "s", tmp_path / "plan.json"
+    told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--dry-run", "--jobs", 2, "--json", plan)
+    assert not out.exists()
+    found = json.loads(plan.read_text())
+    assert [run["status"] for run in found["runs"]] == ["waiting", "waiting"]
+    first, second = (run["seconds"] for run in found["runs"])
+    assert found["core_seconds"] == pytest.approx(first + second)
+    assert found["seconds"] == pytest.approx(max(first, second))
+    assert found["disk_peak_bytes"] > found["disk_bytes"] > 1000
+    assert "2 runs to do:" in told.stdout
+    assert "with 2 side by side" in told.stdout
+    assert "MiB when done" in told.stdout
+
+
+def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) -> None:
+    out = tmp_path / "s"
+    told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--jobs", 1)
+    assert "2 runs, 0 of them finished, 1 side by side" in told.stderr
+    assert "navigation, 100" in told.stdout
+    assert f"next: esp report {out}" in told.stderr
+    study = StudyFolder.open(out).study
+    assert study.command.startswith(
+        "esp reproduce table1 --tasks navigation --algos mappo --steps 100 --seeds 2 --set "
+    )
+    # the run is the one that training by itself gives
+    alone = train_tiny(tmp_path / "alone", "--seeds", "2", "--prior", "none", steps=100)
+    policy = "policy.safetensors"
+    assert (out / "runs" / study.cells[0].name / policy).read_bytes() == (alone / policy).read_bytes()
+    again = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--json", "-")
+    assert "2 of them finished" in again.stderr
+    results = json.loads(again.stdout)
+    assert [cell["status"] for cell in results["cells"]] == ["finished"] * 2
+    small = tmp_path / "small.json"
+    report = esp("report", out, "--films", "--results", small)
+    assert json.loads(small.read_text()) == results
+    assert f"report -> {out / 'report' / 'report.html'}" in report.stderr
+    assert (out / "report" / "report.html").read_text().count("data:image/gif") == 2
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results: small.json returns -->\n<!-- end of results -->\n")
+    esp("report", "--fill", page)
+    assert "| navigation, 100 |" in page.read_text()
+
+
+def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Path) -> None:
+    told = esp(
+        "report", f"ours={finished}", f"again={finished}", "--out", tmp_path / "page", "--results", tmp_path / "r"
+    )
+    assert "report.html" in told.stderr
+    text = (tmp_path / "page" / "report.md").read_text()
+    assert "| ours |" in text
+    assert "+0.00" in text, "the difference of a run from itself"
+    assert json.loads((tmp_path / "r").read_text())["kind"] == "runs"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["ablate", "colours"], "'colours' is not one of"),
+        (["ablate", "modules", "--steps", "soon"], "'soon' is no number of steps"),
+        (["ablate", "modules", "--algo", "magic"], "unknown algorithm 'magic'"),
+        (["ablate", "coefficient", "--set", "prior.consistency_coef=1"], "varies by itself"),
+        (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),
+        (["reproduce", "table1", "--jobs", "0"], "--jobs"),
+        (["report"], "there is nothing to report"),
+    ],
+)
+def test_what_is_wrong_is_told_before_there_is_a_folder(tmp_path: Path, arguments: list[str], sentence: str) -> None:
+    out = [] if arguments == ["report"] else ["--out", tmp_path / "s"]
+    assert sentence in refused(*arguments, *out)
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, finished: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    assert "a study is reported by itself" in refused("report", folder.path, finished)
+    assert "no run has an evaluation yet" in esp("report", folder.path).stderr
+    options = [*TINY, "--steps", 200, *TINY_OPTIONS, "--out", tmp_path / "s"]
+    assert "holds another study" in refused(*options)
+    options[-1] = tmp_path / "t"
+    (tmp_path / "t").mkdir()
+    with contextlib.closing(os.fdopen(acquire(tmp_path / "t" / "study.lock"))):
+        assert "is in use by process" in refused(*options)
+    assert not (tmp_path / "t" / "runs").exists()
+
+
+def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    plain, esp_run = runs = Scheduler(folder, folder.study.cells, 1, stand_in()).runs
+    now = [0.0]
+    with StudyProgress(clock=lambda: now[0]) as progress:
+        plain.status = "training"
+        progress.update(Snapshot(runs, None))
+        plain.step, plain.trained_s = 100, 10.0
+        now[0] = 30.0
+        progress.update(Snapshot(runs, 25.0))
+        now[0] = 61.0
+        progress.update(Snapshot(runs, 25.0))
+        plain.status, esp_run.status, esp_run.message = "finished", "failed", "no disk"
+        progress.update(Snapshot(runs, 0.0))
+    assert capsys.readouterr().err.splitlines() == [
+        f"training {plain.cell.name}",
+        f"  {plain.cell.name}  0/200",
+        "0%  0/2 runs finished  ? left",
+        f"  {plain.cell.name}  100/200  30 steps/s  10 s left",
+        "25%  0/2 runs finished  25 s left",
+        f"finished {plain.cell.name} after 10 s",
+        f"error: {esp_run.cell.name} failed: no disk; the others go on",
+    ]
+    assert share(Snapshot(runs, 0.0)) == 0.5
+    assert "1 failed" in whole_status(Snapshot(runs, 0.0))
+
+
+def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal = console.Console(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
+    monkeypatch.setattr(console, "err", terminal)
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    runs = Scheduler(folder, folder.study.cells, 1, stand_in()).runs
+    runs[0].status, runs[0].step, runs[0].trained_s = "training", 100, 10.0
+    with StudyProgress() as progress:
+        progress.update(Snapshot(runs, 25.0))
+    terminal.file.close()
+    screen = (tmp_path / "screen").read_text()
+    assert runs[0].cell.name in screen
+    assert "30 steps/s" in screen
+    assert "whole study" in screen
+    assert runs[1].cell.name not in screen
+
+
+@pytest.mark.slow
+def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_path: Path) -> None:
+    out = tmp_path / "s"
+    options = [str(x) for x in (*TINY, "--steps", KILLED_STEPS, *TINY_OPTIONS, "--out", out, "--jobs", 1)]
+    command = [sys.executable, "-c", "from esp_cli.app import main; main()", *options]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "environments")]),
+        "ESP_CHECKPOINT_SECONDS": "0",
+    }
+
+    def rows(name: str) -> int:
+        file = out / "runs" / name / "metrics.jsonl"
+        return file.read_bytes().count(b"\n") if file.exists() else 0
+
+    names = ["navigation-1.5k-mappo-plain", "navigation-1.5k-mappo-esp"]
+    for name in names:  # each time in the middle of another run
+        with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, cwd=tmp_path) as process:
+            deadline = time.monotonic() + 300
+            while rows(name) < 5 and process.poll() is None and time.monotonic() < deadline:
+                time.sleep(0.005)
+            process.kill()
+        assert rows(name) >= 5
+    first = (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns
+    subprocess.run(command, env=environment, cwd=tmp_path, check=True, capture_output=True)
+    assert (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns == first, "not run again"
+    for name, prior in zip(names, ("none", "esp"), strict=True):
+        run = out / "runs" / name
+        alone = train_tiny(tmp_path / prior, "--seeds", "2", "--prior", prior, steps=KILLED_STEPS)
+        steps = [row["step"] for row in read_metrics(run / "metrics.jsonl")]
+        assert steps == [row["step"] for row in read_metrics(alone / "metrics.jsonl")]
+        assert (run / "policy.safetensors").read_bytes() == (alone / "policy.safetensors").read_bytes()
