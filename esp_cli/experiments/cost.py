@@ -17,7 +17,9 @@ from esp_cli.training.trainer import build_environment, build_learner
 from esp_envs.registry import task_class
 
 PROBE_SECONDS = 1.0
-"""How long iterations of a run are timed, at the least one after a first that is not."""
+"""How long iterations of a run are timed, after a first that is not."""
+_LONG_SECONDS = 3.0
+"""An iteration that takes as long is measured once."""
 _PROBED_EPISODES = 8
 """Of an evaluation, at most; longer ones take their share more."""
 _CHECKPOINTS = 3
@@ -64,12 +66,15 @@ def probe(config: RunConfig, episodes: int) -> Cost:
 def _probe(config: RunConfig, episodes: int) -> Cost:
     learner = build_learner(config)
     iterations = -(-config.steps // learner.steps_per_iteration)
+    begun = time.monotonic()
     metrics = learner.iterate(0.0)
-    done, begun = 0, time.monotonic()
-    while done == 0 or (time.monotonic() - begun < PROBE_SECONDS and done < iterations):
-        metrics = learner.iterate(done / iterations)
-        done += 1
-    per_iteration = (time.monotonic() - begun) / done
+    per_iteration = time.monotonic() - begun
+    if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
+        done, begun = 0, time.monotonic()
+        while done == 0 or (time.monotonic() - begun < PROBE_SECONDS and done < iterations):
+            metrics = learner.iterate(done / iterations)
+            done += 1
+        per_iteration = (time.monotonic() - begun) / done
     per_episode = _seconds_per_episode(config, learner)
     evaluations = 1 + config.steps // config.evaluation.every_steps
     weights = sum(tensor.nbytes for tensor in learner.policy.state_dict().values())
