@@ -56,7 +56,10 @@ def train(
         float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
     ] = None,
     physics: PhysicsOption = None,
-    network: Annotated[Literal["mlp", "gru"] | None, typer.Option("--network", help="Shape of the networks.")] = None,
+    network: Annotated[
+        Literal["mlp", "gru", "mpn", "empn", "equivariant"] | None,
+        typer.Option("--network", help="Perceptron, recurrent, message passing (plain, equivariant), equivariant."),
+    ] = None,
     steps: StepsOption = DEFAULT_STEPS,
     seeds: SeedsOption = (0,),
     out: Annotated[
