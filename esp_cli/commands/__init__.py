@@ -12,6 +12,7 @@ COMMANDS: dict[str, str] = {
     "eval": "esp_cli.commands.eval:evaluate",
     "render": "esp_cli.commands.render:render",
     "report": "esp_cli.commands.report:report",
+    "compare-homomorphic": "esp_cli.commands.compare_homomorphic:compare_homomorphic",
     "tasks": "esp_cli.commands.tasks:tasks",
 }
 """Command name -> "module:function", in the order in which `esp --help` lists them."""

@@ -94,7 +94,7 @@ def train(
         build_learner(config)  # refuses what does not go together while there is no run folder yet
         name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
-    _run(folder, tensorboard)
+    train_folder(folder, tensorboard)
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
@@ -120,7 +120,7 @@ def _device(wanted: str) -> str:
     return "cuda" if wanted != "cpu" and available else "cpu"
 
 
-def _run(folder: RunFolder, tensorboard: bool) -> None:
+def train_folder(folder: RunFolder, tensorboard: bool) -> None:
     """Train in a locked run folder until the end or an interrupt, then say what came out and what to do next."""
     from esp_cli.training.loading import parse_config
     from esp_cli.training.trainer import Trainer

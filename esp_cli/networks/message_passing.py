@@ -13,10 +13,11 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
 
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
 from esp_cli.networks.contract import Network, NetworkConfig
-from esp_cli.networks.layers import GAINS
+from esp_cli.networks.layers import GAINS, affine
 from esp_cli.networks.ports import Ports
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
@@ -84,21 +85,50 @@ class PictureEncoder(nn.Module):
 
     def encode(self, pictures: Tensor) -> Tensor:
         """Encode every picture."""
-        x = pictures.unflatten(-1, self.shape)
-        for responses in self.responses(x):
-            x = responses
-        return x.flatten(3).amax(-1)
+        return self.responses(self.as_pictures(pictures))[-1].flatten(2, 3).amax(2)
+
+    def as_pictures(self, rows: Tensor) -> Tensor:
+        """Shape rows of numbers [S, B, D] as pictures [S, B, rows, columns, channels]."""
+        return rows.unflatten(-1, self.shape).movedim(2, -1)
 
     def responses(self, x: Tensor) -> list[Tensor]:
-        """Return what each layer responds to pictures [S, B, channels, rows, columns], in the same shape."""
+        """Return what each layer responds to pictures [S, B, rows, columns, channels], in the same shape."""
         out = []
         for layer, side, stride in zip(self.layers, self.sides, self.strides, strict=True):
-            patches = x.unfold(3, side, stride).unfold(4, side, stride)  # [S, B, C, rows, columns, side, side]
-            num_seeds, batch, _, rows, columns = patches.shape[:5]
-            flat = patches.permute(0, 1, 3, 4, 2, 5, 6).reshape(num_seeds, batch * rows * columns, -1)
-            x = torch.relu(layer(flat)).view(num_seeds, batch, rows, columns, -1).permute(0, 1, 4, 2, 3)
+            assert isinstance(layer, ConstrainedLinear)
+            num_seeds, batch = x.shape[:2]
+            rows, columns = ((length - side) // stride + 1 for length in x.shape[2:4])
+            patches = _Patches.apply(x, side, stride)  # type: ignore[no-untyped-call]
+            # a constrained weight counts channels, then pixels; a patch the other way round, which copies in long runs
+            weight = layer.weight().unflatten(1, (-1, side * side)).transpose(1, 2).flatten(1, 2)
+            x = torch.relu(affine(layer.bias(), patches, weight)).view(num_seeds, batch, rows, columns, -1)
             out.append(x)
         return out
+
+
+class _Patches(Function):
+    """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C].
+
+    Torch's own backward of the view adds up number by number; here it adds up picture by picture.
+    """
+
+    @staticmethod
+    def forward(ctx, x, side, stride):  # type: ignore[no-untyped-def]
+        patches = x.unfold(2, side, stride).unfold(3, side, stride).permute(0, 1, 2, 3, 5, 6, 4)
+        ctx.shape, ctx.patches, ctx.stride = x.shape, patches.shape, stride
+        return patches.reshape(x.shape[0], -1, side * side * x.shape[-1])
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        if not ctx.needs_input_grad[0]:
+            return None, None, None
+        (_, _, rows, columns, side, _, _), stride = ctx.patches, ctx.stride
+        grad, out = grad.reshape(ctx.patches), grad.new_zeros(ctx.shape)
+        for i in range(side):
+            for j in range(side):
+                last_row, last_column = i + (rows - 1) * stride + 1, j + (columns - 1) * stride + 1
+                out[:, :, i:last_row:stride, j:last_column:stride] += grad[:, :, :, :, i, j]
+        return out, None, None
 
 
 def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:

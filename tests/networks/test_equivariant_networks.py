@@ -70,7 +70,7 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
     rows = obs.flatten(1, 2)
     pictures = rows[..., network.picture]
     here = network.features(rows)
-    responses = network.encoder.responses(pictures.unflatten(-1, network.encoder.shape))
+    responses = network.encoder.responses(network.encoder.as_pictures(pictures))
     blocks = [network.encoder.output, *(layer.outputs[0] for layer in network.layers)]
     convolved = [layer.outputs[0] for layer in network.encoder.layers]
     for transform in transform_set(group, spec).each():
@@ -79,12 +79,12 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
         there = network.features(transform.obs(obs).flatten(1, 2))
         for block, before, after in zip(blocks, here, there, strict=True):
             torch.testing.assert_close(after, turned(block, g, before), atol=EXACT, rtol=EXACT)
-        moved = transform.obs(obs).flatten(1, 2)[..., network.picture].unflatten(-1, network.encoder.shape)
+        moved = network.encoder.as_pictures(transform.obs(obs).flatten(1, 2)[..., network.picture])
         for block, before, after in zip(convolved, responses, network.encoder.responses(moved), strict=True):
             # a response's place turns as a pixel does, its channels as regular features
-            flat = turned(block, g, before.movedim(2, -1)).movedim(-1, 2)
-            picture = flat.flip(3) if element.mirrored else flat
-            expected = picture.rot90(int(element.turn * 4), (3, 4))
+            channels = turned(block, g, before)
+            picture = channels.flip(2) if element.mirrored else channels
+            expected = picture.rot90(int(element.turn * 4), (2, 3))
             torch.testing.assert_close(after, expected, atol=EXACT, rtol=EXACT)
 
 
@@ -246,6 +246,31 @@ def test_pictures_that_occur_several_times_are_encoded_once_and_nobody_notices()
         strict=True,
     ):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
+    spec, obs, _ = scene()
+    encoder = PictureEncoder(generators(0, 1), spec.observation.fields[0], cyclic(4))
+    stir(encoder)
+    rows = obs[..., :441].flatten(1, 2)
+    x = rows.unflatten(-1, (1, 21, 21))
+    features = []
+    for s in range(SEEDS):
+        y = x[s]
+        for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
+            weight = layer.weight()[s].T.unflatten(1, (-1, side, side))
+            y = torch.relu(torch.nn.functional.conv2d(y, weight, layer.bias()[s, 0], stride))
+        features.append(y.amax((2, 3)))
+    theirs, ours = torch.stack(features), encoder.encode(rows)
+    torch.testing.assert_close(ours, theirs)
+    weight = torch.randn(ours.shape)
+    inputs = list(encoder.parameters())
+    for a, b in zip(
+        torch.autograd.grad((ours * weight).sum(), inputs),
+        torch.autograd.grad((theirs * weight).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
 
 
 def test_pictures_that_all_differ_are_all_encoded() -> None:
