@@ -46,7 +46,7 @@ KIND_MATRICES: dict[Kind, Callable[[Floats], Floats]] = {
     Kind.VECTOR: _vector,
     Kind.WHEELS: _wheels,
 }
-"""One representation per field kind: planar matrices [G, 2, 2] to [G, width, width]. A new kind is one line here."""
+"""One representation per field kind, pictures apart: planar matrices [G, 2, 2] to [G, width, width]."""
 
 
 def kind_matrix(kind: Kind, planar: Floats) -> Floats:
