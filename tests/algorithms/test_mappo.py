@@ -205,7 +205,8 @@ def test_batches_cut_select_and_join_without_mixing_seeds():
 
 def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_value_beyond():
     settings = {"task__horizon": 4, "task__width": 3, "task__height": 3, "task__num_agents": 2}
-    trained = learner("wildlife", mappo__num_envs=12, mappo__num_steps=8, prior__kind="none", **settings)
+    settings |= {"mappo__num_envs": 12, "mappo__num_steps": 8, "prior__kind": "none"}
+    trained = learner("wildlife", **settings)
     rollout = trained.collector.collect(8)
     cut = rollout.ended & ~rollout.terminated
     assert cut.any()
