@@ -192,12 +192,20 @@ class Body:
     model: str | None = None
 
 
+GRID_SPACING = 0.5
+"""Distance of the lines behind a scene, unless it says otherwise."""
+
+
 @dataclass(frozen=True)
 class Scene:
-    """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order."""
+    """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order.
+
+    `grid` is the distance of the lines behind them and where one of them lies, along either axis.
+    """
 
     bodies: tuple[Body, ...]
     window: tuple[float, float, float, float]
+    grid: tuple[float, float] = (GRID_SPACING, 0.0)
 
 
 class Painter(Protocol):

@@ -16,7 +16,6 @@ _OVERSAMPLING = 3
 BACKGROUND = "#fafaf7"
 GRID = "#e4e4de"
 FRAME = "#c8c8c0"
-GRID_SPACING = 0.5
 _RIM_DARKENING = 0.7
 TRAIL_WIDTH = 0.3
 """Width of a trail against the body's radius."""
@@ -46,7 +45,7 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
     if size < 16 or x_max <= x_min or y_max <= y_min:
         raise ValueError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
     canvas = _Canvas(scene.window, size)
-    canvas.grid()
+    canvas.grid(*scene.grid)
     for body, path in trails(scene, trail):
         canvas.trail(path, body)
     for body in scene.bodies:
@@ -104,13 +103,13 @@ class _Canvas:
         self._image = Image.new("RGB", (width, height), BACKGROUND)
         self._draw = ImageDraw.Draw(self._image)
 
-    def grid(self) -> None:
-        """Draw grid lines every half unit and a frame."""
+    def grid(self, spacing: float, offset: float) -> None:
+        """Draw grid lines and a frame."""
         x_min, x_max, y_min, y_max = self._window
-        for k in range(math.ceil(x_min / GRID_SPACING), math.floor(x_max / GRID_SPACING) + 1):
-            self._line([(k * GRID_SPACING, y_min), (k * GRID_SPACING, y_max)], GRID, _OVERSAMPLING)
-        for k in range(math.ceil(y_min / GRID_SPACING), math.floor(y_max / GRID_SPACING) + 1):
-            self._line([(x_min, k * GRID_SPACING), (x_max, k * GRID_SPACING)], GRID, _OVERSAMPLING)
+        for x in _lines(x_min, x_max, spacing, offset):
+            self._line([(x, y_min), (x, y_max)], GRID, _OVERSAMPLING)
+        for y in _lines(y_min, y_max, spacing, offset):
+            self._line([(x_min, y), (x_max, y)], GRID, _OVERSAMPLING)
         width, height = self._image.size
         self._draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME, width=_OVERSAMPLING)
 
@@ -156,6 +155,11 @@ class _Canvas:
     def _at(self, point: Point) -> Point:
         """Return the pixel of a world point; y points up in the world and down in the picture."""
         return (point[0] - self._window[0]) * self._scale, (self._window[3] - point[1]) * self._scale
+
+
+def _lines(low: float, high: float, spacing: float, offset: float) -> list[float]:
+    first, last = math.ceil((low - offset) / spacing), math.floor((high - offset) / spacing)
+    return [k * spacing + offset for k in range(first, last + 1)]
 
 
 def _box(x: float, y: float, radius: float) -> tuple[float, float, float, float]:

@@ -13,6 +13,7 @@ _TASKS = {
     "navigation": "esp_envs.mpe.navigation:Navigation",
     "predator-prey": "esp_envs.mpe.predator_prey:PredatorPrey",
     "formation": "esp_envs.epuck.formation:Formation",
+    "wildlife": "esp_envs.wildlife.wildlife:Wildlife",
 }
 
 

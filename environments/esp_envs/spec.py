@@ -26,16 +26,19 @@ class Kind(Enum):
     VECTOR        (x, y), turned by the 2x2 matrix of the element (a position, a velocity, a heading given as
                   the unit vector (cos, sin)).
     WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
+    PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
+                  top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
     """
 
     SCALAR = "scalar", 1
     PSEUDOSCALAR = "pseudoscalar", 1
     VECTOR = "vector", 2
     WHEELS = "wheels", 2
+    PICTURE = "picture", 1
 
     @property
     def width(self) -> int:
-        """Numbers per item."""
+        """Numbers per item; of a picture, per pixel."""
         return self.value[1]
 
 
@@ -54,18 +57,37 @@ class Items(Enum):
 
 @dataclass(frozen=True)
 class Field:
-    """A run of numbers of one kind: `count` items of `kind.width` numbers each, item after item."""
+    """A run of numbers of one kind: `count` items of `item_width` numbers each, item after item.
+
+    Only a picture has `pixels`, its rows and columns; its items are its channels.
+    """
 
     name: str
     kind: Kind
     count: int = 1
     unit: str = ""
     items: Items = Items.FIXED
+    pixels: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.kind is Kind.PICTURE) != (self.pixels is not None):
+            raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
+
+    @property
+    def item_width(self) -> int:
+        """Numbers per item."""
+        return self.kind.width if self.pixels is None else self.kind.width * math.prod(self.pixels)
 
     @property
     def width(self) -> int:
         """Numbers in the whole field."""
-        return self.count * self.kind.width
+        return self.count * self.item_width
+
+    @property
+    def described(self) -> str:
+        """What it holds, in words: "vector x 2", "picture of 21 x 21 x 1"."""
+        size = "" if self.pixels is None else f" of {self.pixels[0]} x {self.pixels[1]}"
+        return f"{self.kind.value[0]}{size} x {self.count}"
 
 
 @dataclass(frozen=True)
@@ -97,7 +119,7 @@ class Layout:
         rows = []
         for f, s in zip(self.fields, self.slices().values(), strict=True):
             span = str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}"
-            rows.append((span, f.name, f"{f.kind.value[0]} x {f.count}", f.unit))
+            rows.append((span, f.name, f.described, f.unit))
         return rows
 
 
@@ -175,6 +197,7 @@ class TaskSpec:
         shared_reward: whether all agents get the same reward, so that one value per world suffices.
         control_period_s: simulated seconds of one step, for rendering in real time.
         totals: names of the metrics that add up over an episode; the others are averaged over its steps.
+        terminates: whether an episode can reach an end of its own before the horizon, each world at another time.
     """
 
     name: str
@@ -189,6 +212,7 @@ class TaskSpec:
     shared_reward: bool = True
     control_period_s: float = 0.1
     totals: tuple[str, ...] = ()
+    terminates: bool = False
     settings: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -203,4 +227,4 @@ def describe_action(action: ActionSpace) -> Sequence[tuple[str, str]]:
             (f"{j} {name}", "(" + ", ".join(f"{x:g}" for x in p) + ")")
             for j, (name, p) in enumerate(zip(action.names, action.points, strict=True))
         ]
-    return [(f.name, f"{f.kind.value[0]} x {f.count} {f.unit}".strip()) for f in action.layout.fields]
+    return [(f.name, f"{f.described} {f.unit}".strip()) for f in action.layout.fields]

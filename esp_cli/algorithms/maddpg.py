@@ -65,7 +65,7 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
 class Maddpg(OffPolicyLearner):
     """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`.
 
-    The critic is a perceptron with recurrent actors too: it sees all that there is to see at a step.
+    The critic is a plain perceptron whatever the actors are: it sees all that there is to see at a step.
     """
 
     config_class = MaddpgConfig
@@ -83,7 +83,8 @@ class Maddpg(OffPolicyLearner):
         self.config, spec = config, self.spec
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
         self.num_values = 1 if spec.shared_reward else spec.num_agents
-        perceptron = network.model_copy(update={"name": "mlp", "activation": config.critic_activation})
+        plain = {"name": "mlp", "activation": config.critic_activation, "symmetrise": None}
+        perceptron = network.model_copy(update=plain)
         width = self.critic_width + spec.num_agents * self.head.action_width
         self.critic = build_network(generators, width, self.num_values, perceptron, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)

@@ -98,6 +98,17 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
         "prior": {"transforms": "c4"},
         "evaluation": {"every_steps": 100_000},
     },
+    "wildlife": {
+        "mappo": {
+            "num_envs": 64,
+            "num_steps": 16,
+            "num_epochs": 4,
+            "num_minibatches": 2,
+            "critic_input": "own",
+        },
+        "network": {"name": "mpn", "activation": "relu"},
+        "prior": {"transforms": "c4"},
+    },
 }
 """What the preset `default` changes on a task: measured best there.
 
@@ -140,6 +151,11 @@ class Mappo(Learner):
         self.num_values = self.critic.num_values
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
         self.recurrent = self.policy.actor.memory_width > 0
+        if self.recurrent and spec.terminates:
+            raise ValueError(
+                f"mappo needs episodes of one length for a recurrent network, but those of {spec.name} may end early; "
+                "choose a network without memory"
+            )
         if self.recurrent and config.num_steps % spec.horizon:
             raise ValueError(
                 f"a recurrent network needs whole episodes: set mappo.num_steps to a multiple of {spec.horizon}"
@@ -240,8 +256,11 @@ class Mappo(Learner):
             return values[:, :, :, :-1].flatten(2, 3), values[:, :, :, 1:].flatten(2, 3)
         value = self.critic.unroll(rollout.obs, rollout.state)
         next_value = torch.cat([value[:, :, 1:], self._value_of(rollout.last).unsqueeze(2)], 2)
+        # behind an end of its own an episode has no value, so only cut ones are worth a look at what they ended in
+        cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist()
         for t, final in rollout.finals.items():
-            next_value[:, :, t] = self._value_of(final)
+            if cut[t]:
+                next_value[:, :, t] = self._value_of(final)
         return value, next_value
 
     def _episodes(self, rows: Tensor, finals: list[Tensor]) -> Tensor:

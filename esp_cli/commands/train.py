@@ -54,7 +54,10 @@ def train(
         float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
     ] = None,
     physics: PhysicsOption = None,
-    network: Annotated[Literal["mlp", "gru"] | None, typer.Option("--network", help="Shape of the networks.")] = None,
+    network: Annotated[
+        Literal["mlp", "gru", "mpn", "empn", "equivariant"] | None,
+        typer.Option("--network", help="Perceptron, recurrent, message passing (plain, equivariant), equivariant."),
+    ] = None,
     steps: StepsOption = DEFAULT_STEPS,
     seeds: SeedsOption = (0,),
     out: Annotated[
@@ -89,7 +92,7 @@ def train(
         build_learner(config)  # refuses what does not go together while there is no run folder yet
         name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
-    _run(folder, tensorboard)
+    train_folder(folder, tensorboard)
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
@@ -106,7 +109,7 @@ def _refuse_beside_resume(context: typer.Context) -> None:
         )
 
 
-def _run(folder: RunFolder, tensorboard: bool) -> None:
+def train_folder(folder: RunFolder, tensorboard: bool) -> None:
     """Train in a locked run folder until the end or an interrupt, then say what came out and what to do next."""
     from esp_cli.training.loading import parse_config
     from esp_cli.training.trainer import Trainer

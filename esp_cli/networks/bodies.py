@@ -1,64 +1,23 @@
 """Whole networks behind one contract, whether they remember or not.
 
-Adding a network is one class and one line in `NETWORKS`.
+Adding a network is one class and one line in `PLAIN` or `STRUCTURED`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Annotated, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
+from esp_cli.networks.constrained import Equivariant
+from esp_cli.networks.contract import Network, NetworkConfig
 from esp_cli.networks.layers import GAINS, SeedGRU, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.message_passing import MessagePassing
+from esp_cli.networks.ports import Ports
+from esp_cli.networks.symmetrised import Symmetrised
 
-
-class NetworkConfig(BaseModel):
-    """The shape of actor and critic alike."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: Literal["mlp", "gru"] = "mlp"
-    hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(
-        (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
-    )
-    activation: Literal["relu", "tanh"] = Field("tanh", description="of the actor; MAPPO paper: relu")
-    precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
-    layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """The precision as torch names it."""
-        return getattr(torch, self.precision)
-
-
-class Network(nn.Module, ABC):
-    """S networks of one shape; `memory` is what they carry from step to step ([S, B, 0] if nothing)."""
-
-    memory_width = 0
-
-    def initial_memory(self, num_seeds: int, batch: int, like: Tensor) -> Tensor:
-        """Return the empty memory [S, B, H] of a new episode."""
-        return like.new_zeros(num_seeds, batch, self.memory_width)
-
-    @abstractmethod
-    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance one step: x [S, B, in], memory [S, B, H] -> (y [S, B, out], memory [S, B, H])."""
-
-    @abstractmethod
-    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes, which begin with empty memory.
-
-        Args:
-            x: [S, B, T, in].
-            truncation: cut the gradient through time every so many steps; 0 never does.
-
-        Returns:
-            y: [S, B, T, out].
-        """
+__all__ = ["Network", "NetworkConfig", "build_network"]
 
 
 class MLP(SeedMLP, Network):
@@ -120,11 +79,23 @@ class GRU(Network):
         return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
 
 
-NETWORKS: dict[str, type[MLP] | type[GRU]] = {"mlp": MLP, "gru": GRU}
+PLAIN: dict[str, type[MLP] | type[GRU]] = {"mlp": MLP, "gru": GRU}
+"""Networks that know the widths of what they read and write alone."""
+STRUCTURED: dict[str, type[MessagePassing] | type[Equivariant]] = {
+    "mpn": MessagePassing,
+    "empn": MessagePassing,
+    "equivariant": Equivariant,
+}
+"""Networks that have to know what the numbers mean."""
 
 
 def build_network(
-    generators: Sequence[torch.Generator], inputs: int, outputs: int, config: NetworkConfig, output_gain: float
+    generators: Sequence[torch.Generator],
+    inputs: int,
+    outputs: int,
+    config: NetworkConfig,
+    output_gain: float,
+    ports: Ports | None = None,
 ) -> Network:
     """Build the network that `config.name` names.
 
@@ -134,5 +105,17 @@ def build_network(
         outputs: width of an output row.
         config: shape.
         output_gain: orthogonal gain of the last layer.
+        ports: what the numbers mean, where the network or its average over a group is to follow them.
+
+    Raises:
+        ValueError: the network does not fit what is read and written there.
     """
-    return NETWORKS[config.name](generators, inputs, outputs, config, output_gain)
+    structured = STRUCTURED.get(config.name)
+    if ports is None and (structured or config.symmetrise):
+        raise ValueError(f"the network {config.name} has to know what it reads, but here it would get numbers alone")
+    network: Network
+    if structured is None or ports is None:
+        network = PLAIN[config.name](generators, inputs, outputs, config, output_gain)
+    else:
+        network = structured(generators, ports, config, output_gain)
+    return network if ports is None or config.symmetrise is None else Symmetrised(network, ports, config.symmetrise)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.bodies import build_network
+from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.ports import Ports, Reads
 from esp_envs.spec import TaskSpec
 
-CriticInput = Literal["state", "observations", "own"]
+CriticInput = Reads
 
 
 class Critic(nn.Module):
@@ -37,7 +38,8 @@ class Critic(nn.Module):
         self.num_values = 1 if spec.shared_reward and not own else spec.num_agents
         observed = spec.observation.width
         width = {"state": spec.state.width, "observations": spec.num_agents * observed, "own": observed}[reads]
-        self.network = build_network(generators, width, 1 if own else self.num_values, network, 1.0)
+        outputs = 1 if own else self.num_values
+        self.network = build_network(generators, width, outputs, network, 1.0, Ports(spec, reads, outputs))
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""

@@ -42,7 +42,7 @@ class SeedLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer."""
-        return _affine(self.bias, x, self.weight)
+        return affine(self.bias, x, self.weight)
 
 
 class SeedLayerNorm(nn.Module):
@@ -128,7 +128,7 @@ class _Perceptron(Function):
         x = x.to(precision)
         inputs, weights, last = [x], [w.to(precision) for w in parameters[::2]], len(parameters) // 2 - 1
         for k in range(last + 1):
-            x = _affine(parameters[2 * k + 1].to(precision), x, weights[k])
+            x = affine(parameters[2 * k + 1].to(precision), x, weights[k])
             if k < last or activate_output:
                 x = torch.relu_(x) if activation == "relu" else torch.tanh_(x)
                 inputs.append(x)
@@ -163,12 +163,12 @@ THIN = 16
 # otherwise than the batched product that several seeds take.
 
 
-def _affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
+def affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
     """Return x W + b [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost in memory."""
     if weight.shape[-1] >= THIN:
         return torch.baddbmm(bias, x, weight)
     if weight.shape[-1] == 1:
-        return _affine(pad(bias, (0, 1)), x, pad(weight, (0, 1)))[..., :1]
+        return affine(pad(bias, (0, 1)), x, pad(weight, (0, 1)))[..., :1]
     return torch.baddbmm(bias.transpose(1, 2), weight.transpose(1, 2), x.transpose(1, 2)).transpose(1, 2)
 
 

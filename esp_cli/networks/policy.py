@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from esp_cli.networks.bodies import NetworkConfig, build_network
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head
+from esp_cli.networks.ports import Ports
 from esp_envs.spec import TaskSpec
 
 POLICY_GAIN = 0.01
@@ -44,7 +45,8 @@ class Policy(nn.Module):
         self.num_agents = spec.num_agents
         self.head = head
         inputs = spec.observation.width + num_extra
-        self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain)
+        ports = None if num_extra else Ports(spec, "own")
+        self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, ports)
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""

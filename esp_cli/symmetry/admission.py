@@ -9,7 +9,7 @@ import numpy as np
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
 from esp_cli.symmetry.parse import parse_elements, parse_group
-from esp_cli.symmetry.representation import action_map, joint_matrix, state_matrix
+from esp_cli.symmetry.representation import action_map, joint_sources, state_matrix
 from esp_envs.spec import Discrete, Items, TaskSpec, joint_layout
 
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
@@ -29,7 +29,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spec: TaskSpec) -> Non
             are to change places and a layout does not say which numbers follow them.
     """
     moved = elements.witnesses() if isinstance(elements, Group) else tuple(elements)
-    reason = _action_reason(moved, spec) or _task_reason(moved, spec) or _agents_reason(moved, spec)
+    reason = _reason(moved, spec)
     if reason is None:
         return
     advice = "use --prior none"
@@ -54,7 +54,12 @@ def carried_groups(spec: TaskSpec) -> tuple[str, ...]:
 
 def _carries(name: str, spec: TaskSpec) -> bool:
     moved = parse_group(name, spec.num_agents).witnesses()
-    return not (_action_reason(moved, spec) or _task_reason(moved, spec) or _agents_reason(moved, spec))
+    return _reason(moved, spec) is None
+
+
+def _reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+    """Say why a task cannot carry elements, if it cannot."""
+    return _action_reason(elements, spec) or _task_reason(elements, spec) or _agents_reason(elements, spec)
 
 
 def _action_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
@@ -90,7 +95,7 @@ def _agents_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
     if not joint and all(f.items is not Items.AGENTS for f in spec.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
-        joint_matrix(spec.observation, plane, places)
+        joint_sources(spec.observation, places)
         state_matrix(spec, plane, places)
     except ValueError as error:
         return str(error)

@@ -46,7 +46,7 @@ KIND_MATRICES: dict[Kind, Callable[[Floats], Floats]] = {
     Kind.VECTOR: _vector,
     Kind.WHEELS: _wheels,
 }
-"""One representation per field kind: planar matrices [G, 2, 2] to [G, width, width]. A new kind is one line here."""
+"""One representation per field kind, pictures apart: planar matrices [G, 2, 2] to [G, width, width]."""
 
 
 def kind_matrix(kind: Kind, planar: Floats) -> Floats:
@@ -62,6 +62,41 @@ def kind_matrix(kind: Kind, planar: Floats) -> Floats:
     return KIND_MATRICES[kind](planar)
 
 
+def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
+    """Return where each pixel of a transformed picture comes from.
+
+    A pixel's place is its middle's (x, y), seen from the picture's: the first row is the top, the first column left.
+
+    Args:
+        pixels: rows and columns.
+        planar: [G, 2, 2].
+
+    Returns:
+        [G, rows * columns], the index of the old pixel that shows in each new one.
+
+    Raises:
+        ValueError: some pixel would come to lie between others, or outside.
+    """
+    rows, columns = pixels
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    place = np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row], -1)
+    origin = np.einsum("gji,pj->gpi", planar, place)  # the inverse is the transpose
+    old_column, old_row = origin[..., 0] + (columns - 1) / 2, (rows - 1) / 2 - origin[..., 1]
+    whole = np.rint(np.stack([old_row, old_column], -1))
+    fits = np.abs(whole - np.stack([old_row, old_column], -1)).max() < _MATCH_TOLERANCE
+    if not fits or (whole < 0).any() or (whole >= [rows, columns]).any():
+        raise ValueError(f"the pixels of a picture of {rows} x {columns} do not come to lie on pixels")
+    return (whole[..., 0] * columns + whole[..., 1]).astype(np.int64)
+
+
+def item_matrix(field: Field, planar: Floats) -> Floats:
+    """Return how one item of a field transforms: [G, item width, item width]."""
+    if field.pixels is None:
+        return kind_matrix(field.kind, planar)
+    sources = picture_sources(field.pixels, planar)
+    return np.take(np.eye(field.item_width), sources, axis=0)
+
+
 def layout_matrix(layout: Layout, planar: Floats) -> Floats:
     """Return L_g of a layout, one block per item, with all agents in their places.
 
@@ -75,7 +110,7 @@ def layout_matrix(layout: Layout, planar: Floats) -> Floats:
     out = np.zeros((planar.shape[0], layout.width, layout.width))
     start = 0
     for field in layout.fields:
-        block, width = kind_matrix(field.kind, planar), field.kind.width
+        block, width = item_matrix(field, planar), field.item_width
         for _ in range(field.count):
             out[:, start : start + width, start : start + width] = block
             start += width
@@ -100,13 +135,56 @@ def joint_matrix(layout: Layout, planar: Floats, places: Indices) -> Floats:
     row = layout_matrix(layout, planar)
     blocks = np.einsum("nm,gde->gndme", np.eye(num_agents), row)
     width = num_agents * layout.width
-    source = _row_sources(layout, np.argsort(places, axis=1))
+    source = joint_sources(layout, places)
     return np.take_along_axis(blocks.reshape(-1, width, width), source[:, :, None], axis=1)
 
 
 def rows_matrix(layout: Layout, planar: Floats, places: Indices | None) -> Floats:
     """Return `joint_matrix` where agents move, else `layout_matrix`, which acts on each agent's row alike."""
     return layout_matrix(layout, planar) if places is None else joint_matrix(layout, planar, places)
+
+
+def rows_permutation(layout: Layout, planar: Floats, places: Indices | None) -> tuple[Indices, Floats]:
+    """Return L_g as a signed permutation: the new number k is sign[k] times the old number source[k].
+
+    The same as `rows_matrix`, whose square grows too large with pictures.
+
+    Args:
+        layout: one agent's row, D numbers.
+        planar: [G, 2, 2].
+        places: [G, N], or None where agents stay.
+
+    Returns:
+        source and sign, [G, D] each, or [G, N * D] where agents move.
+
+    Raises:
+        ValueError: an item mixes its numbers, as a vector does under other turns than quarters.
+    """
+    sources, signs, start = [], [], 0
+    for field in layout.fields:
+        if field.pixels is None:
+            block = kind_matrix(field.kind, planar)
+            if (
+                not np.array_equal(np.abs(block).sum(-1), np.ones(block.shape[:-1]))
+                or not np.isin(block, (-1, 0, 1)).all()
+            ):
+                raise ValueError(f"a picture turns by quarters alone, but '{field.name}' is to turn by another angle")
+            source, sign = np.abs(block).argmax(-1), block.sum(-1)
+        else:
+            source = picture_sources(field.pixels, planar)
+            sign = np.ones(source.shape)
+        first = start + field.item_width * np.arange(field.count)[:, None]
+        sources.append((source[:, None, :] + first).reshape(len(planar), -1))
+        signs.append(np.tile(sign, (1, field.count)))
+        start += field.width
+    within, sign = np.concatenate(sources, 1), np.concatenate(signs, 1)
+    if places is None:
+        return within, sign
+    num_agents = places.shape[1]
+    joint = (within[:, None, :] + layout.width * np.arange(num_agents)[:, None]).reshape(len(planar), -1)
+    order = joint_sources(layout, places)
+    joint_sign = np.tile(sign, (1, num_agents))
+    return np.take_along_axis(joint, order, 1), np.take_along_axis(joint_sign, order, 1)
 
 
 def state_matrix(spec: TaskSpec, planar: Floats, places: Indices | None) -> Floats:
@@ -132,7 +210,7 @@ def state_matrix(spec: TaskSpec, planar: Floats, places: Indices | None) -> Floa
             slots = came_from
         elif field.items is Items.OTHERS:
             raise ValueError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
-        sources.append(start + _numbers(slots, field.kind.width))
+        sources.append(start + _numbers(slots, field.item_width))
         start += field.width
     whole = layout_matrix(spec.state, planar)
     return np.take_along_axis(whole, np.concatenate(sources, axis=1)[:, :, None], axis=1)
@@ -167,13 +245,14 @@ def _participle(element: Element) -> str:
     return f"turned by {float(element.degrees):g} degrees"
 
 
-def _row_sources(layout: Layout, came_from: Indices) -> Indices:
-    """Return [G, N * D]: the old place of each number when only agents move (came_from [G, N] is sigma^-1)."""
-    group, num_agents = came_from.shape
+def joint_sources(layout: Layout, places: Indices) -> Indices:
+    """Return [G, N * D]: the old place of each number of all rows end to end when only agents move (to `places`)."""
+    group, num_agents = places.shape
+    came_from = np.argsort(places, axis=1)
     sources, start = [], 0
     for field in layout.fields:
         slots = _old_slots(field, came_from)
-        numbers = _numbers(slots.reshape(group * num_agents, -1), field.kind.width)
+        numbers = _numbers(slots.reshape(group * num_agents, -1), field.item_width)
         sources.append(start + numbers.reshape(group, num_agents, -1))
         start += field.width
     within = np.concatenate(sources, axis=2)

@@ -23,7 +23,7 @@ from torch import Tensor
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
-from esp_cli.symmetry.representation import action_map, rows_matrix, state_matrix
+from esp_cli.symmetry.representation import action_map, rows_matrix, rows_permutation, state_matrix
 from esp_envs.spec import Discrete, TaskSpec
 
 _STACK_LIMIT = 512
@@ -42,7 +42,9 @@ class Transform:
         num_agents: N.
         places: [S, N] int64, agent i moves to places[i]; None where all agents stay.
         came_from: [S, N] int64, the inverse of `places`.
-        obs_matrix: L_g, [S, D, D], or [S, N * D, N * D] where agents move.
+        obs_matrix: L_g, [S, D, D], or [S, N * D, N * D] where agents move; None for observations with pictures.
+        obs_source: of these L_g as a signed permutation, [S, D] or [S, N * D] int64: where each number comes from.
+        obs_sign: likewise, what it is multiplied by.
         state_matrix: L_g of the global state, [S, Ds, Ds].
         action_index: K_g of a discrete action space, [S, A] int64: what action j becomes.
         pull_index: [S, A] (or [S, N * A]) int64, the place of each pulled-back number among a policy's outputs.
@@ -54,7 +56,9 @@ class Transform:
     num_agents: int
     places: Tensor | None
     came_from: Tensor | None
-    obs_matrix: Tensor
+    obs_matrix: Tensor | None
+    obs_source: Tensor | None
+    obs_sign: Tensor | None
     state_matrix: Tensor
     action_index: Tensor | None
     pull_index: Tensor | None
@@ -73,7 +77,7 @@ class Transform:
 
     def select(self, indices: Sequence[int]) -> Transform:
         """Return the transform made of the elements at these positions, one per seed."""
-        index = torch.tensor(indices, dtype=torch.int64).to(self.obs_matrix.device, non_blocking=True)
+        index = torch.tensor(indices, dtype=torch.int64).to(self.state_matrix.device, non_blocking=True)
         chosen: dict[str, Any] = {"elements": tuple(self.elements[i] for i in indices)}
         for f in fields(self):
             if isinstance(tensor := getattr(self, f.name), Tensor):
@@ -82,7 +86,16 @@ class Transform:
 
     def obs(self, x: Tensor) -> Tensor:
         """Apply L_g to observations [S, ..., N, D]; row i moves to row sigma(i)."""
-        return self._multiply(x, self.obs_matrix, rows=True)
+        if self.obs_matrix is not None:
+            return self._multiply(x, self.obs_matrix, rows=True)
+        assert self.obs_source is not None
+        assert self.obs_sign is not None
+        if self.moves_agents:
+            self._require_agents(x, -2)
+        self._require_width(x, self.obs_source.shape[-1] // (self.num_agents if self.moves_agents else 1))
+        flat = x.reshape(self._seeds_of(x), -1, self.obs_source.shape[-1])
+        moved = flat.gather(2, self.obs_source[:, None, :].expand(flat.shape))
+        return (moved * self.obs_sign[:, None, :].to(x.dtype)).reshape(x.shape)
 
     def state(self, x: Tensor) -> Tensor:
         """Apply L_g to global states [S, ..., Ds]."""
@@ -146,9 +159,7 @@ class Transform:
             self._require_agents(x, -2)
         width = matrix.shape[-1]
         joint = rows and self.moves_agents
-        expected = width // self.num_agents if joint else width
-        if x.shape[-1] != expected:
-            raise ValueError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
+        self._require_width(x, width // self.num_agents if joint else width)
         flat = x.reshape(self._seeds_of(x), -1, width)
         return torch.bmm(flat, matrix.to(x.dtype).transpose(1, 2)).reshape(x.shape)
 
@@ -165,6 +176,10 @@ class Transform:
         if self.num_seeds not in (1, x.shape[0]):
             raise ValueError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
         return self.num_seeds
+
+    def _require_width(self, x: Tensor, expected: int) -> None:
+        if x.shape[-1] != expected:
+            raise ValueError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
 
     def _require_agents(self, x: Tensor, axis: int) -> None:
         if x.dim() < 1 - axis or x.shape[axis] != self.num_agents:
@@ -194,7 +209,11 @@ def build_transform(elements: Sequence[Element], spec: TaskSpec, device: torch.d
     if any(e.permutation is not None for e in elements):
         stay = tuple(range(spec.num_agents))
         places = np.array([e.permutation or stay for e in elements], dtype=np.int64)
-    index = pull = matrix = None
+    index = pull = matrix = source = sign = obs_matrix = None
+    if any(f.pixels is not None for f in spec.observation.fields):
+        source, sign = rows_permutation(spec.observation, planar, places)
+    else:
+        obs_matrix = rows_matrix(spec.observation, planar, places)
     if isinstance(spec.action, Discrete):
         index = pull = action_map(spec.action, elements)
         if places is not None:
@@ -202,8 +221,8 @@ def build_transform(elements: Sequence[Element], spec: TaskSpec, device: torch.d
     else:
         matrix = rows_matrix(spec.action.layout, planar, places)
 
-    def numbers(array: NDArray[np.float64]) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float32, device=device)
+    def numbers(array: NDArray[np.float64] | None) -> Tensor | None:
+        return None if array is None else torch.as_tensor(array, dtype=torch.float32, device=device)
 
     def indices(array: NDArray[np.int64] | None) -> Tensor | None:
         return None if array is None else torch.as_tensor(array, device=device)
@@ -213,12 +232,14 @@ def build_transform(elements: Sequence[Element], spec: TaskSpec, device: torch.d
         num_agents=spec.num_agents,
         places=indices(places),
         came_from=indices(None if places is None else np.argsort(places, axis=1)),
-        obs_matrix=numbers(rows_matrix(spec.observation, planar, places)),
-        state_matrix=numbers(state_matrix(spec, planar, places)),
+        obs_matrix=numbers(obs_matrix),
+        obs_source=indices(source),
+        obs_sign=numbers(sign),
+        state_matrix=torch.as_tensor(state_matrix(spec, planar, places), dtype=torch.float32, device=device),
         action_index=indices(index),
         pull_index=indices(pull),
         push_index=indices(None if pull is None else np.argsort(pull, axis=1)),
-        action_matrix=None if matrix is None else numbers(matrix),
+        action_matrix=numbers(matrix),
     )
 
 

@@ -105,5 +105,7 @@ def play(env: Environment, controller: Controller) -> Episodes:
             sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
         running &= ~(step.terminated | step.truncated)
         observation = step.next
+        if env.spec.terminates and not running.any():
+            break
     means = {name: value if name in env.spec.totals else value / lengths for name, value in sums.items()}
     return Episodes(returns, lengths, means)

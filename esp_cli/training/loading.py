@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,9 +160,8 @@ def _build(
             f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
             "which a policy sees, does or earns something else; use the esp that it was trained with, or train anew"
         )
-    widths = (spec.observation.width, *config.network.hidden)
-    needed = len(config.seeds) * sum(inputs * outputs for inputs, outputs in pairwise(widths))
-    if min(widths) < 1 or needed > sum(tensor.numel() for tensor in tensors.values()):
+    needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
+    if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
     build = ALGORITHMS[config.algorithm].build_policy
     policy = build(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()

@@ -201,3 +201,27 @@ def test_batches_cut_select_and_join_without_mixing_seeds():
     assert [piece.obs.shape[1] for piece in batch.chunks(4)] == [4, 2]
     chosen = batch.select(torch.tensor([[5, 0], [1, 1]]))
     assert chosen.action.flatten(1).tolist() == [[5, 0], [7, 7]]
+
+
+def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_value_beyond():
+    settings = {"task__horizon": 4, "task__width": 3, "task__height": 3, "task__num_agents": 2}
+    settings |= {"mappo__num_envs": 12, "mappo__num_steps": 8, "prior__kind": "none"}
+    trained = learner("wildlife", **settings)
+    rollout = trained.collector.collect(8)
+    cut = rollout.ended & ~rollout.terminated
+    assert cut.any()
+    assert rollout.terminated.any()
+    with torch.no_grad():
+        _, following = trained._values(rollout)
+        for t in range(8):
+            expected = trained._value_of(rollout.finals[t])
+            torch.testing.assert_close(following[:, :, t][cut[:, :, t]], expected[cut[:, :, t]])
+    # what comes after an end is another episode: its value must not matter
+    batch, _ = trained._prepare(rollout)
+    marred = copy.deepcopy(rollout)
+    for t, final in marred.finals.items():
+        final.obs[rollout.terminated[:, :, t]] = 7.0
+    again, _ = learner("wildlife", mappo__num_envs=12, mappo__num_steps=8, prior__kind="none", **settings)._prepare(
+        marred
+    )
+    torch.testing.assert_close(again.advantage, batch.advantage)

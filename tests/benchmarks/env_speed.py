@@ -19,9 +19,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from esp_envs import Environment, make
+from esp_envs import Environment, make, task_class
 
-DEFAULT_TASKS = ("navigation", "predator-prey")
+DEFAULT_TASKS = ("navigation", "predator-prey", "wildlife")
 DEFAULT_WORLDS = (1024, 4096)
 
 
@@ -51,7 +51,9 @@ def measure(
     records: list[dict[str, object]] = []
     for task in tasks:
         for count in worlds:
-            env = make(task, count, [0], settings, device)
+            known = task_class(task).Settings.model_fields
+            own = {name: value for name, value in settings.items() if name in known}
+            env = make(task, count, [0], own, device)
             rates(env, min(seconds, 0.3))
             on_clock, of_processor = zip(*(rates(env, seconds) for _ in range(runs)), strict=True)
             records.append(

@@ -45,6 +45,11 @@ SETTINGS: dict[str, list[dict[str, object]]] = {
         {"horizon": 7, "num_agents": 5, "action_delay": 2, "mass_spread": 0.3, "friction_spread": 0.5},
         {"horizon": 6, "num_agents": 2, "sensor_noise_m": 0.01, "heading_noise_rad": 0.1, "wheel_mismatch": 0.05},
     ],
+    "wildlife": [
+        {"horizon": 30},
+        {"num_agents": 4, "width": 5, "height": 3, "convention": "corrected", "horizon": 12},
+        {"num_agents": 2, "width": 3, "height": 3, "horizon": 8, "poacher_moves": 0.0},
+    ],
 }
 ROUNDING = {"formation": 1e-5}
 """Tasks whose physics is finer than the float32 of the states they hand out, and how far one step carries that."""
@@ -156,6 +161,8 @@ def test_actions_of_heuristics_and_chance_lie_in_the_action_space(case: Case) ->
 @cases
 def test_episodes_end_together_at_the_horizon(case: Case) -> None:
     env = case.make()
+    if env.spec.terminates:
+        pytest.skip("each world ends for itself")
     env.reset()
     for _ in range(2):
         for t in range(env.spec.horizon):
@@ -170,6 +177,34 @@ def test_episodes_end_together_at_the_horizon(case: Case) -> None:
     env.reset()
     ends = [bool(env.step(env.random_action()).truncated.any()) for _ in range(env.spec.horizon)]
     assert ends == [False] * (env.spec.horizon - 1) + [True], "reset restarts the clock"
+
+
+@cases
+def test_episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest(case: Case) -> None:
+    env = case.make(num_envs=40)
+    if not env.spec.terminates:
+        pytest.skip("all worlds end together")
+    env.reset()
+    age = torch.zeros(2, 40)
+    seen = {"terminated": 0, "truncated": 0}
+    for _ in range(4 * env.spec.horizon):
+        step = env.step(env.random_action())
+        age += 1
+        assert step.final is not None
+        assert not (step.terminated & step.truncated).any()
+        ended = step.terminated | step.truncated
+        assert torch.equal(step.truncated, (age == env.spec.horizon) & ~step.terminated)
+        assert torch.equal(step.final.state[~ended], step.next.state[~ended])
+        assert torch.equal(step.final.obs[~ended], step.next.obs[~ended])
+        age[ended] = 0
+        seen["terminated"] += int(step.terminated.sum())
+        seen["truncated"] += int(step.truncated.sum())
+    assert min(seen.values()) > 0, "both ends must have been met"
+
+
+def chance(env: Environment) -> Tensor | None:
+    """What a task has drawn in advance, a row for each step; a test may write to it. None where there is none."""
+    return getattr(env, "prey_moves", getattr(env, "plan", None))
 
 
 @cases
@@ -277,8 +312,8 @@ def test_set_state_reproduces_what_follows(case: Case) -> None:
     for t in range(min(6, env.spec.horizon - 1)):
         again = other.set_state(observation.state)
         assert nearly_same([again.obs, again.state], [observation.obs, observation.state], ROUNDING.get(case.task, 0))
-        if hasattr(env, "prey_moves"):
-            other.prey_moves[0] = env.prey_moves[t]
+        if (drawn := chance(other)) is not None:
+            drawn[0] = chance(env)[t]
         action = env.random_action()
         step, copy = env.step(action), other.step(action)
         assert nearly_same(tensors_of(copy), tensors_of(step), ROUNDING.get(case.task, 0))
@@ -292,8 +327,12 @@ def test_set_state_starts_an_episode(case: Case) -> None:
     if env.spec.horizon > 1:
         env.step(env.random_action())
     env.set_state(observation.state)
-    ends = [bool(env.step(env.random_action()).truncated.all()) for _ in range(env.spec.horizon)]
-    assert ends == [False] * (env.spec.horizon - 1) + [True]
+    alive = torch.ones(2, 5, dtype=torch.bool)
+    for t in range(env.spec.horizon):
+        step = env.step(env.random_action())
+        alive &= ~step.terminated
+        assert torch.equal(step.truncated & alive, alive & torch.tensor(t == env.spec.horizon - 1))
+        alive &= ~step.truncated
     with pytest.raises(ValueError, match="shape"):
         env.set_state(observation.state[:, :-1])
 
@@ -349,7 +388,8 @@ def test_agents_of_a_team_are_interchangeable(case: Case) -> None:
         action = env.heuristic()
         a, b = env.step(action), other.step(action[:, :, list(order)])
         torch.testing.assert_close(b.reward, a.reward[..., list(order)])
-        torch.testing.assert_close(b.next.state, permute(a.next.state, spec.state, list(order)))
+        after, expected_after = ((step.final or step.next).state for step in (b, a))
+        torch.testing.assert_close(after, permute(expected_after, spec.state, list(order)))
 
 
 @cases
@@ -404,8 +444,8 @@ def test_a_gpu_gives_the_same_physics(case: Case) -> None:
     state = cpu.reset().state
     gpu.reset()
     cpu.set_state(state), gpu.set_state(state.cuda())
-    if hasattr(cpu, "prey_moves"):
-        gpu.prey_moves.copy_(cpu.prey_moves)
+    if (drawn := chance(gpu)) is not None:
+        drawn.copy_(chance(cpu))
     action = cpu.heuristic()
     a, b = cpu.step(action), gpu.step(action.cuda())
     torch.testing.assert_close(b.next.obs.cpu(), a.next.obs, atol=1e-4, rtol=1e-4)

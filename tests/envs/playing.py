@@ -16,7 +16,9 @@ def episode_return(env: Environment, policy: str) -> tuple[float, float]:
     """
     env.reset()
     total = torch.zeros(env.num_seeds, env.num_envs)
+    running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool)
     for _ in range(env.spec.horizon):
-        action = env.random_action() if policy == "random" else env.heuristic(policy)
-        total += env.step(action).reward.mean(-1)
+        step = env.step(env.random_action() if policy == "random" else env.heuristic(policy))
+        total += torch.where(running, step.reward.mean(-1), 0.0)
+        running &= ~(step.terminated | step.truncated)
     return total.mean().item(), total.std().item() / total.numel() ** 0.5

@@ -28,6 +28,7 @@ def test_the_script_measures_and_writes_json(
     script.main()
     torch.set_num_threads(before)
     records = json.loads(out.read_text())["records"]
-    assert [(r["task"], r["worlds"], r["runs"]) for r in records] == [("navigation", 8, 3), ("predator-prey", 8, 3)]
+    tasks = ("navigation", "predator-prey", "wildlife")
+    assert [(r["task"], r["worlds"], r["runs"]) for r in records] == [(task, 8, 3) for task in tasks]
     assert all(0 < r["least"] <= r["steps_per_second"] <= r["most"] for r in records)
     assert "predator-prey" in capsys.readouterr().out

@@ -10,10 +10,11 @@ import pytest
 
 pettingzoo_test = pytest.importorskip("pettingzoo.test")
 
-from esp_envs import make, task_names  # noqa: E402 - the view needs PettingZoo
+from esp_envs import make, task_class, task_names  # noqa: E402 - the view needs PettingZoo
 from esp_envs.pettingzoo_view import ParallelView  # noqa: E402
 
-CASES = [*((task, {}) for task in task_names()), *((task, {"actions": "continuous"}) for task in task_names())]
+ACTIONS = [task for task in task_names() if "actions" in task_class(task).Settings.model_fields]
+CASES = [*((task, {}) for task in task_names()), *((task, {"actions": "continuous"}) for task in ACTIONS)]
 
 
 @pytest.mark.parametrize(("task", "settings"), CASES)
@@ -38,10 +39,13 @@ def test_the_view_is_the_environment(task: str, settings: dict[str, object]) -> 
         joint = {agent: action[0, 0, i].numpy() for i, agent in enumerate(view.agents)}
         seen, rewards, terminations, truncations, infos = view.step(joint)
         assert list(rewards.values()) == step.reward[0, 0].tolist()
-        assert not any(terminations.values())
-        assert all(truncations.values()) == (t == env.spec.horizon - 1)
+        assert set(terminations.values()) == {bool(step.terminated)}
+        assert env.spec.terminates or not step.terminated
+        assert all(truncations.values()) == (t == env.spec.horizon - 1 and not step.terminated)
         assert infos["agent_0"].keys() == step.metrics.keys()
         observation = step.next if step.final is None else step.final
+        if step.terminated:
+            break
     assert view.agents == []
     np.testing.assert_array_equal(view.state(), observation.state[0, 0].numpy())
     assert view.step({}) == ({}, {}, {}, {}, {})

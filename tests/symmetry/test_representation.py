@@ -9,10 +9,9 @@ import pytest
 
 from esp_cli.symmetry import Element, agent_permutations, dihedral, direct_product, mirror, rotation
 from esp_cli.symmetry.representation import (
-    KIND_MATRICES,
     action_map,
+    item_matrix,
     joint_matrix,
-    kind_matrix,
     layout_matrix,
     state_matrix,
 )
@@ -29,20 +28,20 @@ def stack(*elements: Element, num_agents: int = 3) -> tuple[np.ndarray, np.ndarr
     return np.stack([e.matrix for e in elements]), np.array([e.permutation or stay for e in elements])
 
 
-def test_every_kind_has_a_representation_of_its_width() -> None:
-    planar, _ = stack(*D8.elements)
-    assert set(KIND_MATRICES) == set(Kind)
-    for kind in Kind:
-        assert kind_matrix(kind, planar).shape == (16, kind.width, kind.width)
+def field_of(name: str, kind: Kind, count: int = 1, items: Items = Items.FIXED) -> Field:
+    """Return a field of any kind; a picture has 3 x 3 pixels."""
+    return Field(name, kind, count, items=items, pixels=(3, 3) if kind is Kind.PICTURE else None)
 
 
 @pytest.mark.parametrize("kind", Kind)
 def test_kinds_are_orthogonal_homomorphisms(kind: Kind) -> None:
-    matrices = kind_matrix(kind, stack(*D8.elements)[0])
-    np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[D8.product], atol=1e-15)
-    np.testing.assert_allclose(
-        matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(kind.width), (16, 1, 1)), atol=1e-15
-    )
+    field = field_of("field", kind)
+    group = D4 if kind is Kind.PICTURE else D8
+    matrices = item_matrix(field, stack(*group.elements)[0])
+    assert matrices.shape == (group.order, field.width, field.width)
+    np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[group.product], atol=1e-15)
+    identity = np.tile(np.eye(field.width), (group.order, 1, 1))
+    np.testing.assert_allclose(matrices @ matrices.transpose(0, 2, 1), identity, atol=1e-15)
 
 
 def test_a_row_by_hand() -> None:
@@ -114,7 +113,7 @@ def random_layout(rng: np.random.Generator, num_agents: int):
     for i in range(rng.integers(1, 7)):
         items = list(Items)[rng.integers(3)]
         count = counts[items] or int(rng.integers(1, 4))
-        fields.append(Field(f"f{i}", list(Kind)[rng.integers(len(Kind))], count, items=items))
+        fields.append(field_of(f"f{i}", list(Kind)[rng.integers(len(Kind))], count, items))
     return layout(*fields)
 
 

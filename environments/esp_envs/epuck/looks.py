@@ -7,8 +7,8 @@ import math
 import mujoco
 from PIL import ImageColor
 
-from esp_envs.base import Body, Scene
-from esp_envs.drawing import BACKGROUND, FRAME, GRID, GRID_SPACING
+from esp_envs.base import GRID_SPACING, Body, Scene
+from esp_envs.drawing import BACKGROUND, FRAME, GRID
 from esp_envs.epuck.robot import AXLE_M, BODY_HEIGHT_M, BODY_RADIUS_M, WHEEL_RADIUS_M
 
 WALL_HEIGHT_M = 0.03

@@ -1,0 +1,1 @@
+"""A grid world on a torus, seen in pictures."""

@@ -1,0 +1,314 @@
+"""Wildlife monitoring (van der Pol et al., 2022): drones on a torus of cells trap a poacher between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field as Setting
+from pydantic import model_validator
+from torch import Tensor
+
+from esp_envs.base import (
+    Body,
+    Environment,
+    Observation,
+    Scene,
+    Step,
+    TaskSettings,
+    generator_states,
+    restore_generators,
+)
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
+from esp_envs.wildlife.pictures import PIXELS, all_pictures, cell_index
+
+REST = (0.0, 0.0)
+MOVES = Discrete(Kind.VECTOR, (REST, UP, RIGHT, DOWN, LEFT), ("rest", "up", "right", "down", "left"))
+"""In the order of van der Pol's code; the meaning of each is the way to the next cell."""
+STEP_COST = 0.05
+"""What a step costs the whole team."""
+_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
+_POACHER_COLOR = "#202020"
+
+
+class WildlifeSettings(TaskSettings):
+    """What a user may change of `wildlife`."""
+
+    convention: Literal["esp", "corrected"] = Setting(
+        "esp",
+        description="whose rules: 'esp' is van der Pol's code, which the paper used, 'corrected' has its quirks mended",
+    )
+    num_agents: int = Setting(3, ge=2, le=16, description="N, drones; van der Pol: 3")
+    width: int = Setting(7, ge=3, le=63, description="columns of the grid, an odd number; van der Pol: 7")
+    height: int = Setting(7, ge=3, le=63, description="rows of the grid, an odd number")
+    horizon: int = Setting(100, ge=1, description="steps of an episode, at most")
+    poacher_moves: float = Setting(0.8, ge=0, le=1, description="probability that the poacher moves in a step")
+
+    @model_validator(mode="after")
+    def _fits(self) -> WildlifeSettings:
+        if self.width % 2 == 0 or self.height % 2 == 0:
+            raise ValueError(
+                f"a grid of {self.width} x {self.height} cells has no cell in its middle; use odd numbers, so that a "
+                "drone can be in the middle of its picture"
+            )
+        if self.num_agents >= self.width * self.height:
+            raise ValueError(f"{self.num_agents} drones and a poacher do not fit on {self.width * self.height} cells")
+        return self
+
+
+class Wildlife(Environment):
+    """Wildlife monitoring, the drones' game of van der Pol et al. (2022).
+
+    N drones and a poacher move on a grid of cells whose opposite edges are joined. One drone has to hover above the
+    poacher while others stand beside it.
+
+    Actions: 0 rest, 1 up, 2 right, 3 down, 4 left: to the next cell. Drones that would share a cell stay where they
+    were, all of them. The poacher moves in a uniformly random direction with probability 0.8, else it rests.
+
+    Observation of one drone, a picture of 9 numbers a cell and N - 1 planar vectors (7 x 7 cells, N = 3: 445 numbers):
+
+        | index (7 x 7, N = 3) | field   | meaning                                           | unit  |
+        |----------------------|---------|---------------------------------------------------|-------|
+        | 0..440               | picture | 21 x 21 pixels: the torus, itself in the middle   | shade |
+        | 441..444             | others  | each other drone, in index order, minus own cell  | cell  |
+
+    The picture has 3 x 3 pixels of 0 or 1 a cell: a plus is the drone itself, an x the poacher, which hides the plus
+    below it. It does not show the other drones. Rows of pixels from the top (largest y), in each from the left.
+
+    State: cells of the drones, cell of the poacher, as (x, y) from the middle cell.
+
+    Reward, the same for every drone: -0.05 in each step; in the last one, if the poacher is trapped, 1 for the drone
+    above it and 1 for each drone beside it. It is trapped if exactly one drone is in its cell and at least one that did
+    not just bump into another is at a Manhattan distance of 1 from it.
+        convention `esp` (van der Pol's code): the poacher's cell BEFORE its move counts; distances between cells,
+            and the relative positions that are seen, do not go round the torus.
+        convention `corrected`: the cell after its move counts, and distances go round the torus.
+
+    Start: drones and poacher on different cells, uniformly.
+
+    Terminated: when the poacher is trapped; each world for itself. Truncated: after `horizon` = 100 steps; bootstrap
+    there.
+
+    Metrics, added up over an episode: `captures` (1 if it ends with the poacher trapped), `lone_landings` (steps with
+    a drone alone above the poacher), `collisions` (drones sent back to their cells), `steps` (its length).
+
+    Symmetry: all turns and mirrors of the square (`d4`) where the grid is one, else half turns and mirrors in the axes
+    (`d2`); in both conventions.
+
+    Heuristics: `surround` (all fly to the poacher; the nearest lands when another is beside it in the same step).
+
+    Anchors, convention `esp`, 7 x 7 cells, N = 3, return of an episode: random -2.78, surround 1.98.
+
+    Versions:
+        1: first.
+    """
+
+    Settings: ClassVar[type[WildlifeSettings]] = WildlifeSettings
+    heuristics: ClassVar[tuple[str, ...]] = ("surround",)
+    settings: WildlifeSettings
+
+    def __init__(self, settings: WildlifeSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        self.spec = _spec(settings)
+        agents, device = settings.num_agents, self.device
+        self._size = torch.tensor([settings.width, settings.height], device=device)
+        self._half = self._size // 2
+        self._points = torch.tensor(MOVES.points, device=device).long()
+        pictures = all_pictures(settings.width, settings.height)
+        # as wide as an observation, so that one copy of rows makes the observations
+        self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
+        self._others = torch.tensor([[j for j in range(agents) if j != i] for i in range(agents)], device=device)
+        lead = (self.num_seeds, num_envs)
+        self._cells = torch.zeros(*lead, agents + 1, 2, dtype=torch.int64, device=device)
+        self._time = torch.zeros(lead, dtype=torch.int64, device=device)
+        self._clock = 0
+        self.plan = torch.zeros(settings.horizon, *lead, agents + 2, 2, dtype=torch.int16, device=device)
+        """[horizon, S, E, N + 2, 2], all that chance decides, drawn in advance: in each step the poacher's move, then
+        the cells of drones and poacher with which an episode would begin. A new plan follows when it is used up."""
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        self._clock = 0
+        self._time.zero_()
+        self._cells = self._draw_plan()
+        return self._observe(self._cells)
+
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one step.
+
+        Raises:
+            ValueError: the action has another shape than [S, E, N].
+        """
+        settings, agents = self.settings, self.settings.num_agents
+        expected = (self.num_seeds, self.num_envs, agents)
+        if tuple(action.shape) != expected:
+            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {expected}")
+        before = self._cells
+        chance = self.plan[self._clock].long()
+        after = self._wrap(before + torch.cat([self._points[action], chance[:, :, :1]], 2))
+        drones = after[:, :, :agents]
+        bumped = (drones.unsqueeze(3) == drones.unsqueeze(2)).all(-1).sum(-1) > 1
+        drones = torch.where(bumped.unsqueeze(-1), before[:, :, :agents], drones)
+        cells = torch.cat([drones, after[:, :, agents:]], 2)
+        poacher = (before if settings.convention == "esp" else cells)[:, :, agents:]
+        landed, helpers = self._trap(drones, poacher, bumped)
+        captured = landed & (helpers > 0)
+        self._time += 1
+        truncated = (self._time == settings.horizon) & ~captured
+        ended = captured | truncated
+        final = self._observe(cells)
+        self._cells = torch.where(ended[..., None, None], chance[:, :, 1:], cells)
+        self._time = torch.where(ended, 0, self._time)
+        self._clock += 1
+        if self._clock == settings.horizon:
+            self._draw_plan()
+            self._clock = 0
+        reward = torch.where(captured, 1.0 + helpers, 0.0) - STEP_COST
+        return Step(
+            next=self._observe(self._cells),
+            reward=reward.unsqueeze(-1).expand(expected).contiguous(),
+            terminated=captured,
+            truncated=truncated,
+            final=final,
+            metrics={
+                "captures": captured.float(),
+                "lone_landings": (landed & (helpers == 0)).float(),
+                "collisions": bumped.sum(-1).float(),
+                "steps": torch.ones_like(reward),
+            },
+        )
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state at the start of an episode; the plan stays, and begins anew."""
+        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
+        if tuple(state.shape) != expected:
+            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
+        self._clock = 0
+        self._time.zero_()
+        self._cells = state.round().long().unflatten(-1, (-1, 2))
+        return self._observe(self._cells)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return everything that `load_state_dict` needs to go on bit for bit."""
+        return {
+            "cells": self._cells.to(torch.int16),
+            "time": self._time.clone(),
+            "clock": torch.tensor(self._clock),
+            "plan": self.plan.clone(),
+            "generators": generator_states(self.generators),
+        }
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: the tensors belong to an environment of another size.
+        """
+        if tensors["plan"].shape != self.plan.shape or len(tensors["generators"]) != self.num_seeds:
+            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+        self._cells = tensors["cells"].to(self.device).long()
+        self._time = tensors["time"].to(self.device).clone()
+        self._clock = int(tensors["clock"])
+        self.plan.copy_(tensors["plan"])
+        restore_generators(self.generators, tensors["generators"])
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of `surround`."""
+        if name not in (None, *self.heuristics):
+            raise ValueError(f"wildlife has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        drones, poacher = self._cells[:, :, :-1], self._cells[:, :, -1:]
+        way = self._wrap(poacher - drones)
+        distance = way.abs().sum(-1)
+        nearest, second = distance.topk(2, dim=-1, largest=False, sorted=True).values.unbind(-1)
+        # of several nearest drones the first
+        lands = torch.zeros_like(distance).scatter_(-1, distance.argmin(-1, keepdim=True), 1).bool()
+        trap = ((nearest <= 1) & (second <= 2)).unsqueeze(-1)
+        moves = (distance > 1) | (lands & trap & (distance == 1))
+        sideways = way[..., 0].abs() > way[..., 1].abs()
+        up, right, down, left = (MOVES.points.index(p) for p in (UP, RIGHT, DOWN, LEFT))
+        along_x, along_y = torch.where(way[..., 0] > 0, right, left), torch.where(way[..., 1] > 0, up, down)
+        return torch.where(moves, torch.where(sideways, along_x, along_y), MOVES.points.index(REST))
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return the drones of one world and the poacher on top of them, on the lines between the cells."""
+        *drones, poacher = [(float(x), float(y)) for x, y in self._cells[world].tolist()]
+        bodies = [Body(place, 0.4, _COLORS[i % len(_COLORS)]) for i, place in enumerate(drones)]
+        bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross"))
+        right, top = self.settings.width / 2, self.settings.height / 2
+        return Scene(tuple(bodies), (-right, right, -top, top), grid=(1.0, 0.5))
+
+    def _wrap(self, cells: Tensor) -> Tensor:
+        """Return coordinates [..., 2] brought round the torus into the grid, whose middle cell is (0, 0)."""
+        return torch.remainder(cells + self._half, self._size) - self._half
+
+    def _trap(self, drones: Tensor, poacher: Tensor, bumped: Tensor) -> tuple[Tensor, Tensor]:
+        """Return whether just one drone is above the poacher [S, E], and how many stand beside it [S, E]."""
+        offset = drones - poacher
+        if self.settings.convention == "corrected":
+            offset = self._wrap(offset)
+        distance = offset.abs().sum(-1)
+        return (distance == 0).sum(-1) == 1, ((distance == 1) & ~bumped).sum(-1)
+
+    def _observe(self, cells: Tensor) -> Observation:
+        drones, poacher = cells[:, :, :-1], cells[:, :, -1:]
+        settings = self.settings
+        picture = cell_index(self._wrap(poacher - drones), settings.width, settings.height)
+        obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
+        others = drones[:, :, self._others] - drones.unsqueeze(3)
+        if settings.convention == "corrected":
+            others = self._wrap(others)
+        obs[..., -2 * (settings.num_agents - 1) :] = others.flatten(-2)
+        return Observation(obs, cells.flatten(-2).float())
+
+    def _draw_plan(self) -> Tensor:
+        """Draw all that chance decides in the next `horizon` steps; return the cells to start from now."""
+        agents, (rows, _, worlds) = self.settings.num_agents, self.plan.shape[:3]
+        shape = (rows + 1, worlds, agents + 3)
+        drawn = torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self.generators], 1)
+        move = self._points[1 + (4 * drawn[:-1, ..., 1]).long().clamp_(max=3)]
+        self.plan[..., 0, :] = torch.where(drawn[:-1, ..., :1] < self.settings.poacher_moves, move, 0)
+        starts = self._different_cells(drawn[..., 2:])
+        self.plan[..., 1:, :] = starts[:-1]
+        return starts[-1]
+
+    def _different_cells(self, uniform: Tensor) -> Tensor:
+        """Turn numbers in [0, 1), [..., K], into K different cells [..., K, 2], all choices equally likely."""
+        width, count = self.settings.width, self.settings.width * self.settings.height
+        chosen: list[Tensor] = []
+        for k in range(uniform.shape[-1]):
+            cell = (uniform[..., k] * (count - k)).long().clamp_(max=count - k - 1)
+            # the cell-th of those that are free: each taken one that is not above it moves it up
+            if chosen:
+                for taken in torch.stack(chosen, -1).sort(-1).values.unbind(-1):
+                    cell = cell + (cell >= taken)
+            chosen.append(cell)
+        index = torch.stack(chosen, -1)
+        return torch.stack([index % width, index // width], -1) - self._half
+
+
+def _spec(settings: WildlifeSettings) -> TaskSpec:
+    """Return the spec that follows from the settings."""
+    agents, width, height = settings.num_agents, settings.width, settings.height
+    before = "before its move, no way round the torus" if settings.convention == "esp" else "after its move"
+    return TaskSpec(
+        name="wildlife",
+        version=1,
+        convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}",
+        num_agents=agents,
+        horizon=settings.horizon,
+        observation=layout(
+            Field("picture", Kind.PICTURE, 1, "shade", pixels=(PIXELS * height, PIXELS * width)),
+            Field("others", Kind.VECTOR, agents - 1, "cell", Items.OTHERS),
+        ),
+        state=layout(
+            Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS),
+            Field("poacher", Kind.VECTOR, 1, "cell"),
+        ),
+        action=MOVES,
+        symmetry="d4" if width == height else "d2",
+        control_period_s=0.25,
+        totals=("captures", "lone_landings", "collisions", "steps"),
+        terminates=True,
+        settings=settings.model_dump(),
+    )

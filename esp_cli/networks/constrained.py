@@ -1,0 +1,143 @@
+"""Layers whose weights commute with a group: the equivariance constraint is solved, what is free in it is learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from esp_cli.networks.contract import Network, NetworkConfig
+from esp_cli.networks.layers import GAINS, affine, orthogonal
+from esp_cli.networks.ports import Ports
+from esp_cli.symmetry import FiniteGroup
+from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
+
+
+def copies_for(width: int, group: FiniteGroup) -> int:
+    """Return how many regular features have about as many weights between two layers as `width` plain numbers.
+
+    Two layers of m features of a group of order G share m m G free numbers, so m is width / sqrt(G).
+    """
+    return max(1, round(width / math.sqrt(group.order)))
+
+
+class ConstrainedLinear(nn.Module):
+    """y = x W + b for S seeds, with every W and b such that y transforms as it should when x does (Eq. 2).
+
+    Between each block of the input and each of the output, W is a combination of the maps that commute with the group;
+    the coefficients are the parameters. For the group of one element it is a plain linear layer.
+
+    Args:
+        generators: one CPU generator per seed, for the initial weights.
+        inputs: how x transforms.
+        outputs: how y transforms.
+        gain: the initial weights are orthogonal ones of this gain, projected onto what is allowed and scaled to keep
+            their size.
+
+    Shape:
+        x: [S, B, in] -> [S, B, out].
+    """
+
+    def __init__(
+        self, generators: Sequence[torch.Generator], inputs: Sequence[Block], outputs: Sequence[Block], gain: float
+    ) -> None:
+        super().__init__()
+        self.inputs, self.outputs = list(inputs), list(outputs)
+        full = orthogonal(generators, block_width(inputs), block_width(outputs), gain)
+        one = Block(np.ones((len(inputs[0].matrices), 1, 1)), 1)
+        self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
+        row = 0
+        for a, source in enumerate(self.inputs):
+            column = 0
+            for b, target in enumerate(self.outputs):
+                basis = torch.as_tensor(intertwiners(source, target), dtype=torch.float32)
+                if len(basis):
+                    part = full[:, row : row + source.width, column : column + target.width]
+                    part = part.unflatten(1, (source.copies, -1)).unflatten(3, (target.copies, -1))
+                    scale = math.sqrt(source.size * target.size / len(basis))
+                    start = torch.einsum("sminj,kij->smnk", part, basis) * scale
+                    self.weights[f"{a}-{b}"] = nn.Parameter(start.contiguous())
+                    self.register_buffer(f"basis-{a}-{b}", basis.flatten(1), False)
+                column += target.width
+            row += source.width
+        for b, target in enumerate(self.outputs):
+            basis = torch.as_tensor(intertwiners(one, target), dtype=torch.float32)
+            if len(basis):
+                self.biases[str(b)] = nn.Parameter(torch.zeros(len(generators), target.copies, len(basis)))
+                self.register_buffer(f"constant-{b}", basis.flatten(1), False)
+        self.num_seeds = len(generators)
+
+    def weight(self) -> Tensor:
+        """Return W: [S, in, out]."""
+        like = next(iter(self.weights.values()))
+        rows = []
+        for a, source in enumerate(self.inputs):
+            parts = []
+            for b, target in enumerate(self.outputs):
+                name = f"{a}-{b}"
+                if name in self.weights:
+                    made = self.weights[name] @ self.get_buffer(f"basis-{name}")  # [S, m, n, d_in * d_out]
+                    made = made.unflatten(3, (source.size, target.size)).transpose(2, 3)
+                    parts.append(made.reshape(self.num_seeds, source.width, target.width))
+                else:
+                    parts.append(like.new_zeros(self.num_seeds, source.width, target.width))
+            rows.append(torch.cat(parts, 2) if len(parts) > 1 else parts[0])
+        return torch.cat(rows, 1) if len(rows) > 1 else rows[0]
+
+    def bias(self) -> Tensor:
+        """Return b: [S, 1, out]."""
+        like = next(iter(self.weights.values()))
+        parts = []
+        for b, target in enumerate(self.outputs):
+            if str(b) in self.biases:
+                parts.append((self.biases[str(b)] @ self.get_buffer(f"constant-{b}")).flatten(1))
+            else:
+                parts.append(like.new_zeros(self.num_seeds, target.width))
+        return torch.cat(parts, 1).unsqueeze(1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply the layer."""
+        return affine(self.bias(), x, self.weight())
+
+
+class Equivariant(Network):
+    """A perceptron of regular features over a row of scalars, planar vectors and the like: equivariant in every layer.
+
+    Hidden widths are those of a plain perceptron with about as many weights. A value is invariant, an action's numbers
+    transform as the action does.
+    """
+
+    def __init__(
+        self, generators: Sequence[torch.Generator], ports: Ports, config: NetworkConfig, output_gain: float
+    ) -> None:
+        super().__init__()
+        if any(field.pixels is not None for field in ports.layout.fields):
+            raise ValueError(
+                f"the network 'equivariant' reads numbers, but {ports.spec.name} shows pictures; use empn or mlp"
+            )
+        self.group = ports.group(config.group)
+        hidden = [[regular(self.group, copies_for(width, self.group))] for width in config.hidden]
+        blocks = [ports.inputs(self.group), *hidden, ports.outputs(self.group)]
+        gains = [GAINS[config.activation]] * len(hidden) + [output_gain]
+        self.layers = nn.ModuleList(
+            ConstrainedLinear(generators, a, b, gain) for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
+        )
+        self.activate = torch.relu if config.activation == "relu" else torch.tanh
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [S, B, in] to [S, B, out]."""
+        *hidden, last = self.layers
+        for layer in hidden:
+            x = self.activate(layer(x))
+        return last(x)
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Apply the network to one step."""
+        return self(x), memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps at once."""
+        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])

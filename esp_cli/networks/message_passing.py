@@ -1,0 +1,242 @@
+"""Message passing networks on pictures (van der Pol et al., 2022), plain and equivariant: one class for any group.
+
+Each drone encodes its picture by two convolutions and their largest response anywhere; then drones that are near each
+other exchange what they found and where they are. With the group of one element the layers are plain, and this is the
+standard network; with C4 or D4 every layer is equivariant: group convolutions, regular features, relative positions as
+planar vectors, values invariant, actions permuted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import Function
+
+from esp_cli.networks.constrained import ConstrainedLinear, copies_for
+from esp_cli.networks.contract import Network, NetworkConfig
+from esp_cli.networks.layers import GAINS, affine
+from esp_cli.networks.ports import Ports
+from esp_cli.symmetry import FiniteGroup
+from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
+from esp_envs.spec import Field, Items, Kind, Layout
+
+CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
+"""Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
+REACH = 3 * math.sqrt(2)
+"""Drones nearer than this exchange messages, in cells; van der Pol's code."""
+_LOT = 16
+"""Different pictures are encoded in multiples of this, so that few lengths of products occur."""
+
+
+class PictureEncoder(nn.Module):
+    """Convolutions for S seeds, each followed by relu, then the largest response over all places.
+
+    Args:
+        generators: one CPU generator per seed.
+        field: the pictures.
+        group: how they may turn.
+
+    Shape:
+        [S, B, pixels of all channels] -> [S, B, width].
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], field: Field, group: FiniteGroup) -> None:
+        super().__init__()
+        assert field.pixels is not None
+        self.shape = (field.count, *field.pixels)
+        side = min(field.pixels)
+        block = trivial(group, field.count)
+        self.sides, self.strides, layers = [], [], []
+        for channels, filter_side, stride in zip(CHANNELS, FILTERS, STRIDES, strict=True):
+            used = min(filter_side, side)
+            # a filter that stepped over the last pixels would see one edge and not the other
+            step = stride if all((length - used) % stride == 0 for length in self._after(field.pixels)) else 1
+            following = regular(group, copies_for(channels, group))
+            layers.append(ConstrainedLinear(generators, [with_pixels(block, used, group)], [following], GAINS["relu"]))
+            self.sides.append(used)
+            self.strides.append(step)
+            side = (side - used) // step + 1
+            block = following
+        self.layers = nn.ModuleList(layers)
+        self.output = block
+        keys = torch.randn(2, field.width, generator=torch.Generator().manual_seed(0))
+        self.keys: Tensor
+        self.register_buffer("keys", keys, False)
+
+    def _after(self, pixels: tuple[int, int]) -> list[int]:
+        """Return height and width behind the layers so far."""
+        sizes = list(pixels)
+        for side, stride in zip(self.sides, self.strides, strict=True):
+            sizes = [(size - side) // stride + 1 for size in sizes]
+        return sizes
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Encode pictures; those that occur several times are encoded once. No gradient reaches a picture."""
+        which, place = distinct(pictures.detach(), self.keys)
+        num_seeds, batch = place.shape
+        seeds = torch.arange(num_seeds, device=place.device).unsqueeze(1)
+        rows = pictures.detach().flatten(0, 1).index_select(0, (which + batch * seeds).flatten())
+        features = self.encode(rows.unflatten(0, which.shape))
+        index = (place + which.shape[1] * seeds).flatten()
+        return features.flatten(0, 1).index_select(0, index).unflatten(0, place.shape)
+
+    def encode(self, pictures: Tensor) -> Tensor:
+        """Encode every picture."""
+        return self.responses(self.as_pictures(pictures))[-1].flatten(2, 3).amax(2)
+
+    def as_pictures(self, rows: Tensor) -> Tensor:
+        """Shape rows of numbers [S, B, D] as pictures [S, B, rows, columns, channels]."""
+        return rows.unflatten(-1, self.shape).movedim(2, -1)
+
+    def responses(self, x: Tensor) -> list[Tensor]:
+        """Return what each layer responds to pictures [S, B, rows, columns, channels], in the same shape."""
+        out = []
+        for layer, side, stride in zip(self.layers, self.sides, self.strides, strict=True):
+            assert isinstance(layer, ConstrainedLinear)
+            num_seeds, batch = x.shape[:2]
+            rows, columns = ((length - side) // stride + 1 for length in x.shape[2:4])
+            patches = _Patches.apply(x, side, stride)  # type: ignore[no-untyped-call]
+            # a constrained weight counts channels, then pixels; a patch the other way round, which copies in long runs
+            weight = layer.weight().unflatten(1, (-1, side * side)).transpose(1, 2).flatten(1, 2)
+            x = torch.relu(affine(layer.bias(), patches, weight)).view(num_seeds, batch, rows, columns, -1)
+            out.append(x)
+        return out
+
+
+class _Patches(Function):
+    """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C].
+
+    Torch's own backward of the view adds up number by number; here it adds up picture by picture.
+    """
+
+    @staticmethod
+    def forward(ctx, x, side, stride):  # type: ignore[no-untyped-def]
+        patches = x.unfold(2, side, stride).unfold(3, side, stride).permute(0, 1, 2, 3, 5, 6, 4)
+        ctx.shape, ctx.patches, ctx.stride = x.shape, patches.shape, stride
+        return patches.reshape(x.shape[0], -1, side * side * x.shape[-1])
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        if not ctx.needs_input_grad[0]:
+            return None, None, None
+        (_, _, rows, columns, side, _, _), stride = ctx.patches, ctx.stride
+        grad, out = grad.reshape(ctx.patches), grad.new_zeros(ctx.shape)
+        for i in range(side):
+            for j in range(side):
+                last_row, last_column = i + (rows - 1) * stride + 1, j + (columns - 1) * stride + 1
+                out[:, :, i:last_row:stride, j:last_column:stride] += grad[:, :, :, :, i, j]
+        return out, None, None
+
+
+def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """Find which rows are different: on a torus of 49 cells a batch of thousands of pictures holds 49.
+
+    Rows are told apart by two fixed random projections, so two that differ are taken for one with a chance of 2^-46.
+
+    Args:
+        rows: [S, B, D].
+        keys: [2, D].
+
+    Returns:
+        which: [S, U] for each seed the index of one row of each sort; filled up with others.
+        place: [S, B] the sort of each row.
+    """
+    num_seeds, batch, width = rows.shape
+    flat = rows.reshape(-1, width)
+    first, second = ((flat @ key).view(torch.int32).long() for key in keys)
+    marks, order = ((first << 32) ^ (second & 0xFFFFFFFF)).view(num_seeds, batch).sort(1)
+    sort = torch.zeros_like(order)
+    sort[:, 1:] = (marks[:, 1:] != marks[:, :-1]).cumsum(1)
+    sorts = min(batch, -(-(int(sort[:, -1].max()) + 1) // _LOT) * _LOT)
+    place = torch.empty_like(order).scatter_(1, order, sort)
+    which = torch.zeros(num_seeds, sorts, dtype=torch.int64, device=rows.device).scatter_(1, sort, order)
+    return which, place
+
+
+class MessagePassing(Network):
+    """Encoder, message passing layers, head; see the module.
+
+    A layer maps [own features, mean of (relative position, features) over the near], where the mean counts the drone
+    itself among those it divides by, through one linear layer and relu.
+
+    Raises:
+        ValueError: the task does not show pictures and relative positions, or a critic is to read them all in a row.
+    """
+
+    def __init__(
+        self, generators: Sequence[torch.Generator], ports: Ports, config: NetworkConfig, output_gain: float
+    ) -> None:
+        super().__init__()
+        if ports.reads != "own":
+            raise ValueError(
+                f"{config.name} passes messages between drones, each with what it sees: set mappo.critic_input=own"
+            )
+        picture, others = _fields(ports)
+        self.group = ports.group("c1" if config.name == "mpn" else config.group)
+        self.num_agents = ports.spec.num_agents
+        self.picture, self.others = (ports.layout.slices()[field.name] for field in (picture, others))
+        self.encoder = PictureEncoder(generators, picture, self.group)
+        (vector,) = layout_blocks(Layout((Field("way", Kind.VECTOR),)), self.group)
+        block: Block = self.encoder.output
+        layers = []
+        for width in config.hidden:
+            following = regular(self.group, copies_for(width, self.group))
+            layers.append(ConstrainedLinear(generators, [block, vector, block], [following], GAINS["relu"]))
+            block = following
+        self.layers = nn.ModuleList(layers)
+        self.head = ConstrainedLinear(generators, [block], ports.outputs(self.group), output_gain)
+        index = [[j for j in range(self.num_agents) if j != i] for i in range(self.num_agents)]
+        self.index: Tensor
+        self.register_buffer("index", torch.tensor(index), False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [S, W * N, D] to [S, W * N, out]; the N rows of a world stand side by side."""
+        return self.head(self.features(x)[-1])
+
+    def features(self, x: Tensor) -> list[Tensor]:
+        """Return the features [S, W * N, C] behind the encoder and behind each message passing layer."""
+        way = x[..., self.others].unflatten(-1, (-1, 2)) / REACH
+        near = (way.square().sum(-1) < 1).float()
+        share = near / (1 + near.sum(-1, keepdim=True))  # [S, W * N, N - 1]
+        mean_way = (share.unsqueeze(-1) * way).sum(-2)
+        features = [self.encoder(x[..., self.picture])]
+        for layer in self.layers:
+            own = features[-1]
+            heard = self._hear(own, share)
+            features.append(torch.relu(layer(torch.cat([own, mean_way, heard], -1))))
+        return features
+
+    def _hear(self, own: Tensor, share: Tensor) -> Tensor:
+        """Return for each drone the sum of the others' features by their shares: [S, W * N, C]."""
+        worlds = own.unflatten(1, (-1, self.num_agents))
+        shares = share.unflatten(1, (-1, self.num_agents)).unsqueeze(-1)
+        heard = torch.zeros_like(worlds)
+        for k in range(self.num_agents - 1):
+            heard = torch.addcmul(heard, shares[:, :, :, k], worlds[:, :, self.index[:, k]])
+        return heard.flatten(1, 2)
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Apply the network to one step."""
+        return self(x), memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""
+        worlds = x.unflatten(1, (-1, self.num_agents)).transpose(2, 3)  # [S, W, T, N, D]
+        outputs = self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4])
+        return outputs.transpose(2, 3).flatten(1, 2)
+
+
+def _fields(ports: Ports) -> tuple[Field, Field]:
+    """Return the field of pictures and that of relative positions."""
+    fields = ports.layout.fields
+    pictures = [f for f in fields if f.kind is Kind.PICTURE]
+    others = [f for f in fields if f.kind is Kind.VECTOR and f.items is Items.OTHERS]
+    if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != ports.spec.num_agents - 1:
+        raise ValueError(
+            f"message passing needs a picture and the way to each other agent, but {ports.spec.name} does not show "
+            "them; use mlp, gru or equivariant"
+        )
+    return pictures[0], others[0]

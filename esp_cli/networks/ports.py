@@ -1,0 +1,58 @@
+"""What a network reads and writes, and how both transform: all that an equivariant network has to know of its place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from esp_cli.symmetry import FiniteGroup, admit, parse_group
+from esp_cli.symmetry.intertwiners import Block, action_blocks, layout_blocks, trivial
+from esp_envs.spec import Layout, TaskSpec, joint_layout
+
+Reads = Literal["state", "observations", "own"]
+
+
+@dataclass(frozen=True)
+class Ports:
+    """The place of a network in a task.
+
+    Attributes:
+        spec: the task.
+        reads: the global state, all agents' observations in a row, or one agent's own, of which rows come with the
+            agents of a world side by side.
+        num_values: invariant values that it writes, or None where it writes one number per action (discrete) or the
+            numbers of an action (continuous).
+    """
+
+    spec: TaskSpec
+    reads: Reads
+    num_values: int | None = None
+
+    @property
+    def layout(self) -> Layout:
+        """The layout of an input row."""
+        if self.reads == "observations":
+            return joint_layout(self.spec.observation, self.spec.num_agents)
+        return self.spec.state if self.reads == "state" else self.spec.observation
+
+    def group(self, name: str) -> FiniteGroup:
+        """Return a group of turns and mirrors by its name.
+
+        Raises:
+            ValueError: there is no such group, it is infinite or moves agents, or the task cannot carry it.
+        """
+        group = parse_group(name, self.spec.num_agents)
+        if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
+            raise ValueError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
+        admit(name, group, self.spec)
+        return group
+
+    def inputs(self, group: FiniteGroup) -> list[Block]:
+        """Return how an input row transforms."""
+        return layout_blocks(self.layout, group)
+
+    def outputs(self, group: FiniteGroup) -> list[Block]:
+        """Return how an output row transforms."""
+        if self.num_values is not None:
+            return [trivial(group, self.num_values)]
+        return action_blocks(self.spec.action, group)

@@ -1,0 +1,326 @@
+"""Networks that commute with a group: in every layer, with any weights, after training; and plain ones do not."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.constrained import ConstrainedLinear, copies_for
+from esp_cli.networks.layers import SeedMLP, orthogonal
+from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
+from esp_cli.networks.ports import Ports
+from esp_cli.networks.symmetrised import Symmetrised
+from esp_cli.symmetry import (
+    cyclic,
+    dihedral,
+    network_equivariance_error,
+    parse_group,
+    transform_set,
+)
+from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
+from esp_cli.training.config import resolve_config
+from esp_cli.training.trainer import build_learner
+from esp_envs import make
+from esp_envs.spec import TaskSpec
+
+SEEDS, WORLDS = 2, 12
+EXACT = 1e-5
+"""Of float32, relative to outputs of the size of 1."""
+
+
+def generators(*seeds: int) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in seeds]
+
+
+def scene(task: str = "wildlife", **settings) -> tuple[TaskSpec, Tensor, Tensor]:
+    env = make(task, WORLDS, range(SEEDS), settings)
+    observation = env.reset()
+    return env.spec, observation.obs, observation.state
+
+
+def stir(network: nn.Module) -> None:
+    """Give a network random weights and biases, so that nothing holds by the way it begins."""
+    g = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=g) * 0.3)
+
+
+def turned(block: Block, g: int, x: Tensor) -> Tensor:
+    """Apply an element to features [..., copies * d]."""
+    matrix = torch.as_tensor(block.matrices[g], dtype=x.dtype)
+    return (x.unflatten(-1, (block.copies, -1)) @ matrix.T).flatten(-2)
+
+
+def message_passing(spec: TaskSpec, name: str, group: str = "c4") -> MessagePassing:
+    config = NetworkConfig(name=name, hidden=(16, 16), activation="relu", group=group)
+    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+    assert isinstance(network, MessagePassing)
+    stir(network)
+    return network
+
+
+@pytest.mark.parametrize("group", ["c4", "d4", "c2"])
+def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_world(group) -> None:
+    spec, obs, _ = scene()
+    network = message_passing(spec, "empn", group)
+    elements = parse_group(group, 3).elements
+    rows = obs.flatten(1, 2)
+    pictures = rows[..., network.picture]
+    here = network.features(rows)
+    responses = network.encoder.responses(network.encoder.as_pictures(pictures))
+    blocks = [network.encoder.output, *(layer.outputs[0] for layer in network.layers)]
+    convolved = [layer.outputs[0] for layer in network.encoder.layers]
+    for transform in transform_set(group, spec).each():
+        (element,) = transform.elements
+        g = elements.index(element)
+        there = network.features(transform.obs(obs).flatten(1, 2))
+        for block, before, after in zip(blocks, here, there, strict=True):
+            torch.testing.assert_close(after, turned(block, g, before), atol=EXACT, rtol=EXACT)
+        moved = network.encoder.as_pictures(transform.obs(obs).flatten(1, 2)[..., network.picture])
+        for block, before, after in zip(convolved, responses, network.encoder.responses(moved), strict=True):
+            # a response's place turns as a pixel does, its channels as regular features
+            channels = turned(block, g, before)
+            picture = channels.flip(2) if element.mirrored else channels
+            expected = picture.rot90(int(element.turn * 4), (2, 3))
+            torch.testing.assert_close(after, expected, atol=EXACT, rtol=EXACT)
+
+
+@torch.no_grad()
+def errors(spec: TaskSpec, config: NetworkConfig, obs: Tensor, state: Tensor, group: str, reads="own") -> float:
+    """The largest equivariance error of a policy and a critic with random weights, over a group."""
+    width = Ports(spec, reads).layout.width
+    outputs = Ports(spec, "own").outputs(cyclic(1))[0].width if hasattr(spec.action, "count") else spec.action.width
+    actor = build_network(generators(0, 1), spec.observation.width, outputs, config, 1.0, Ports(spec, "own"))
+    critic = build_network(generators(0, 1), width, 1, config, 1.0, Ports(spec, reads, 1))
+    stir(actor), stir(critic)
+
+    def policy(x: Tensor) -> Tensor:
+        return actor.unroll(x.unsqueeze(2).transpose(2, 3).flatten(1, 2)).unflatten(1, x.shape[1:3]).squeeze(-2)
+
+    def value(x: Tensor) -> Tensor:
+        rows = {"own": x.flatten(1, 2) if x.dim() == 4 else x, "observations": x.flatten(2), "state": x}[reads]
+        return critic.unroll(rows.unsqueeze(2)).flatten(1, 2)
+
+    worst = 0.0
+    for transform in transform_set(group, spec).each():
+        moved = transform.state(state) if reads == "state" else transform.obs(obs)
+        here = value(state if reads == "state" else obs)
+        worst = max(
+            worst,
+            network_equivariance_error(policy, None, obs, state, transform)["policy"],
+            float((value(moved) - here).abs().max() / here.abs().max().clamp_min(1.0)),
+        )
+    return worst
+
+
+@pytest.mark.parametrize("group", ["c4", "d4"])
+def test_the_equivariant_message_passing_network_is_exact_and_the_standard_one_is_not(group) -> None:
+    spec, obs, state = scene(num_agents=4, convention="corrected")
+    equivariant = NetworkConfig(name="empn", hidden=(16, 16), activation="relu", group=group)
+    assert errors(spec, equivariant, obs, state, group) < EXACT
+    standard = NetworkConfig(name="mpn", hidden=(16, 16), activation="relu")
+    assert errors(spec, standard, obs, state, group) > 1e-2
+    ensemble = standard.model_copy(update={"symmetrise": group})
+    assert errors(spec, ensemble, obs, state, group) < EXACT
+
+
+def test_c4_is_not_enough_for_mirrors() -> None:
+    spec, obs, state = scene()
+    assert errors(spec, NetworkConfig(name="empn", hidden=(16,), group="c4"), obs, state, "d4") > 1e-2
+
+
+@pytest.mark.parametrize("reads", ["own", "observations", "state"])
+@pytest.mark.parametrize(
+    ("task", "settings", "group"),
+    [
+        ("navigation", {}, "d4"),
+        ("navigation", {"actions": "continuous"}, "c8"),
+        ("predator-prey", {"num_predators": 2}, "c4"),
+        ("formation", {"num_agents": 3}, "d4"),
+    ],
+    ids=str,
+)
+def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(task, settings, group, reads) -> None:
+    spec, obs, state = scene(task, **settings)
+    exact = NetworkConfig(name="equivariant", hidden=(16, 16), group=group)
+    assert errors(spec, exact, obs, state, group, reads) < EXACT
+    plain = NetworkConfig(name="mlp", hidden=(16, 16))
+    assert errors(spec, plain, obs, state, group, reads) > 1e-2
+    assert errors(spec, plain.model_copy(update={"symmetrise": group}), obs, state, group, reads) < EXACT
+
+
+@pytest.mark.parametrize(
+    ("task", "network"),
+    [("wildlife", {"name": "empn"}), ("navigation", {"name": "equivariant"}), ("navigation", {"symmetrise": "c4"})],
+    ids=str,
+)
+def test_equivariance_survives_training(task, network) -> None:
+    overrides = {"mappo.num_envs": 4, "mappo.num_steps": 5, "mappo.num_epochs": 2, "prior.kind": "none"}
+    overrides |= {"mappo.learning_rate": 0.01, "network.hidden": [16]}
+    overrides |= {f"network.{name}": value for name, value in network.items()}
+    learner = build_learner(resolve_config(task, seeds=(0, 1), overrides=overrides))
+    before = [parameter.clone() for parameter in learner.policy.parameters()]
+    for _ in range(2):
+        metrics = learner.iterate(0.0)
+    assert not any(torch.equal(a, b) for a, b in zip(before, learner.policy.parameters(), strict=True))
+    spec, obs, _ = scene(task)
+    memory = learner.policy.initial_memory(WORLDS, obs)
+    for transform in transform_set("c4", spec).each():
+        here = learner.policy.step(obs, memory)[0]
+        there = learner.policy.step(transform.obs(obs), memory)[0]
+        torch.testing.assert_close(transform.pull_back(there), here, atol=EXACT, rtol=EXACT)
+    assert metrics["train/value_symmetry_error"].isfinite().all()
+
+
+def test_a_recurrent_ensemble_keeps_the_memories_of_its_images_apart() -> None:
+    spec, obs, _ = scene("navigation")
+    config = NetworkConfig(name="gru", hidden=(8,), symmetrise="c4")
+    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+    assert isinstance(network, Symmetrised)
+    assert network.memory_width == 4 * 8
+    rows = torch.stack([obs.flatten(1, 2), 0.5 * obs.flatten(1, 2), -obs.flatten(1, 2)], 2)
+    memory, steps = network.initial_memory(SEEDS, rows.shape[1], rows), []
+    for t in range(3):
+        y, memory = network.step(rows[:, :, t], memory)
+        steps.append(y)
+    torch.testing.assert_close(network.unroll(rows), torch.stack(steps, 2))
+    (transform,) = transform_set("rot90", spec).each()
+    moved = transform.obs(rows.unflatten(1, (WORLDS, 3)).transpose(2, 3)).transpose(2, 3).flatten(1, 2)
+    back = transform.pull_back(network.unroll(moved))
+    torch.testing.assert_close(back, network.unroll(rows), atol=EXACT, rtol=EXACT)
+
+
+def test_the_group_of_one_element_gives_plain_layers() -> None:
+    one = cyclic(1)
+    layer = ConstrainedLinear(generators(3), [trivial(one, 4), regular(one, 3)], [regular(one, 5)], 1.5)
+    torch.testing.assert_close(layer.weight(), orthogonal(generators(3), 7, 5, 1.5))
+    spec, obs, _ = scene("navigation")
+    config = NetworkConfig(name="equivariant", hidden=(8, 8), group="c1")
+    ours = build_network(generators(0, 1), 14, 5, config, 0.1, Ports(spec, "own"))
+    theirs = SeedMLP(generators(0, 1), (14, 8, 8, 5), "tanh", 0.1)
+    torch.testing.assert_close(ours.unroll(obs), theirs(obs.flatten(1, 2)).unflatten(1, obs.shape[1:3]))
+
+
+@pytest.mark.parametrize("group", [cyclic(4), dihedral(4), cyclic(8)], ids=lambda g: g.name)
+def test_initial_weights_have_the_size_of_plain_ones(group) -> None:
+    (vectors,) = layout_blocks(make("navigation", 1, [0]).spec.state, group)[:1]
+    for source in (vectors, regular(group, 12)):
+        layer = ConstrainedLinear(generators(*range(4)), [source], [regular(group, 12)], 1.0)
+        plain = orthogonal(generators(*range(4)), source.width, 12 * group.order, 1.0)
+        assert layer.weight().square().mean().item() == pytest.approx(plain.square().mean().item(), rel=0.25)
+
+
+def test_parameter_counts_are_alike() -> None:
+    spec, _, _ = scene()
+    for name, hidden in (("empn", (64, 64)), ("mpn", (64, 64))):
+        assert copies_for(64, parse_group("c4", 3)) == 32
+        config = NetworkConfig(name=name, hidden=hidden)
+        network = build_network(generators(0), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+        count = sum(parameter.numel() for parameter in network.parameters())
+        assert count == pytest.approx(26_500, rel=0.05)
+
+
+def test_pictures_that_occur_several_times_are_encoded_once_and_nobody_notices() -> None:
+    spec, _, _ = scene()
+    g = torch.Generator().manual_seed(0)
+    sorts = torch.rand(SEEDS, 20, 441, generator=g).round()
+    pick = torch.randint(20, (SEEDS, 100), generator=g)
+    pictures = torch.stack([sorts[s][pick[s]] for s in range(SEEDS)])
+    encoder = PictureEncoder(generators(0, 1), spec.observation.fields[0], cyclic(1))
+    stir(encoder)
+    which, place = distinct(pictures, encoder.keys)
+    assert which.shape == (SEEDS, 32)
+    for s in range(SEEDS):
+        assert torch.equal(pictures[s][which[s][place[s]]], pictures[s])
+        assert len(place[s].unique()) == len(pick[s].unique())
+    ours, theirs = encoder(pictures), encoder.encode(pictures)
+    torch.testing.assert_close(ours, theirs)
+    weight = torch.randn(ours.shape, generator=g)
+    inputs = list(encoder.parameters())
+    for a, b in zip(
+        torch.autograd.grad((ours * weight).sum(), inputs),
+        torch.autograd.grad((theirs * weight).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
+    spec, obs, _ = scene()
+    encoder = PictureEncoder(generators(0, 1), spec.observation.fields[0], cyclic(4))
+    stir(encoder)
+    rows = obs[..., :441].flatten(1, 2)
+    x = rows.unflatten(-1, (1, 21, 21))
+    features = []
+    for s in range(SEEDS):
+        y = x[s]
+        for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
+            weight = layer.weight()[s].T.unflatten(1, (-1, side, side))
+            y = torch.relu(torch.nn.functional.conv2d(y, weight, layer.bias()[s, 0], stride))
+        features.append(y.amax((2, 3)))
+    theirs, ours = torch.stack(features), encoder.encode(rows)
+    torch.testing.assert_close(ours, theirs)
+    weight = torch.randn(ours.shape)
+    inputs = list(encoder.parameters())
+    for a, b in zip(
+        torch.autograd.grad((ours * weight).sum(), inputs),
+        torch.autograd.grad((theirs * weight).sum(), inputs),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+
+
+def test_pictures_that_all_differ_are_all_encoded() -> None:
+    pictures = torch.rand(1, 50, 441)
+    which, place = distinct(pictures, torch.randn(2, 441))
+    assert torch.equal(pictures[0][which[0][place[0]]], pictures[0])
+    assert len(place.unique()) == 50
+
+
+@pytest.mark.parametrize("name", ["mpn", "empn"])
+def test_a_seed_alone_equals_itself_among_others(name) -> None:
+    spec, obs, _ = scene()
+    config = NetworkConfig(name=name, hidden=(16,))
+    both, alone = (
+        build_network(generators(*seeds), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+        for seeds in ((0, 1), (1,))
+    )
+    rows = obs.flatten(1, 2)
+    ours, theirs = both.unroll(rows.unsqueeze(2)), alone.unroll(rows[1:].unsqueeze(2))
+    assert torch.equal(ours[1:], theirs)
+    (gradient,) = torch.autograd.grad(ours[0].sum(), [next(both.parameters())])
+    assert gradient[1].abs().max() == 0
+
+
+def test_drones_out_of_reach_are_not_heard() -> None:
+    spec, obs, _ = scene(num_agents=2, width=13, height=13)
+    network = message_passing(spec, "mpn")
+    obs[:, :, :, -2:] = torch.tensor([3.0, 3.0])  # just out of reach
+    alone = network(obs.flatten(1, 2))
+    other = obs.clone()
+    other[:, :, 1, :-2] = obs[:, :, 0, :-2].flip(1)
+    assert torch.equal(network(other.flatten(1, 2))[:, ::2], alone[:, ::2])
+    for rows in (obs, other):
+        rows[:, :, :, -2:] = torch.tensor([3.0, 2.0])
+    assert not torch.equal(network(other.flatten(1, 2))[:, ::2], network(obs.flatten(1, 2))[:, ::2])
+
+
+@pytest.mark.parametrize(
+    ("task", "overrides", "message"),
+    [
+        ("navigation", {"network.name": "mpn", "mappo.critic_input": "own"}, "navigation does not show them"),
+        ("wildlife", {"mappo.critic_input": "observations"}, "set mappo.critic_input=own"),
+        ("wildlife", {"network.name": "equivariant"}, "use empn or mlp"),
+        ("wildlife", {"network.name": "gru", "mappo.num_steps": 100}, "may end early"),
+        ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "choose a finite group of the plane"),
+        ("navigation", {"network.name": "equivariant", "network.group": "c8"}, "no action"),
+        ("navigation", {"network.symmetrise": "agents"}, "choose a finite group of the plane"),
+        ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "are for mlp and gru"),
+    ],
+)
+def test_what_does_not_fit_is_refused(task, overrides, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        build_learner(resolve_config(task, overrides={"mappo.num_envs": 2} | overrides))

@@ -1,0 +1,146 @@
+"""Pictures turn by moving pixels, and Eq. 5 and 6 hold exactly in wildlife monitoring."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from esp_cli.symmetry import (
+    Transform,
+    build_transform,
+    carried_groups,
+    environment_errors,
+    mirror,
+    parse_elements,
+    rotation,
+    transform_set,
+)
+from esp_cli.symmetry.representation import picture_sources, rows_matrix, rows_permutation
+from esp_envs import Environment, Field, Items, Kind, layout, make
+
+STEPS = 6
+
+
+def turn_picture(picture: Tensor, element) -> Tensor:
+    sources = picture_sources(tuple(picture.shape), element.matrix[None])[0]
+    return picture.flatten()[torch.as_tensor(sources)].view(picture.shape)
+
+
+def test_a_picture_turns_counter_clockwise() -> None:
+    picture = torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    assert turn_picture(picture, rotation(90)).tolist() == [[2, 4], [1, 3]]
+    assert turn_picture(picture, mirror(0)).tolist() == [[3, 4], [1, 2]]  # in the x-axis: top and bottom swap
+    odd = torch.arange(15.0).view(3, 5)
+    assert torch.equal(turn_picture(odd, rotation(180)), odd.flip((0, 1)))
+    assert torch.equal(turn_picture(torch.arange(9.0).view(3, 3), rotation(90)), torch.arange(9.0).view(3, 3).rot90())
+
+
+def test_pixels_that_find_no_place_are_refused() -> None:
+    for pixels, element in (((3, 3), rotation(45)), ((3, 5), rotation(90))):
+        with pytest.raises(ValueError, match="do not come to lie on pixels"):
+            picture_sources(pixels, element.matrix[None])
+
+
+def test_only_pictures_have_pixels() -> None:
+    for kind, pixels in ((Kind.PICTURE, None), (Kind.VECTOR, (2, 2))):
+        with pytest.raises(ValueError, match="a picture, and nothing else"):
+            Field("field", kind, pixels=pixels)
+
+
+def test_the_permutation_is_the_matrix() -> None:
+    row = layout(
+        Field("speed", Kind.SCALAR),
+        Field("picture", Kind.PICTURE, 2, pixels=(3, 3)),
+        Field("others", Kind.VECTOR, 2, items=Items.OTHERS),
+        Field("spin", Kind.PSEUDOSCALAR),
+        Field("wheels", Kind.WHEELS),
+    )
+    elements = parse_elements("d4*agents", 3)
+    planar = np.stack([e.matrix for e in elements])
+    places = np.array([e.permutation or (0, 1, 2) for e in elements])
+    for where in (None, places):
+        source, sign = rows_permutation(row, planar, where)
+        dense = rows_matrix(row, planar, where)
+        group, width = source.shape
+        rebuilt = np.zeros((group, width, width))
+        np.put_along_axis(rebuilt, source[..., None], sign[..., None], axis=2)
+        np.testing.assert_array_equal(rebuilt, dense)
+
+
+def worlds(elements: str, seeds: int | None = None, **settings) -> tuple[Environment, Transform]:
+    probe = make("wildlife", 1, [0], settings)
+    listed = parse_elements(elements, probe.spec.num_agents)
+    env = make("wildlife", 30, range(seeds or len(listed)), settings)
+    env.reset()
+    return env, build_transform(listed, env.spec)
+
+
+def errors(env: Environment, transform: Transform, turn_chance: bool = True) -> dict[str, float]:
+    plan = env.plan.clone()
+    state = torch.stack([env.plan[k % len(env.plan), 0, :, 1:] for k in range(env.num_seeds)]).flatten(-2).float()
+    state = state.clamp(-2, 2)  # crowded, so that drones meet and poachers are trapped
+
+    def restore(same: Environment, turned: Transform | None) -> None:
+        matrix = torch.eye(2).expand(same.num_seeds, 2, 2)
+        order = list(range(same.settings.num_agents))
+        same.plan.copy_(plan)
+        if turned is not None and turn_chance:
+            matrix = torch.as_tensor(np.stack([e.matrix for e in turned.elements]), dtype=torch.float32)
+            same.plan.copy_(torch.einsum("sij,tsenj->tseni", matrix.expand(same.num_seeds, 2, 2), plan.float()))
+            for s, element in enumerate(turned.elements):
+                for i, place in enumerate(element.permutation or order):
+                    moved = (plan[:, s, :, 1 + i].float() @ matrix[s].T).to(plan.dtype)
+                    same.plan[:, s, :, 1 + place] = moved
+
+    return environment_errors(env, transform, state, [env.random_action() for _ in range(STEPS)], restore)
+
+
+SIZES = [("d4", {}), ("d4*agents", {"width": 5, "height": 5}), ("d2", {"width": 5, "height": 7})]
+
+
+@pytest.mark.parametrize("convention", ["esp", "corrected"])
+@pytest.mark.parametrize(("group", "size"), SIZES, ids=str)
+def test_every_declared_transform_leaves_reward_and_transition_alone(group, size, convention) -> None:
+    env, transform = worlds(group, convention=convention, **size)
+    assert carried_groups(env.spec)[-2] == group.split("*")[0]
+    measured = errors(env, transform)
+    assert measured == dict.fromkeys(("observation", "reward", "next_obs", "next_state", "end"), 0.0)
+
+
+def test_the_check_sees_poachers_trapped() -> None:
+    env, _ = worlds("d4")
+    ends = sum(int(env.step(env.heuristic()).terminated.sum()) for _ in range(STEPS))
+    assert ends > 20
+
+
+def test_a_wrong_action_table_is_noticed() -> None:
+    env, right = worlds("rot90")
+    wrong = replace(right, action_index=build_transform([mirror(0)], env.spec).action_index)
+    measured = errors(env, wrong)
+    assert measured["observation"] == 0
+    assert min(measured["next_state"], measured["next_obs"]) >= 1
+    assert measured["end"] == 1 or measured["reward"] > 0.1
+
+
+def test_pictures_that_do_not_turn_along_are_noticed() -> None:
+    env, right = worlds("rot90")
+    assert right.obs_source is not None
+    still = right.obs_source.clone()
+    pixels = env.spec.observation.slices()["picture"]
+    still[:, pixels] = torch.arange(pixels.start, pixels.stop)
+    assert errors(env, replace(right, obs_source=still))["observation"] == 1
+
+
+def test_a_poacher_whose_moves_are_not_turned_along_is_noticed() -> None:
+    env, transform = worlds("d4")
+    assert errors(env, transform, turn_chance=False)["next_state"] >= 1
+
+
+def test_quarter_turns_of_a_grid_that_is_no_square_are_refused() -> None:
+    spec = make("wildlife", 1, [0], {"width": 5, "height": 7}).spec
+    with pytest.raises(ValueError, match="rot90 is no symmetry of its dynamics and reward, which carry d2"):
+        transform_set("rot90", spec)
