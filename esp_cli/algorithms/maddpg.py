@@ -31,10 +31,7 @@ class MaddpgConfig(OffPolicyConfig):
 
     learning_rate: float = Field(1e-3, gt=0, description="of the critic; paper: 7e-4")
     actor_learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
-    td_lambda: float = Field(0.0, ge=0, le=1, description="0: one-step targets; above: TD(lambda) along the episode")
-    critic_input: Literal["state", "observations"] = Field(
-        "observations", description="what the critic sees beside the joint action"
-    )
+    td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")
     actor_actions: Literal["own", "all"] = Field(
@@ -49,6 +46,8 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
         "maddpg": {
             "num_envs": 1,
             "rounds": 20,
+            "replay_episodes": 5000,
+            "td_lambda": 0.0,
             "learning_rate": 7e-4,
             "actor_learning_rate": 7e-4,
             "anneal_learning_rate": False,

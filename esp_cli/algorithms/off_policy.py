@@ -29,7 +29,7 @@ class OffPolicyConfig(LearnerConfig):
     rounds: int = Field(1, ge=1, description="rounds of collecting and learning between two lines of metrics")
     updates_per_episode: int = Field(1, ge=1, description="gradient steps per collected episode")
     batch_episodes: int = Field(32, ge=1, description="episodes per seed of a gradient step")
-    replay_episodes: int = Field(5000, ge=1, description="episodes that each seed remembers")
+    replay_episodes: int = Field(1000, ge=1, description="episodes that each seed remembers; paper: 5000")
     warmup_episodes: int = Field(5, ge=0, description="episodes of random actions before learning begins")
     epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
     epsilon_finish: float = Field(0.05, ge=0, le=1)
@@ -43,7 +43,9 @@ class OffPolicyConfig(LearnerConfig):
     huber_delta: float = Field(10.0, gt=0)
     bootstrap_truncated: bool = Field(False, description="value the final state where the horizon cuts an episode")
     reward_decay: float = Field(0.999, gt=0, lt=1, description="of the reward statistics, per episode")
-    critic_input: Literal["state", "observations"]
+    critic_input: Literal["state", "observations"] = Field(
+        "observations", description="what the critic (the mixer) sees: the global state, or all observations in a row"
+    )
     critic_sees_time: bool = Field(True, description="the critic (the mixer) also sees the share of the horizon gone")
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from pydantic import Field
@@ -33,10 +32,7 @@ class QmixConfig(OffPolicyConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
     learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
-    critic_input: Literal["state", "observations"] = Field(
-        "state", description="what the mixer sees: the task's global state, or all agents' observations in a row"
-    )
-    td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
+    td_lambda: float = Field(0.9, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     mixer_width: int = Field(32, ge=1, le=1024, description="hidden units of the mixer")
     hyper_width: int = Field(64, ge=1, le=1024, description="hidden units of the hypernetwork")
     double_q: bool = Field(True, description="the online network chooses the next action, the target network values it")
@@ -49,6 +45,8 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
         "qmix": {
             "num_envs": 1,
             "rounds": 20,
+            "replay_episodes": 5000,
+            "critic_input": "state",
             "learning_rate": 7e-4,
             "anneal_learning_rate": False,
             "td_lambda": 0.0,

@@ -22,7 +22,7 @@ def linear_critic(trained, weights):
 
 def test_targets_by_hand_on_the_last_two_transitions():
     """The target policy's greedy actions, valued by the target critic; nothing beyond a terminal horizon."""
-    trained, episodes = prepared(task__num_agents=2, prior__kind="none")
+    trained, episodes = prepared(task__num_agents=2, prior__kind="none", algo__td_lambda=0.0)
     trained.reward_scale.normalise = lambda x: 5.0 * x  # undoes the division by the root of 25 steps
     linear_critic(trained, torch.arange(10.0))
     outputs = torch.zeros(2, 2, 26, 2, 5)
