@@ -221,7 +221,5 @@ def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_valu
     marred = copy.deepcopy(rollout)
     for t, final in marred.finals.items():
         final.obs[rollout.terminated[:, :, t]] = 7.0
-    again, _ = learner("wildlife", mappo__num_envs=12, mappo__num_steps=8, prior__kind="none", **settings)._prepare(
-        marred
-    )
+    again, _ = learner("wildlife", **settings)._prepare(marred)
     torch.testing.assert_close(again.advantage, batch.advantage)
