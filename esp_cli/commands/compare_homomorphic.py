@@ -16,7 +16,7 @@ EPILOG = """Examples:\n
     esp compare-homomorphic --contestants mpn,empn --steps 100k --seeds 3 --out runs/quick\n
     esp compare-homomorphic --grid 9 --drones 4 --group d4"""
 
-DEFAULT_STEPS = 300_000
+DEFAULT_STEPS = 200_000
 DEFAULT_SEEDS = tuple(range(10))
 
 
