@@ -63,6 +63,10 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     if config.algorithm not in ALGORITHMS:
         raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    try:
+        resolve_task_settings(config.task, config.task_settings)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
     return config
 
 
@@ -145,14 +149,9 @@ def _build(
     if type(step) is not int or step < 0:
         raise ValueError(f"{path} is damaged: it does not say after how many steps it was written")
     misfit = f"{path}: the weights do not fit the configuration beside them"
-    # Before worlds are made for every seed, and networks of that size: a damaged configuration may ask for more of
-    # either than the machine has.
+    # Before worlds are made for every seed: a damaged configuration may ask for more of them than the machine has.
     if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
         raise ValueError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
-    try:
-        resolve_task_settings(config.task, config.task_settings)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
     spec = build_environment(config, 1, "shape").spec
     version = meta.get("task_version", spec.version)
     if version != spec.version:
