@@ -96,7 +96,7 @@ def compare(curves: Sequence[RunCurve], at: Sequence[int], thresholds: Sequence[
         "task": spec.name,
         "task_version": spec.version,
         "convention": spec.convention,
-        "episodes_per_evaluation": curves[0].config.evaluation.episodes,
+        "episodes_per_evaluation": min(curve.config.evaluation.episodes for curve in curves),
         "runs": [_entry(curve, curves[0], at, thresholds) for curve in curves],
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,13 @@ def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there(
         [-5.0],
     ]
     assert one.at(1701) is None, "more than an evaluation interval past the end"
+
+
+def test_the_fewest_episodes_of_all_runs_are_stated():
+    few, many = curve(PLAIN, "plain"), curve(ESP, "ESP")
+    evaluation = many.config.evaluation.model_copy(update={"episodes": 40})
+    many = replace(many, config=many.config.model_copy(update={"evaluation": evaluation}))
+    assert compare([many, few], [], [])["episodes_per_evaluation"] == 2
 
 
 def test_returns_differences_thresholds_and_areas_by_hand():
