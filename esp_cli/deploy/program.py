@@ -34,8 +34,8 @@ SQUASH_EPSILON = 1e-18
 
 
 @dataclass(frozen=True)
-class Affine:
-    """x W + b with W [in, out] and b [out]."""
+class Learned:
+    """What a layer with a weight and a bias holds."""
 
     weight: Floats
     bias: Floats
@@ -44,6 +44,10 @@ class Affine:
     def arrays(self) -> tuple[Floats, ...]:
         """What it learned, in the order in which exports store it."""
         return self.weight, self.bias
+
+
+class Affine(Learned):
+    """x W + b with W [in, out] and b [out]."""
 
     @property
     def flops(self) -> int:
@@ -51,17 +55,8 @@ class Affine:
         return 2 * self.weight.size
 
 
-@dataclass(frozen=True)
-class Norm:
+class Norm(Learned):
     """(x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
-
-    weight: Floats
-    bias: Floats
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """What it learned, in the order in which exports store it."""
-        return self.weight, self.bias
 
     @property
     def flops(self) -> int:

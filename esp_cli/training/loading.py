@@ -159,6 +159,7 @@ def _build(
             f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
             "which a policy sees, does or earns something else; use the esp that it was trained with, or train anew"
         )
+    # ... and before networks are made: it may ask for larger ones than fit.
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")

@@ -169,7 +169,8 @@ def test_other_tasks_settings_or_conventions_do_not_compare(choice):
 
 
 def test_other_learners_do_compare():
-    compare([curve(PLAIN), curve(ESP, prior__kind="none", network__name="gru", mappo__num_envs=3)], [], [])
+    result = compare([curve(PLAIN), curve(ESP, prior__kind="none", network__name="gru", mappo__num_envs=3)], [], [])
+    assert [run["config"]["network"]["name"] for run in result["runs"]] == ["mlp", "gru"]
 
 
 def test_a_run_of_a_gpu_is_compared_where_there_is_none():
