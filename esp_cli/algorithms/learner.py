@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -52,6 +53,7 @@ class Learner(ABC):
 
     Attributes:
         config_class: model of its hyperparameters.
+        task_settings: what it asks of a task that has such settings, where a user says nothing else.
         policy: what acts, and what evaluation, rendering and export take.
         modules: every network and statistic with a seed axis, by name.
         optimisers: by name.
@@ -60,6 +62,7 @@ class Learner(ABC):
     """
 
     config_class: ClassVar[type[LearnerConfig]]
+    task_settings: ClassVar[Mapping[str, object]] = MappingProxyType({})
     policy: Policy
     modules: dict[str, nn.Module]
     optimisers: dict[str, torch.optim.Optimizer]

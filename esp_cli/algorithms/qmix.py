@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import torch
 from pydantic import Field
@@ -70,6 +71,7 @@ class Qmix(OffPolicyLearner):
     """
 
     config_class = QmixConfig
+    task_settings = MappingProxyType({"actions": "discrete"})
 
     def __init__(
         self,

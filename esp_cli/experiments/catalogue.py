@@ -223,8 +223,6 @@ def _config(
 ) -> RunConfig:
     """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
     settings = dict(common or {})
-    if algorithm == "qmix" and "actions" in resolve_task_settings(task, {}):
-        settings["task.actions"] = "discrete"  # values are of single actions
     for name, value in request.overrides.items():
         section, _, rest = name.partition(".")
         if section == task:

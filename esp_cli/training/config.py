@@ -72,6 +72,8 @@ def resolve_config(
         raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(PRESETS[algorithm])}")
     names = {"task": "task", algorithm: algorithm, "network": "network", "prior": "prior", "evaluation": "evaluation"}
     sections: dict[str, dict[str, object]] = {name: {} for name in names}
+    asked = ALGORITHMS[algorithm].task_settings
+    sections["task"] = {name: asked[name] for name in asked if name in task_class(task).Settings.model_fields}
     tuned = TUNED.get(algorithm, {}).get(task, {}) if preset == "default" else {}
     for layer in (PRESETS[algorithm][preset], tuned):
         for section, values in layer.items():

@@ -36,6 +36,7 @@ def options(algorithm: str) -> list[str]:
         ("maddpg", ["--task", "predator-prey", "--set", "prior.replay=stored"]),
         ("qmix", []),
         ("qmix", ["--network", "gru", "--task", "predator-prey"]),
+        ("qmix", ["--task", "formation", "--set", "task.horizon=5"]),
         ("qmix", ["--preset", "paper"]),
     ],
 )

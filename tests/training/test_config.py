@@ -60,6 +60,22 @@ def test_overrides_may_be_text_as_on_the_command_line():
 
 
 @pytest.mark.parametrize(
+    ("task", "algorithm", "overrides", "actions"),
+    [
+        ("formation", "qmix", {}, "discrete"),
+        ("formation", "maddpg", {}, "continuous"),
+        ("navigation", "qmix", {}, "discrete"),
+        ("navigation", "qmix", {"task.actions": "continuous"}, "continuous"),
+        ("wildlife", "qmix", {}, None),
+    ],
+)
+def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_is_silent(
+    task, algorithm, overrides, actions
+):
+    assert resolve_config(task, algorithm, overrides=overrides).task_settings.get("actions") == actions
+
+
+@pytest.mark.parametrize(
     ("choice", "sentence"),
     [
         ({"task": "chess"}, "unknown task 'chess'; the tasks are navigation, predator-prey"),
