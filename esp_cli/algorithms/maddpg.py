@@ -17,7 +17,8 @@ from torch import Tensor
 from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.bodies import MLP, NetworkConfig
+from esp_cli.networks.exchange import with_one_exchanged
 from esp_cli.networks.exploration import ActorHead, build_actor_head
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import PriorConfig, policy_consistency_loss
@@ -83,9 +84,9 @@ class Maddpg(OffPolicyLearner):
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
         self.num_values = 1 if spec.shared_reward else spec.num_agents
         plain = {"name": "mlp", "activation": config.critic_activation, "symmetrise": None}
-        perceptron = network.model_copy(update=plain)
+        shape = network.model_copy(update=plain)
         width = self.critic_width + spec.num_agents * self.head.action_width
-        self.critic = build_network(generators, width, self.num_values, perceptron, 1.0).to(self.device)
+        self.critic = MLP(generators, width, self.num_values, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_parameters, self.critic_parameters = list(self.policy.parameters()), list(self.critic.parameters())
@@ -97,7 +98,6 @@ class Maddpg(OffPolicyLearner):
             "target_critic": self.target_critic,
         }
         self.optimisers = {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
-        self._own = torch.eye(spec.num_agents, dtype=torch.bool, device=self.device).unsqueeze(-1)
 
     @classmethod
     def build_policy(
@@ -188,10 +188,8 @@ class Maddpg(OffPolicyLearner):
         """
         if self.config.actor_actions == "all":
             return self._value(seen, own)
-        agents = self.spec.num_agents
-        joint = torch.where(self._own, own.unsqueeze(3), self.head.encode(stored).unsqueeze(3))
-        views = torch.cat([seen.unsqueeze(3).expand(*seen.shape[:3], agents, -1), joint.flatten(-2)], -1)
-        values = self.critic.unroll(views.flatten(2, 3)).unflatten(2, (-1, agents))
+        rows = (seen, self.head.encode(stored), own)
+        values = with_one_exchanged(self.critic, *(x.flatten(1, 2) for x in rows)).unflatten(1, seen.shape[1:3])
         return values.squeeze(-1) if self.num_values == 1 else values.diagonal(dim1=-2, dim2=-1)
 
     @torch.no_grad()

@@ -115,7 +115,7 @@ class ExploringCategorical(ExploringHead, Categorical):
             noise: uniform in [0, 1), of the same shape.
         """
         gumbel = -(-(noise.clamp(1e-7, 1 - 1e-7)).log()).log()
-        soft = torch.softmax(log_probs + gumbel, -1)
+        soft = self.normalise(log_probs + gumbel).exp()
         hard = one_hot(best(soft), self.num_outputs).to(soft.dtype)
         return hard + (soft - soft.detach())
 

@@ -98,9 +98,20 @@ class SeedMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, B, in] to [S, B, out]."""
-        if self.norms is not None:
-            return self._forward_normed(x)
-        parameters = [p for layer in self.layers for p in (layer.weight, layer.bias)]
+        return self._from_layer(0, x) if self.norms is None else self._forward_normed(x)
+
+    def from_first_sums(self, sums: Tensor) -> Tensor:
+        """Map what the first layer gives, x W_1 + b_1 before its activation, [S, B, H], to [S, B, out].
+
+        Works in place on `sums`. Not with layer normalisation.
+        """
+        if len(self.layers) == 1 and not self.activate_output:
+            return sums.float()
+        x = torch.relu_(sums) if self.activation == "relu" else torch.tanh_(sums)
+        return x.float() if len(self.layers) == 1 else self._from_layer(1, x)
+
+    def _from_layer(self, first: int, x: Tensor) -> Tensor:
+        parameters = [p for layer in self.layers[first:] for p in (layer.weight, layer.bias)]
         return _Perceptron.apply(  # type: ignore[no-untyped-call]
             x, self.activation, self.activate_output, self.precision, *parameters
         )
@@ -125,7 +136,7 @@ class _Perceptron(Function):
 
     @staticmethod
     def forward(ctx, x, activation, activate_output, precision, *parameters):  # type: ignore[no-untyped-def]
-        x = x.to(precision)
+        ctx.dtype, x = x.dtype, x.to(precision)
         inputs, weights, last = [x], [w.to(precision) for w in parameters[::2]], len(parameters) // 2 - 1
         for k in range(last + 1):
             x = affine(parameters[2 * k + 1].to(precision), x, weights[k])
@@ -151,7 +162,7 @@ class _Perceptron(Function):
                 grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
-        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).float() if ctx.needs_input_grad[0] else None
+        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).to(ctx.dtype) if ctx.needs_input_grad[0] else None
         return grad_x, None, None, None, *grads
 
 

@@ -3,6 +3,8 @@
 import pytest
 import torch
 
+from esp_cli.networks.bodies import MLP
+from esp_cli.networks.layers import SeedMLP
 from tests.algorithms.off_policy import learner, turn
 
 
@@ -13,11 +15,20 @@ def prepared(**choice):
     return trained, episodes
 
 
-def linear_critic(trained, weights):
-    """Replace the critic by Q = weights . (joint action), blind to the rest."""
-    width = weights.numel()
-    trained.critic.unroll = lambda x: (x[..., -width:] * weights).sum(-1, keepdim=True)
-    trained.target_critic.unroll = trained.critic.unroll
+class LinearCritic(MLP):
+    """Q = weights . (joint action) + bias, blind to the rest, for two seeds."""
+
+    def __init__(self, inputs, weights, bias):
+        SeedMLP.__init__(self, [torch.Generator(), torch.Generator()], (inputs, bias.numel()), "relu", 1.0)
+        self.layers[0].weight.data.zero_()[:, -weights.numel() :] = weights.unsqueeze(1)
+        self.layers[0].bias.data[:] = bias
+
+
+def linear_critic(trained, weights, bias=None):
+    """Replace the critic and its target by a linear one."""
+    inputs = trained.critic.layers[0].weight.shape[1]
+    bias = torch.zeros(1) if bias is None else bias
+    trained.critic, trained.target_critic = (LinearCritic(inputs, weights, bias) for _ in range(2))
 
 
 def test_targets_by_hand_on_the_last_two_transitions():
@@ -33,22 +44,22 @@ def test_targets_by_hand_on_the_last_two_transitions():
     torch.testing.assert_close(y[:, :, 24], episodes.reward[:, :, 24])
 
 
-@pytest.mark.parametrize(("rule", "product"), [("own", False), ("all", True)])
-def test_whose_actions_are_the_policys(rule, product):
-    """With Q = (sum of the agents' action numbers) squared, own and all see different partners."""
+@pytest.mark.parametrize(
+    ("rule", "expected"), [("own", [3 * 0.25 - 7 * 0.25, 7 * 0.25 - 3 * 0.25]), ("all", [10 * 0.25])]
+)
+def test_whose_actions_are_the_policys(rule, expected):
+    """With Q = (1, 2, 3, 4) . (joint action), own and all see different partners."""
     trained, episodes = prepared(task__num_agents=2, task__actions="continuous", algo__actor_actions=rule)
-    trained.critic.unroll = lambda x: x[..., -4:].sum(-1, keepdim=True).square()
+    linear_critic(trained, torch.arange(1.0, 5.0))
     own = torch.full((2, 2, 25, 2, 2), 0.25)
     stored = torch.full((2, 2, 25, 2, 2), -0.25)
     value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, stored)
-    assert value.shape == (2, 2, 25, 1 if product else 2)
-    expected = 1.0 if product else 0.0  # four quarters, or two and minus two
-    torch.testing.assert_close(value, torch.full_like(value, expected))
+    torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
 
 
 def test_values_of_ones_own_are_taken_where_rewards_are_ones_own():
     trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none")
-    trained.critic.unroll = lambda x: torch.arange(3.0).expand(*x.shape[:-1], 3)
+    linear_critic(trained, torch.zeros(15), torch.arange(3.0))
     own = trained.head.encode(episodes.action)
     value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, episodes.action)
     torch.testing.assert_close(value, torch.arange(3.0).expand(2, 2, 25, 3))
