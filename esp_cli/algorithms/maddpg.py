@@ -19,7 +19,7 @@ from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, ada
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.bodies import MLP, NetworkConfig
 from esp_cli.networks.exchange import with_one_exchanged
-from esp_cli.networks.exploration import ActorHead, build_actor_head
+from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import PriorConfig, policy_consistency_loss
 from esp_cli.symmetry import Transform
@@ -36,7 +36,12 @@ class MaddpgConfig(OffPolicyConfig):
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")
     actor_actions: Literal["own", "all"] = Field(
-        "own", description="the actor's gradient: each agent's action alone is the policy's, or all agents' are"
+        "all",
+        description="the actor's gradient: all agents' actions are the policy's; paper: each agent's own alone is",
+    )
+    actor_gradient: Literal["expected", "sampled"] = Field(
+        "expected",
+        description="discrete actions: that of the expected value of all of them; paper: straight-through of a draw",
     )
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
@@ -53,6 +58,8 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
             "actor_learning_rate": 7e-4,
             "anneal_learning_rate": False,
             "critic_sees_time": False,
+            "actor_actions": "own",
+            "actor_gradient": "sampled",
             "output_penalty": 0.0,
         },
         "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
@@ -161,7 +168,7 @@ class Maddpg(OffPolicyLearner):
             learned, used = outputs, rows
             drawn = drawn.repeat(1, 1 + len(transforms), *[1] * (drawn.dim() - 2))
         self.critic.requires_grad_(False)
-        value = self._value_of_policy(seen[:, : learned.shape[1], :-1], self.head.relaxed(learned, drawn), used.action)
+        value = self._value_of_policy(seen[:, : learned.shape[1], :-1], learned, drawn, used.action)
         self.critic.requires_grad_(True)
         # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
         # that Adam's epsilon slows the actor down.
@@ -178,19 +185,39 @@ class Maddpg(OffPolicyLearner):
         """Return Q [S, B, T, C] of encoded joint actions [S, B, T, N, width]."""
         return self.critic.unroll(torch.cat([seen, action.flatten(-2)], -1))
 
-    def _value_of_policy(self, seen: Tensor, own: Tensor, stored: Tensor) -> Tensor:
+    def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, stored: Tensor) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
         Args:
             seen: [S, B, T, critic width].
-            own: [S, B, T, N, width] the policy's encoded actions.
+            outputs: [S, B, T, N, ...] of the policy.
+            noise: of the shape of `outputs`, uniform in [0, 1).
             stored: [S, B, T, N(, width)] what was done.
         """
+        own, head = self.head.relaxed(outputs, noise), self.head
+        joint = own if self.config.actor_actions == "all" else head.encode(stored)
+        if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):
+            others = head.choices.expand(*own.shape, -1)
+            values = self._exchanged(seen, joint.detach(), others)
+            return (outputs.exp() * values).sum(-1)
         if self.config.actor_actions == "all":
             return self._value(seen, own)
-        rows = (seen, self.head.encode(stored), own)
-        values = with_one_exchanged(self.critic, *(x.flatten(1, 2) for x in rows)).unflatten(1, seen.shape[1:3])
-        return values.squeeze(-1) if self.num_values == 1 else values.diagonal(dim1=-2, dim2=-1)
+        return self._exchanged(seen, joint, own.unsqueeze(-2)).squeeze(-1)
+
+    def _exchanged(self, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+        """Return each agent's Q if it alone did otherwise.
+
+        Args:
+            seen: [S, B, T, critic width].
+            joint: [S, B, T, N, width] encoded actions.
+            others: [S, B, T, N, K, width] what each might do instead.
+
+        Returns:
+            [S, B, T, N, K].
+        """
+        rows = (x.flatten(1, 2) for x in (seen, joint, others))
+        values = with_one_exchanged(self.critic, *rows).unflatten(1, seen.shape[1:3])
+        return values.squeeze(-1) if self.num_values == 1 else values.diagonal(dim1=3, dim2=5).movedim(-1, 3)
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:

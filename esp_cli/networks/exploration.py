@@ -104,6 +104,11 @@ class ExploringCategorical(ExploringHead, Categorical):
         """Return one-hot rows."""
         return one_hot(action, self.num_outputs).float()
 
+    @property
+    def choices(self) -> Tensor:
+        """All actions, encoded: [A, A]."""
+        return torch.eye(self.num_outputs, device=self.epsilon.device)
+
     def relaxed(self, log_probs: Tensor, noise: Tensor) -> Tensor:
         """Draw one-hot actions [..., A] through which gradients flow (straight-through Gumbel-softmax).
 

@@ -53,20 +53,50 @@ def test_whose_actions_are_the_policys(rule, expected):
     linear_critic(trained, torch.arange(1.0, 5.0))
     own = torch.full((2, 2, 25, 2, 2), 0.25)
     stored = torch.full((2, 2, 25, 2, 2), -0.25)
-    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, stored)
+    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, own, stored)
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
 
 
-def test_values_of_ones_own_are_taken_where_rewards_are_ones_own():
-    trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none")
+@pytest.mark.parametrize("rule", ["expected", "sampled"])
+def test_values_of_ones_own_are_taken_where_rewards_are_ones_own(rule):
+    trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none", algo__actor_gradient=rule)
     linear_critic(trained, torch.zeros(15), torch.arange(3.0))
-    own = trained.head.encode(episodes.action)
-    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, episodes.action)
+    outputs = torch.full((2, 2, 25, 3, 5), 0.2).log()
+    noise = torch.rand(outputs.shape)
+    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], outputs, noise, episodes.action)
     torch.testing.assert_close(value, torch.arange(3.0).expand(2, 2, 25, 3))
 
 
-def test_the_actor_climbs_the_critic_and_leaves_it_alone():
-    trained, episodes = prepared(prior__kind="none", algo__output_penalty=0.0)
+def test_the_expected_value_by_hand():
+    """Q = k for agent 1's action k, 10 k for agent 2's; agent 1 is half 2, half 4, agent 2 always 1; both did 3."""
+    trained, episodes = prepared(
+        task__num_agents=2, prior__kind="none", algo__actor_gradient="expected", algo__actor_actions="own"
+    )
+    linear_critic(trained, torch.cat([torch.arange(5.0), 10 * torch.arange(5.0)]))
+    probabilities = torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0, 0.0]])
+    outputs = probabilities.clamp_min(1e-30).log().expand(2, 2, 25, 2, 5).clone().requires_grad_()
+    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
+    value = trained._value_of_policy(seen, outputs, noise, torch.full((2, 2, 25, 2), 3))
+    torch.testing.assert_close(value, torch.tensor([30.0 + 3.0, 3.0 + 10.0]).expand(2, 2, 25, 2))
+    (gradient,) = torch.autograd.grad(value.sum(), outputs)  # of exp(log p) Q: p Q
+    torch.testing.assert_close(gradient[0, 0, 0, 0], torch.tensor([0.0, 0.0, 0.5 * 32.0, 0.0, 0.5 * 34.0]))
+
+
+def test_with_all_actions_the_policys_the_partners_are_drawn_from_it():
+    trained, episodes = prepared(
+        task__num_agents=2, prior__kind="none", algo__actor_gradient="expected", algo__actor_actions="all"
+    )
+    linear_critic(trained, torch.cat([torch.zeros(5), torch.arange(5.0)]))  # Q is agent 2's action
+    outputs = torch.full((2, 2, 25, 2, 5), 1e-30)
+    outputs[..., 1] = 1.0  # both always choose 1
+    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
+    value = trained._value_of_policy(seen, outputs.log(), noise, torch.full((2, 2, 25, 2), 3))
+    torch.testing.assert_close(value, torch.ones(2, 2, 25, 2))
+
+
+@pytest.mark.parametrize("rule", ["expected", "sampled"])
+def test_the_actor_climbs_the_critic_and_leaves_it_alone(rule):
+    trained, episodes = prepared(prior__kind="none", algo__output_penalty=0.0, algo__actor_gradient=rule)
     linear_critic(trained, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0] * 3))  # every agent should move right
     before = [p.clone() for p in trained.critic.parameters()]
     seen = trained._critic_rows(episodes)

@@ -11,20 +11,22 @@ def perceptron(sizes, **choice):
     return SeedMLP([torch.Generator().manual_seed(seed) for seed in (0, 1)], sizes, "relu", 1.0, **choice)
 
 
-def drawn(num_items=3, width=4, rows=11):
+def drawn(num_items=3, num_others=2, width=4, rows=11):
     generator = torch.Generator().manual_seed(5)
-    shapes = ((2, rows, 6), (2, rows, num_items, width), (2, rows, num_items, width))
+    shapes = ((2, rows, 6), (2, rows, num_items, width), (2, rows, num_items, num_others, width))
     return [torch.randn(shape, generator=generator) for shape in shapes]
 
 
 def test_by_hand():
-    """Two items of one number: 1 and 2 become 10 and 20, weighed by 3 and 5, beside a row of 7 weighed by 1."""
+    """Two items of one number, 1 and 2, weighed by 3 and 5, become 10 or 30 and 20 or 40, beside 7 weighed by 1."""
     network = perceptron((3, 1))
     network.layers[0].weight.data[:] = torch.tensor([1.0, 3.0, 5.0]).view(1, 3, 1)
     rows = torch.full((2, 1, 1), 7.0)
-    items, others = torch.tensor([1.0, 2.0]).view(1, 1, 2, 1), torch.tensor([10.0, 20.0]).view(1, 1, 2, 1)
-    out = with_one_exchanged(network, rows, items.expand(2, -1, -1, -1), others.expand(2, -1, -1, -1))
-    torch.testing.assert_close(out[0, 0, :, 0], torch.tensor([7.0 + 30 + 10, 7.0 + 3 + 100]))
+    items = torch.tensor([1.0, 2.0]).view(1, 1, 2, 1).expand(2, -1, -1, -1)
+    others = torch.tensor([[10.0, 30.0], [20.0, 40.0]]).view(1, 1, 2, 2, 1).expand(2, -1, -1, -1, -1)
+    out = with_one_exchanged(network, rows, items, others)
+    expected = torch.tensor([[7.0 + 30 + 10, 7.0 + 90 + 10], [7.0 + 3 + 100, 7.0 + 3 + 200]])
+    torch.testing.assert_close(out.squeeze(-1), expected.expand(2, 1, 2, 2))
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
@@ -34,7 +36,7 @@ def test_values_and_gradients_are_those_of_every_row_asked_for_by_itself(sizes, 
     network.activation = activation
     rows, items, others = drawn()
     others.requires_grad_()
-    weight = torch.randn(2, 11, 3, sizes[-1])
+    weight = torch.randn(2, 11, 3, 2, sizes[-1])
     ours, theirs = (ask(network, rows, items, others) for ask in (with_one_exchanged, _one_by_one))
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
     (a,), (b,) = (torch.autograd.grad((values * weight).sum(), others) for values in (ours, theirs))
@@ -55,6 +57,6 @@ def test_a_normalised_input_is_built_anew_for_every_exchange():
     network = perceptron((18, 16, 1), layer_norm=True)
     rows, items, others = drawn()
     exchanged = items.clone()
-    exchanged[:, :, 1] = others[:, :, 1]
+    exchanged[:, :, 1] = others[:, :, 1, 0]
     expected = network(torch.cat([rows, exchanged.flatten(2)], -1))
-    torch.testing.assert_close(with_one_exchanged(network, rows, items, others)[:, :, 1], expected)
+    torch.testing.assert_close(with_one_exchanged(network, rows, items, others)[:, :, 1, 0], expected)
