@@ -24,6 +24,7 @@ from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringC
 from esp_cli.networks.heads import BoundedGaussian, Categorical
 from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
+from esp_cli.networks.separate import Separate
 
 Floats = NDArray[np.float32]
 
@@ -184,6 +185,8 @@ def program_of(policy: Policy) -> Program:
         ValueError: a network or head that exports do not know.
     """
     actor, head = policy.actor, policy.head
+    parts = actor.parts if isinstance(actor, Separate) else None
+    actor = actor.network if isinstance(actor, Separate) else actor
     if isinstance(actor, MLP):
         layers = _perceptron(actor)
     elif isinstance(actor, GRU):
@@ -192,6 +195,8 @@ def program_of(policy: Policy) -> Program:
         layers = [*_perceptron(actor.body), unit, *norm, _affine(actor.head)]
     else:
         raise ValueError(f"a network of the kind {type(actor).__name__} cannot be exported; mlp and gru can")
+    if parts is not None:
+        layers.append(_sums(parts))
     if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         groups: tuple[int, ...] = ()
     elif isinstance(head, BoundedGaussian | BoundedPoint):
@@ -230,6 +235,12 @@ def _perceptron(mlp: SeedMLP) -> list[Layer]:
 def _affine(linear: object) -> Affine:
     assert isinstance(linear, SeedLinear)
     return Affine(_plain(linear.weight[0]), _plain(linear.bias[0, 0]))
+
+
+def _sums(parts: Tensor) -> Affine:
+    """Return the sums of an action's parts as one more layer."""
+    matrix = _plain(parts)
+    return Affine(matrix, np.zeros(matrix.shape[1], np.float32))
 
 
 def _norm(norm: object) -> Norm:

@@ -28,6 +28,10 @@ class NetworkConfig(BaseModel):
         None, description="a group: the network's answers to all images of what it sees are averaged"
     )
 
+    separate_parts: bool = Field(
+        False, description="discrete wheel pairs: one output per speed of each wheel, a pair's being their sum"
+    )
+
     @property
     def dtype(self) -> torch.dtype:
         """The precision as torch names it."""
@@ -39,6 +43,8 @@ class NetworkConfig(BaseModel):
             raise ValueError(
                 f"layer_norm and precision are for mlp and gru, not for {self.name}; leave them as they are"
             )
+        if self.separate_parts and (self.name not in ("mlp", "gru") or self.symmetrise):
+            raise ValueError("separate_parts is for mlp and gru without symmetrise; leave it off")
         return self
 
     def least_parameters(self, inputs: int) -> int:

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.bodies import Network, NetworkConfig, build_network
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head
 from esp_cli.networks.ports import Ports
+from esp_cli.networks.separate import Separate, action_parts
 from esp_envs.spec import TaskSpec
 
 POLICY_GAIN = 0.01
@@ -45,8 +46,12 @@ class Policy(nn.Module):
         self.num_agents = spec.num_agents
         self.head = head
         inputs = spec.observation.width + num_extra
-        ports = None if num_extra else Ports(spec, "own")
-        self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, ports)
+        if network.separate_parts:
+            parts = action_parts(spec.action)
+            self.actor: Network = Separate(build_network(generators, inputs, len(parts), network, output_gain), parts)
+        else:
+            ports = None if num_extra else Ports(spec, "own")
+            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, ports)
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""

@@ -1,0 +1,61 @@
+"""Outputs for actions that have parts, as the two wheels of a robot: one output per value of each part."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from esp_cli.networks.contract import Network
+from esp_envs.spec import ActionSpace, Discrete
+
+
+def action_parts(space: ActionSpace) -> Tensor:
+    """Return which values of its parts an action has, [values of all parts, actions], ones and zeros.
+
+    Raises:
+        ValueError: the actions are not all combinations of what their parts can be.
+    """
+    if isinstance(space, Discrete):
+        columns = list(zip(*space.points, strict=True))
+        values = [sorted(set(column)) for column in columns]
+        if len(values) > 1 and math.prod(map(len, values)) == space.count:
+            has = [
+                [x == value for x in column]
+                for column, choices in zip(columns, values, strict=True)
+                for value in choices
+            ]
+            return torch.tensor(has, dtype=torch.float32)
+    raise ValueError(
+        "network.separate_parts is for discrete actions that are all combinations of what their parts can be, "
+        "as pairs of wheel speeds; leave it off"
+    )
+
+
+class Separate(Network):
+    """y_j = sum over the parts p of action j of f(x)_p: values (or logits) of the parts add up to those of the action.
+
+    Greedy parts make the greedy action, and a softmax of the sums is a product of one distribution per part. What
+    moves parts around, as a mirror that swaps the wheels, moves the sums along.
+
+    Args:
+        network: f, with one output per value of each part.
+        parts: see `action_parts`.
+    """
+
+    def __init__(self, network: Network, parts: Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.memory_width = network.memory_width
+        self.parts: Tensor
+        self.register_buffer("parts", parts, False)
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance one step."""
+        y, memory = self.network.step(x, memory)
+        return y @ self.parts, memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Run over whole episodes."""
+        return self.network.unroll(x, truncation) @ self.parts
