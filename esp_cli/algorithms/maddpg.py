@@ -30,8 +30,8 @@ from esp_envs.spec import TaskSpec
 class MaddpgConfig(OffPolicyConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
-    learning_rate: float = Field(1e-3, gt=0, description="of the critic; paper: 7e-4")
-    actor_learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
+    learning_rate: float = Field(4e-3, gt=0, description="of the critic; paper: 7e-4")
+    actor_learning_rate: float = Field(4e-3, gt=0, description="paper: 7e-4")
     td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")
@@ -39,9 +39,9 @@ class MaddpgConfig(OffPolicyConfig):
         "all",
         description="the actor's gradient: all agents' actions are the policy's; paper: each agent's own alone is",
     )
-    actor_gradient: Literal["expected", "sampled"] = Field(
-        "expected",
-        description="discrete actions: that of the expected value of all of them; paper: straight-through of a draw",
+    actor_gradient: Literal["sampled", "expected"] = Field(
+        "sampled",
+        description="discrete actions: straight-through of a draw, or that of the expected value over all of them",
     )
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
@@ -59,7 +59,6 @@ PRESETS: dict[str, dict[str, dict[str, object]]] = {
             "anneal_learning_rate": False,
             "critic_sees_time": False,
             "actor_actions": "own",
-            "actor_gradient": "sampled",
             "output_penalty": 0.0,
         },
         "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},

@@ -35,8 +35,7 @@ class OffPolicyConfig(LearnerConfig):
     epsilon_finish: float = Field(0.05, ge=0, le=1)
     epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
     learning_rate: float = Field(gt=0)
-    anneal_learning_rate: bool = Field(True, description="linearly to 0 at the run's end; paper: off")
-    anneal_from: float = Field(0.0, ge=0, lt=1, description="share of the run from which it falls")
+    anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run; paper: off")
     adam_epsilon: float = Field(1e-5, gt=0)
     max_grad_norm: float = Field(10.0, gt=0)
     gamma: float = Field(0.99, ge=0, le=1)
@@ -104,7 +103,7 @@ class OffPolicyLearner(Learner):
         """Collect episodes, learn from the replay, and return metrics, each [S]."""
         config, sums, returns = self.off_policy, dict[str, Tensor](), []
         if config.anneal_learning_rate:
-            self.anneal(min((1.0 - progress) / (1.0 - config.anneal_from), 1.0))
+            self.anneal(1.0 - progress)
         learned = 0
         for _ in range(config.rounds):
             self.policy.head.explore(self._epsilon())
