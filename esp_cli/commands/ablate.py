@@ -15,6 +15,7 @@ from esp_cli.commands.study_options import (
     DryRunOption,
     JobsOption,
     PresetOption,
+    ReuseOption,
     StudyChoices,
     StudyOutOption,
     StudyStepsOption,
@@ -25,7 +26,8 @@ from esp_cli.commands.studying import run_study
 EPILOG = """Examples:\n
     esp ablate transforms --algo maddpg --task navigation\n
     esp ablate coefficient --steps 500k --dry-run\n
-    esp ablate modules --algo maddpg,mappo --seeds 10 --steps 500k --out runs/modules"""
+    esp ablate modules --algo maddpg,mappo --seeds 10 --steps 500k --out runs/modules\n
+    esp ablate modules --reuse runs/table1 --reuse runs/transforms"""
 
 
 def ablate(
@@ -48,8 +50,11 @@ def ablate(
     episodes: EpisodesOption = DEFAULT_EPISODES,
     jobs: JobsOption = None,
     dry_run: DryRunOption = False,
+    reuse: ReuseOption = None,
     json: JsonOption = None,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""
-    choices = StudyChoices(tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, json)
+    choices = StudyChoices(
+        tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, reuse, json
+    )
     run_study(f"ablate-{part}", ("ablate", part), choices)

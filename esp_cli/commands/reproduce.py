@@ -15,6 +15,7 @@ from esp_cli.commands.study_options import (
     DryRunOption,
     JobsOption,
     PresetOption,
+    ReuseOption,
     StudyChoices,
     StudyOutOption,
     StudyStepsOption,
@@ -45,8 +46,11 @@ def reproduce(
     episodes: EpisodesOption = DEFAULT_EPISODES,
     jobs: JobsOption = None,
     dry_run: DryRunOption = False,
+    reuse: ReuseOption = None,
     json: JsonOption = None,
 ) -> None:
     """Train, judge and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    choices = StudyChoices(tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, json)
+    choices = StudyChoices(
+        tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, reuse, json
+    )
     run_study(table, ("reproduce", table), choices)

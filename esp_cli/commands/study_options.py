@@ -51,6 +51,15 @@ JobsOption = Annotated[
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
 ]
+ReuseOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--reuse",
+        help="Take finished runs of the same configuration from this study instead of training them again; may be "
+        "repeated.",
+        metavar="STUDY",
+    ),
+]
 
 
 def parse_names(items: Sequence[str] | None) -> tuple[str, ...] | None:
@@ -87,6 +96,7 @@ class StudyChoices:
     episodes: int
     jobs: int | None
     dry_run: bool
+    reuse: list[Path] | None
     json: str | None
 
     def request(self, words: Sequence[str], out: Path) -> Request:

@@ -19,7 +19,7 @@ from esp_cli.commands.study_progress import StudyProgress
 if TYPE_CHECKING:
     from esp_cli.experiments.cost import Cost
     from esp_cli.experiments.scheduler import Snapshot
-    from esp_cli.experiments.study import Study, StudyFolder
+    from esp_cli.experiments.study import StudyFolder
 
 _BOOT = "from esp_cli.experiments.workers import follow_parent; follow_parent(); from esp_cli.app import main; main()"
 """The application as a child process: it stops cleanly when the study that started it ends."""
@@ -44,9 +44,10 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
 
     out = choices.out or Path("runs") / kind
     study = plan(kind, choices.request(words, out))
+    others = [StudyFolder.open(path) for path in choices.reuse or ()]
     jobs = choices.jobs or (1 if study.cells[0].config.device == "cuda" else available_cores())
     if choices.dry_run:
-        _dry_run(study, StudyFolder(out, study), jobs, choices.json)
+        _dry_run(StudyFolder(out, study), others, jobs, choices.json)
         return
     for cell in study.cells:  # refuses what does not go together while there is no folder yet
         build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1]}))
@@ -55,6 +56,11 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
         begun = time.monotonic()
         names = {cell.name for cell in study.cells}
         cells = [cell for cell in folder.study.cells if cell.name in names]
+        for cell in cells:
+            twin = folder.find_twin(cell, others)
+            if twin is not None:
+                folder.adopt(cell, twin)
+                console.note(f"taking over {twin} as {cell.name}")
         scheduler = Scheduler(folder, cells, min(jobs, len(cells)), (sys.executable, "-c", _BOOT))
         finished = sum(run.status == "finished" for run in scheduler.runs)
         console.note(
@@ -94,12 +100,16 @@ def _report(folder: StudyFolder, json: str | None) -> None:
     console.note(f"next: esp report {folder.path}")
 
 
-def _dry_run(study: Study, folder: StudyFolder, jobs: int, json: str | None) -> None:
+def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
     """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
     from esp_cli.experiments.cost import probe
     from esp_cli.experiments.scheduler import Scheduler, makespan
 
+    study = folder.study
     states = Scheduler(folder, study.cells, jobs, ()).runs
+    for run in states:
+        if folder.find_twin(run.cell, others) is not None:
+            run.status = "finished"
     costs: list[Cost] = []
     with console.TrainingProgress(len(states), description="measure") as progress:
         for run in states:

@@ -19,7 +19,7 @@ PAPER_PRIOR: dict[str, object] = {"prior.transforms": "rot90", "prior.consistenc
 """What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
 TRANSFORM_CHOICES: dict[str, dict[str, object]] = {
     "none": {"prior.kind": "none"},
-    "rot90": {"prior.transforms": "rot90", "prior.copies": "all"},
+    "rot90": {"prior.transforms": "rot90"},
     "rot90, rot180": {"prior.transforms": "rot90,rot180", "prior.copies": "all"},
     "rot90, rot180, rot270": {"prior.transforms": "rot90,rot180,rot270", "prior.copies": "all"},
     "rot90, flip": {"prior.transforms": "rot90,flip-x", "prior.copies": "all"},
@@ -146,7 +146,7 @@ def _ablation(kind: str, request: Request) -> Iterator[Cell]:
                     config = _config(task, algorithm, steps, request, choice, common)
                     key = None
                     if kind == "ablate-coefficient" and _comparable(config, {}):
-                        coefficient = f"{config.prior.consistency_coef:g}"
+                        coefficient = f"{choice['prior.consistency_coef']:g}"
                         key = ("coefficient, read off figure 5c", task, str(steps), algorithm, coefficient)
                     yield Cell(
                         name=f"{stem}-{_slug(label)}",
@@ -230,7 +230,8 @@ def _config(
         elif section == algorithm or section not in (*ALGORITHMS, *task_names()):
             settings[name] = value
     settings |= choice
-    return resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
+    config = resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
+    return config.model_copy(update={"prior": config.prior.effective()})  # what trains the same is the same run
 
 
 def _comparable(config: RunConfig, settings: Mapping[str, object]) -> bool:

@@ -14,7 +14,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -210,6 +211,31 @@ class StudyFolder:
         if folder.config != wanted:
             raise StudyError(f"{path} holds a run of another configuration; move it away, or choose another --out")
         return folder
+
+    def find_twin(self, cell: Cell, others: Sequence[StudyFolder]) -> Path | None:
+        """Return the folder of a finished run of the same configuration, judged on as many episodes, in other studies.
+
+        None where there is none, or where the cell's own run has begun.
+        """
+        if self.run_path(cell).exists():
+            return None
+        alike = (
+            other.run_path(theirs)
+            for other in others
+            if other.study.episodes == self.study.episodes
+            for theirs in other.study.cells
+            if theirs.config == cell.config and other.is_finished(theirs)
+        )
+        return next(alike, None)
+
+    def adopt(self, cell: Cell, twin: Path) -> None:
+        """Take a finished run of the same configuration over as this cell's; its log says where it is from."""
+        part = self.path / _RUNS / f".{cell.name}.part"
+        shutil.rmtree(part, ignore_errors=True)  # what a kill left
+        shutil.copytree(twin, part)
+        with (part / _LOG).open("a", encoding="utf-8") as log:
+            log.write(f"taken over from {twin}\n")
+        part.rename(self.run_path(cell))
 
     def is_trained(self, cell: Cell) -> bool:
         """Return whether a cell's training is done; the policy file is the last that a run writes."""

@@ -54,3 +54,21 @@ class PriorConfig(BaseModel):
     def coefficient(self) -> float:
         """c, or 0 where the consistency loss is off."""
         return self.consistency_coef if self.kind in ("esp", "consistency") else 0.0
+
+    def effective(self) -> PriorConfig:
+        """Return this prior with every setting that has no effect beside the others at its default.
+
+        Two priors with the same effective settings train the same, bit for bit: one without a coefficient is one
+        without consistency, and without either of its means the prior is none.
+        """
+        loses = {
+            "none": set(type(self).model_fields),
+            "augment": {"consistency_coef", "terms", "stop_gradient"},
+            "consistency": {"old_log_prob", "replay"},
+            "esp": set[str](),
+        }
+        kind = self.kind
+        if kind in ("esp", "consistency") and self.consistency_coef == 0:
+            kind = "augment" if kind == "esp" else "none"
+        kept = {name: value for name, value in self if name not in loses[kind]}
+        return PriorConfig(**{**kept, "kind": kind})

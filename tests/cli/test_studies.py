@@ -73,6 +73,12 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     assert "2 of them finished" in again.stderr
     results = json.loads(again.stdout)
     assert [cell["status"] for cell in results["cells"]] == ["finished"] * 2
+    copied = (*TINY, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "copied", "--reuse", out)
+    assert "0 runs to do" in esp(*copied, "--dry-run").stdout
+    assert not (tmp_path / "copied").exists()
+    taken = esp(*copied)
+    assert taken.stderr.count("taking over") == 2
+    assert "2 runs, 2 of them finished" in taken.stderr
     small = tmp_path / "small.json"
     report = esp("report", out, "--films", "--results", small)
     assert json.loads(small.read_text()) == results
@@ -104,6 +110,7 @@ def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Pat
         (["ablate", "coefficient", "--set", "prior.consistency_coef=1"], "varies by itself"),
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),
         (["reproduce", "table1", "--jobs", "0"], "--jobs"),
+        (["ablate", "modules", "--reuse", "none"], "none is no study"),
         (["report"], "there is nothing to report"),
     ],
 )

@@ -6,6 +6,7 @@ import pytest
 
 from esp_cli.experiments.catalogue import KINDS, Request, paper_cells, plan
 from esp_cli.experiments.paper import Reported, horizons, reported, tasks
+from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import parse
 from tests.experiments.studies import request, small_study
 
@@ -77,7 +78,7 @@ def test_transforms_vary_number_and_type_with_augmentation_alone():
     priors = [cell.config.prior for cell in study.cells]
     assert [prior.kind for prior in priors] == ["none"] + ["augment"] * 6
     assert [len(parse.parse_elements(prior.transforms, 3)) for prior in priors[1:]] == [1, 2, 3, 2, 3, 7]
-    assert [prior.copies for prior in priors[1:]] == ["all"] * 4 + ["draw"] * 2
+    assert [prior.copies for prior in priors[1:]] == ["draw", *["all"] * 3, *["draw"] * 2], "one element: no matter"
     assert {cell.reference for cell in study.cells[1:]} == {study.cells[0].name}
     assert study.panels == ["navigation, MADDPG, 500k"]
 
@@ -87,7 +88,8 @@ def test_the_coefficient_is_that_of_the_loss_alone_at_two_horizons_and_0_is_the_
     assert study.panels == ["navigation, MADDPG, 500k", "navigation, MADDPG, 3M"]
     first = [cell.config.prior for cell in study.cells[:6]]
     assert [prior.coefficient for prior in first] == [0, 0.01, 0.05, 0.1, 0.5, 1]
-    assert {(prior.kind, prior.transforms) for prior in first} == {("consistency", "rot90")}
+    assert first[0] == PriorConfig(kind="none")
+    assert {(prior.kind, prior.transforms) for prior in first[1:]} == {("consistency", "rot90")}
     assert not any(prior.augments for prior in first)
     assert [reported(cell.paper).mean for cell in study.cells[:3]] == [-145, -138, -135]
 
@@ -96,7 +98,8 @@ def test_modules_are_none_loss_augmentation_and_both():
     study = plan("ablate-modules", Request(algorithms=("maddpg", "mappo")))
     kinds = [cell.config.prior.kind for cell in study.cells]
     assert kinds == ["none", "consistency", "augment", "esp"] * 2
-    assert {(c.config.prior.transforms, c.config.prior.consistency_coef) for c in study.cells} == {("rot90", 0.5)}
+    assert {c.config.prior.transforms for c in study.cells if c.config.prior.kind != "none"} == {"rot90"}
+    assert {c.config.prior.coefficient for c in study.cells} == {0.0, 0.5}
 
 
 def test_a_setting_reaches_the_runs_that_it_concerns():
@@ -116,7 +119,8 @@ def test_a_setting_reaches_the_runs_that_it_concerns():
         config = cell.config
         assert config.algorithm_settings["gamma"] == (0.9 if config.algorithm == "mappo" else 0.99)
         assert config.task_settings.get("prey") == ("fleeing" if config.task == "predator-prey" else None)
-        assert (config.prior.transforms, config.network.hidden) == ("c4", (8,))
+        assert config.network.hidden == (8,)
+        assert config.prior.transforms == ("c4" if config.prior.kind == "esp" else PriorConfig().transforms)
 
 
 @pytest.mark.parametrize(

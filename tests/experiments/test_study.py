@@ -91,3 +91,39 @@ def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"steps": 7}))
     with pytest.raises(ValueError, match="holds a run of another configuration"):
         folder.prepare(folder.study.cells[0])
+
+
+def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_study(tmp_path):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    plain, esp = folder.study.cells
+    twin = folder.find_twin(plain, [other])
+    assert twin == other.run_path(plain)
+    assert folder.find_twin(esp, [other]) is None, "not finished there"
+    folder.adopt(plain, twin)
+    assert folder.is_finished(plain)
+    assert read_judgement(folder.run_path(plain)) == read_judgement(twin)
+    assert folder.log_path(plain).read_text().endswith(f"taken over from {twin}\n")
+    assert folder.find_twin(plain, [other]) is None, "it is there now"
+    assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
+
+
+@pytest.mark.parametrize("choice", [{"seeds": (0, 1)}, {"steps": ((None, 300),)}, {"episodes": 8}])
+def test_a_run_of_other_seeds_or_steps_or_judged_otherwise_is_no_twin(tmp_path, choice):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    folder = StudyFolder.create(tmp_path / "s", small_study(**choice))
+    assert folder.find_twin(folder.study.cells[0], [other]) is None
+
+
+def test_ablations_share_their_runs_with_each_other_and_with_table_1():
+    """The plain learner, which c = 0 is too, and the loss alone and augmentation alone with a quarter turn."""
+    configs = {
+        kind: {cell.variant: cell.config for cell in small_study(kind).cells}
+        for kind in ("table1", "ablate-modules", "ablate-transforms", "ablate-coefficient")
+    }
+    plain = configs["table1"]["MAPPO"]
+    modules = configs["ablate-modules"]
+    assert plain == modules["none"] == configs["ablate-transforms"]["none"] == configs["ablate-coefficient"]["c = 0"]
+    assert modules["augmentation"] == configs["ablate-transforms"]["rot90"]
+    assert modules["loss"] == configs["ablate-coefficient"]["c = 0.5"]
+    assert len({config.model_dump_json() for config in modules.values()}) == 4

@@ -67,6 +67,21 @@ def test_kinds_switch_the_two_means(kind, augments, coefficient, active):
     assert SymmetryPrior(config, SPEC).active is active
 
 
+@pytest.mark.parametrize(
+    ("choice", "effective"),
+    [
+        ({"kind": "none", "transforms": "c4", "consistency_coef": 0.5, "replay": "stored"}, {"kind": "none"}),
+        ({"kind": "augment", "transforms": "c4", "consistency_coef": 0.5}, {"kind": "augment", "transforms": "c4"}),
+        ({"kind": "consistency", "old_log_prob": "recompute"}, {"kind": "consistency"}),
+        ({"kind": "consistency", "consistency_coef": 0, "transforms": "c4"}, {"kind": "none"}),
+        ({"kind": "esp", "consistency_coef": 0, "copies": "all"}, {"kind": "augment", "copies": "all"}),
+        ({"kind": "esp", "consistency_coef": 0.5, "old_log_prob": "recompute"}, None),
+    ],
+)
+def test_settings_without_effect_go_back_to_their_defaults(choice, effective):
+    assert PriorConfig(**choice).effective() == PriorConfig(**(choice if effective is None else effective))
+
+
 def test_copies_and_their_share():
     def prior(**choice):
         return SymmetryPrior(PriorConfig(**choice), SPEC)
