@@ -22,6 +22,10 @@ _LEGEND_INCHES = 0.8
 _MAX_COLUMNS = 3
 _JITTER = 0.08
 """Horizontal distance of the lines of `sensitivity`, so that intervals do not lie upon each other."""
+_BELOW_RANDOM = 0.15
+"""How far below the random policy a panel of curves goes, as a share of what is above it."""
+_NAME_HEIGHT = 0.05
+"""Height of an anchor's name as a share of a panel."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,7 @@ def curve_panels(
             for curve in panel.curves:
                 draw_curve(axes, curve, labels.index(curve.label), band)
                 handles.setdefault(curve.label, axes.lines[-1])
-            for name, value in panel.anchors.items():
-                _anchor(axes, name, value)
+            _draw_anchors(axes, panel.anchors)
             axes.set_title(panel.title, loc="left", fontweight="bold")
             axes.set_xlabel("environment steps per seed")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -104,11 +107,24 @@ def curve_panels(
     return files
 
 
-def _anchor(axes: Axes, name: str, value: float) -> None:
-    """Draw a dotted line where it is in view, with its name."""
+def _draw_anchors(axes: Axes, anchors: Mapping[str, float]) -> None:
+    """Draw a dotted line for each anchor in view, with its name; names that would lie upon each other stand in a row.
+
+    The view ends a little below the random policy: what is worse, as the first greedy policy often is, would press the
+    rest of the curves together.
+    """
     low, high = axes.get_ylim()
-    if low <= value <= high:
+    random = anchors.get("random", low)
+    if random < high:
+        low = max(low, random - _BELOW_RANDOM * (high - random))
+        axes.set_ylim(low, high)
+    shown = sorted((value, name) for name, value in anchors.items() if low <= value <= high)
+    names: list[tuple[float, str]] = []
+    for value, name in shown:
         axes.axhline(value, linestyle=":", color="#777777", linewidth=1.0, zorder=1)
+        beside = names and value - names[-1][0] < _NAME_HEIGHT * (high - low)
+        names.append((value, f"{names.pop()[1]}, {name}" if beside else name))
+    for value, name in names:
         axes.annotate(name, (1.0, value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7)
 
 

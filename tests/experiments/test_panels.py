@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from esp_cli.experiments.charts import chart
-from esp_cli.experiments.panels import Panel, Sensitivity, curve_panels, sensitivity
+from esp_cli.experiments.panels import Panel, Sensitivity, _draw_anchors, curve_panels, sensitivity
 from esp_cli.experiments.plots import PALETTE, Curve
 
 RISING = Curve("MAPPO", [0, 100, 200], [[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]])
@@ -26,6 +27,17 @@ def test_panels_share_a_legend_and_each_has_its_title_and_anchors(tmp_path):
     assert text.count(PALETTE[1].lower()) >= 2, "one label, one colour in both panels"
     again = curve_panels(panels, tmp_path / "again.png", "greedy return")[1]
     assert again.read_text() == text
+
+
+def test_names_of_anchors_that_lie_together_stand_in_a_row_and_what_is_below_random_is_cut_off():
+    axes = Figure().add_subplot()
+    axes.set_ylim(-400.0, -100.0)
+    _draw_anchors(axes, {"random": -220.0, "heuristic": -112.0, "cover": -109.0})
+    assert [text.get_text() for text in axes.texts] == ["random", "heuristic, cover"]
+    assert axes.get_ylim() == (-220.0 - 0.15 * 120.0, -100.0)
+    axes.set_ylim(-200.0, -100.0)  # nothing is as low as the random policy
+    _draw_anchors(axes, {"random": -220.0})
+    assert axes.get_ylim() == (-200.0, -100.0)
 
 
 def test_the_coefficient_is_drawn_with_the_papers_means(tmp_path):
