@@ -24,6 +24,7 @@ from esp_cli.training.config import resolve_config
 from esp_cli.training.trainer import build_learner
 from esp_envs import make
 from esp_envs.spec import TaskSpec
+from tests.networks.gradients import assert_same_gradients
 
 SEEDS, WORLDS = 2, 12
 EXACT = 1e-5
@@ -239,13 +240,7 @@ def test_pictures_that_occur_several_times_are_encoded_once_and_nobody_notices()
     ours, theirs = encoder(pictures), encoder.encode(pictures)
     torch.testing.assert_close(ours, theirs)
     weight = torch.randn(ours.shape, generator=g)
-    inputs = list(encoder.parameters())
-    for a, b in zip(
-        torch.autograd.grad((ours * weight).sum(), inputs),
-        torch.autograd.grad((theirs * weight).sum(), inputs),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
+    assert_same_gradients(ours, theirs, weight, list(encoder.parameters()), atol=1e-4)
 
 
 def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
@@ -264,13 +259,7 @@ def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
     theirs, ours = torch.stack(features), encoder.encode(rows)
     torch.testing.assert_close(ours, theirs)
     weight = torch.randn(ours.shape)
-    inputs = list(encoder.parameters())
-    for a, b in zip(
-        torch.autograd.grad((ours * weight).sum(), inputs),
-        torch.autograd.grad((theirs * weight).sum(), inputs),
-        strict=True,
-    ):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-3)
+    assert_same_gradients(ours, theirs, weight, list(encoder.parameters()), atol=1e-3)
 
 
 def test_pictures_that_all_differ_are_all_encoded() -> None:
