@@ -18,7 +18,7 @@ from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.bodies import MLP, NetworkConfig
-from esp_cli.networks.exchange import with_one_exchanged
+from esp_cli.networks.exchange import in_a_circle, with_one_exchanged
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import PriorConfig, policy_consistency_loss
@@ -88,11 +88,11 @@ class Maddpg(OffPolicyLearner):
         super().__init__(env, config, network, prior, generators, prior_generators)
         self.config, spec = config, self.spec
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
-        self.num_values = 1 if spec.shared_reward else spec.num_agents
+        self.shared = spec.shared_reward
         plain = {"name": "mlp", "activation": config.critic_activation, "symmetrise": None}
         shape = network.model_copy(update=plain)
         width = self.critic_width + spec.num_agents * self.head.action_width
-        self.critic = MLP(generators, width, self.num_values, shape, 1.0).to(self.device)
+        self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_parameters, self.critic_parameters = list(self.policy.parameters()), list(self.critic.parameters())
@@ -125,7 +125,7 @@ class Maddpg(OffPolicyLearner):
 
     def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
         """Return S_pi and S_Q of a batch with its copies."""
-        values = self._value(self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
+        values = self._value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
         valid = rows.valid[:, : rows.valid.shape[1] // (1 + len(transforms))]
         outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
         return {
@@ -138,7 +138,7 @@ class Maddpg(OffPolicyLearner):
     ) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q."""
         count = batch.obs.shape[1]
-        values = self._value(seen[:, :, :-1], self.head.encode(rows.action))
+        values = self._value(self.critic, seen[:, :, :-1], self.head.encode(rows.action))
         target = self._targets(batch, seen[:, :count])
         learned, valid = values[:, :count], batch.valid
         if self.prior.config.augments_batches:
@@ -180,15 +180,37 @@ class Maddpg(OffPolicyLearner):
         metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
         return metrics | {name: masked_mean(x, used.valid) for name, x in self.head.statistics(learned).items()}
 
-    def _value(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return Q [S, B, T, C] of encoded joint actions [S, B, T, N, width]."""
-        return self.critic.unroll(torch.cat([seen, action.flatten(-2)], -1))
+    def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
+        """Return what the critic sees beside actions: [S, B, T + 1, critic width], or one such row per agent.
+
+        Where rewards are each agent's own, all agents share one critic, which sees them in a circle that ends with
+        the agent whose value it tells; beside a global state, it sees that agent's observation.
+        """
+        if self.shared:
+            return super()._critic_rows(batch)
+        if self.config.critic_input == "observations":
+            return self._with_time(in_a_circle(batch.obs))
+        state = batch.state.unsqueeze(-2).expand(*batch.obs.shape[:-1], -1)
+        return self._with_time(torch.cat([state, batch.obs], -1))
+
+    @property
+    def critic_width(self) -> int:
+        """Numbers that the critic sees of a state."""
+        own = 0 if self.shared or self.config.critic_input == "observations" else self.spec.observation.width
+        return super().critic_width + own
+
+    def _value(self, critic: MLP, seen: Tensor, action: Tensor) -> Tensor:
+        """Return Q [S, B, T, C] of encoded joint actions [S, B, T, N, width]; C is 1 or N."""
+        joint = action.flatten(-2) if self.shared else in_a_circle(action)
+        rows = torch.cat([seen, joint], -1)
+        values = critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
+        return values if self.shared else values.squeeze(-1)
 
     def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, stored: Tensor) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
         Args:
-            seen: [S, B, T, critic width].
+            seen: [S, B, T(, N), critic width].
             outputs: [S, B, T, N, ...] of the policy.
             noise: of the shape of `outputs`, uniform in [0, 1).
             stored: [S, B, T, N(, width)] what was done.
@@ -200,31 +222,35 @@ class Maddpg(OffPolicyLearner):
             values = self._exchanged(seen, joint.detach(), others)
             return (outputs.exp() * values).sum(-1)
         if self.config.actor_actions == "all":
-            return self._value(seen, own)
+            return self._value(self.critic, seen, own)
         return self._exchanged(seen, joint, own.unsqueeze(-2)).squeeze(-1)
 
     def _exchanged(self, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q if it alone did otherwise.
 
         Args:
-            seen: [S, B, T, critic width].
+            seen: [S, B, T(, N), critic width].
             joint: [S, B, T, N, width] encoded actions.
             others: [S, B, T, N, K, width] what each might do instead.
 
         Returns:
             [S, B, T, N, K].
         """
-        rows = (x.flatten(1, 2) for x in (seen, joint, others))
-        values = with_one_exchanged(self.critic, *rows).unflatten(1, seen.shape[1:3])
-        return values.squeeze(-1) if self.num_values == 1 else values.diagonal(dim1=3, dim2=5).movedim(-1, 3)
+        if not self.shared:  # of the actions in an agent's row, its own stands last and is exchanged alone
+            width = joint.shape[-1]
+            seen = torch.cat([seen, in_a_circle(joint)[..., :-width]], -1)
+            joint, others = joint.unsqueeze(-2), others.unsqueeze(-3)
+        shape = joint.shape[1:-2]
+        rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
+        values = with_one_exchanged(self.critic, *rows).unflatten(1, shape).squeeze(-1)
+        return values if self.shared else values.squeeze(-2)
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
         outputs = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
         following = self.head.encode(self.head.mode(outputs))
-        next_value = self.target_critic.unroll(torch.cat([seen[:, :, 1:], following.flatten(-2)], -1))
-        return self._td_targets(batch, batch.reward, next_value)
+        return self._td_targets(batch, batch.reward, self._value(self.target_critic, seen[:, :, 1:], following))
 
     def _policy_gap(self, outputs: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
         """Return S_pi (Eq. 8) per seed, averaged over the copies; outputs [S, B (1 + copies), T, N, ...]."""

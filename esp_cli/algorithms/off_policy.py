@@ -85,7 +85,7 @@ class OffPolicyLearner(Learner):
         self.collector = EpisodeCollector(env, self.policy, self.generators["learner"])
         self.modules = {"policy": self.policy, "reward_scale": self.reward_scale}
         self.episodes = self.updates = 0
-        self._time = torch.linspace(0, 1, spec.horizon + 1, device=device).unsqueeze(1)
+        self._time = torch.linspace(0, 1, spec.horizon + 1, device=device)
 
     @property
     def steps_per_iteration(self) -> int:
@@ -156,10 +156,14 @@ class OffPolicyLearner(Learner):
 
     def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
         """Return what the critic or the mixer sees of every state: [S, B, T + 1, critic width]."""
-        rows = batch.state if self.off_policy.critic_input == "state" else batch.obs.flatten(-2)
+        return self._with_time(batch.state if self.off_policy.critic_input == "state" else batch.obs.flatten(-2))
+
+    def _with_time(self, rows: Tensor) -> Tensor:
+        """Append the share of the horizon gone, where the critic sees it, to rows [S, B, T + 1, ..., width]."""
         if not self.off_policy.critic_sees_time:
             return rows
-        return torch.cat([rows, self._time.expand(*rows.shape[:3], 1)], -1)
+        time = self._time.view(-1, *[1] * (rows.dim() - 3))
+        return torch.cat([rows, time.expand(*rows.shape[:-1], 1)], -1)
 
     @torch.no_grad()
     def _td_targets(self, batch: EpisodeBatch, reward: Tensor, next_value: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A perceptron's answers to rows that differ from each other in a few of their last numbers alone.
+"""Rows for a centralised critic: agents in a circle, and joint actions in which one of them is exchanged.
 
 A centralised critic is asked for the value of N joint actions in each of which another agent's action is exchanged. All
 of them have nearly all of the first layer's sums in common.
@@ -10,6 +10,21 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.layers import SeedLinear, SeedMLP, affine
+
+
+def in_a_circle(items: Tensor) -> Tensor:
+    """Put N items in a row once for each of them, in the order of a circle that ends with it.
+
+    Args:
+        items: [..., N, A].
+
+    Returns:
+        [..., N, N A]; row i holds items i + 1, ..., N, 1, ..., i.
+    """
+    count = items.shape[-2]
+    agents = torch.arange(count, device=items.device)
+    order = (agents.unsqueeze(1) + agents + 1) % count
+    return items[..., order, :].flatten(-2)
 
 
 def with_one_exchanged(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:

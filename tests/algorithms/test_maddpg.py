@@ -16,19 +16,18 @@ def prepared(**choice):
 
 
 class LinearCritic(MLP):
-    """Q = weights . (joint action) + bias, blind to the rest, for two seeds."""
+    """Q = weights . (joint action), blind to the rest, for two seeds."""
 
-    def __init__(self, inputs, weights, bias):
-        SeedMLP.__init__(self, [torch.Generator(), torch.Generator()], (inputs, bias.numel()), "relu", 1.0)
+    def __init__(self, inputs, weights):
+        SeedMLP.__init__(self, [torch.Generator(), torch.Generator()], (inputs, 1), "relu", 1.0)
         self.layers[0].weight.data.zero_()[:, -weights.numel() :] = weights.unsqueeze(1)
-        self.layers[0].bias.data[:] = bias
+        self.layers[0].bias.data.zero_()
 
 
-def linear_critic(trained, weights, bias=None):
+def linear_critic(trained, weights):
     """Replace the critic and its target by a linear one."""
     inputs = trained.critic.layers[0].weight.shape[1]
-    bias = torch.zeros(1) if bias is None else bias
-    trained.critic, trained.target_critic = (LinearCritic(inputs, weights, bias) for _ in range(2))
+    trained.critic, trained.target_critic = (LinearCritic(inputs, weights) for _ in range(2))
 
 
 def test_targets_by_hand_on_the_last_two_transitions():
@@ -57,14 +56,43 @@ def test_whose_actions_are_the_policys(rule, expected):
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
 
 
-@pytest.mark.parametrize("rule", ["expected", "sampled"])
-def test_values_of_ones_own_are_taken_where_rewards_are_ones_own(rule):
-    trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none", algo__actor_gradient=rule)
-    linear_critic(trained, torch.zeros(15), torch.arange(3.0))
-    outputs = torch.full((2, 2, 25, 3, 5), 0.2).log()
-    noise = torch.rand(outputs.shape)
-    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], outputs, noise, episodes.action)
-    torch.testing.assert_close(value, torch.arange(3.0).expand(2, 2, 25, 3))
+def own_rewards(**choice):
+    """Three agents with rewards of their own, and Q_i = 10 a_{i+1} + 100 a_{i+2} + a_i; they did 1, 2, 3."""
+    trained, episodes = prepared(task__convention="pettingzoo", prior__kind="none", **choice)
+    linear_critic(trained, torch.cat([10 * torch.arange(5.0), 100 * torch.arange(5.0), torch.arange(5.0)]))
+    return trained, episodes, torch.tensor([1, 2, 3]).expand(2, 2, 25, 3)
+
+
+def test_agents_with_rewards_of_their_own_share_a_critic_that_sees_them_last():
+    trained, episodes, done = own_rewards()
+    seen = trained._critic_rows(episodes)[:, :, :-1]
+    value = trained._value(trained.critic, seen, trained.head.encode(done))
+    torch.testing.assert_close(value, torch.tensor([321.0, 132.0, 213.0]).expand(2, 2, 25, 3))
+
+
+@pytest.mark.parametrize("gradient", ["expected", "sampled"])
+@pytest.mark.parametrize(("rule", "expected"), [("own", [324.0, 134.0, 214.0]), ("all", [444.0] * 3)])
+def test_each_agent_is_told_its_own_value_of_what_its_policy_does(gradient, rule, expected):
+    """Where the policy always does 4."""
+    trained, episodes, done = own_rewards(algo__actor_gradient=gradient, algo__actor_actions=rule)
+    outputs = torch.full((2, 2, 25, 3, 5), -70.0)
+    outputs[..., 4] = 0.0
+    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full(outputs.shape, 0.5)
+    value = trained._value_of_policy(seen, outputs, noise, done)
+    torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, 3))
+
+
+def test_what_the_shared_critic_sees_of_a_state():
+    """Observations in a circle that ends with one's own, then the time; beside a state one's own observation alone."""
+    trained, episodes, _ = own_rewards()
+    seen, first = trained._critic_rows(episodes), episodes.obs
+    assert seen.shape[-1] == trained.critic_width
+    torch.testing.assert_close(seen[..., 1, :-1], first[..., [2, 0, 1], :].flatten(-2))
+    torch.testing.assert_close(seen[0, 0, :, 0, -1], torch.arange(26.0) / 25)
+    trained, episodes = prepared(task__convention="pettingzoo", algo__critic_input="state")
+    seen = trained._critic_rows(episodes)
+    assert seen.shape[-1] == trained.critic_width
+    torch.testing.assert_close(seen[..., 2, :-1], torch.cat([episodes.state, episodes.obs[..., 2, :]], -1))
 
 
 def test_the_expected_value_by_hand():

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.exchange import _one_by_one, with_one_exchanged
+from esp_cli.networks.exchange import _one_by_one, in_a_circle, with_one_exchanged
 from esp_cli.networks.layers import SeedMLP
 from tests.networks.gradients import assert_same_gradients
 
@@ -16,6 +16,12 @@ def drawn(num_items=3, num_others=2, width=4, rows=11):
     generator = torch.Generator().manual_seed(5)
     shapes = ((2, rows, 6), (2, rows, num_items, width), (2, rows, num_items, num_others, width))
     return [torch.randn(shape, generator=generator) for shape in shapes]
+
+
+def test_a_circle_ends_with_each_item_in_turn():
+    items = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
+    rows = [[2, 20, 3, 30, 1, 10], [3, 30, 1, 10, 2, 20], [1, 10, 2, 20, 3, 30]]
+    torch.testing.assert_close(in_a_circle(items), torch.tensor(rows).float())
 
 
 def test_by_hand():
