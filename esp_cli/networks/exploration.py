@@ -134,7 +134,7 @@ class ExploringCategorical(ExploringHead, Categorical):
 
 
 class BoundedPoint(ExploringHead):
-    """A deterministic bounded action; behaviour adds Gaussian noise of deviation epsilon and goes back to the bounds.
+    """A deterministic action, the outputs squashed to the bounds; behaviour adds Gaussian noise of deviation epsilon and goes back to the bounds.
 
     Planar vectors are bounded by the unit disc, other numbers by [-1, 1]. Squash, noise and bounds commute with every
     rotation and reflection of the action.
@@ -152,24 +152,24 @@ class BoundedPoint(ExploringHead):
         return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
 
     def normalise(self, outputs: Tensor) -> Tensor:
-        """Return the actions within their bounds."""
-        return squash(outputs, self.disc)
+        """Return the outputs as they are."""
+        return outputs
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action plus noise, back within the bounds."""
-        noisy = outputs + self._epsilon(outputs) * noise
+        noisy = self.mode(outputs) + self._epsilon(outputs) * noise
         return noisy / (noisy.square() @ self.disc).sqrt().clamp_min(1.0)
 
     def mode(self, outputs: Tensor) -> Tensor:
         """Return the action itself."""
-        return outputs
+        return squash(outputs, self.disc)
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return |p - q|^2 / 2, the KL of two Gaussians of deviation 1 around the actions: [S, B, N]."""
-        return 0.5 * (p - q).square().sum(-1)
+        """Return half the squared distance of the actions, the KL of two Gaussians of deviation 1: [S, B, N]."""
+        return 0.5 * (self.mode(p) - self.mode(q)).square().sum(-1)
 
     def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
-        """Return K_g^{-1} applied to the actions."""
+        """Return K_g^{-1} applied to the outputs, with which the squash commutes."""
         return transform.pull_back_mean(outputs)
 
     def to_environment(self, action: Tensor) -> Tensor:
@@ -182,15 +182,15 @@ class BoundedPoint(ExploringHead):
 
     def relaxed(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action itself, through which gradients flow."""
-        return outputs
+        return self.mode(outputs)
 
     def penalty(self, outputs: Tensor) -> Tensor:
-        """Return the mean square of the action's numbers: [S, B, N]."""
+        """Return the mean square of the outputs, which pulls also where the squash is flat: [S, B, N]."""
         return outputs.square().mean(-1)
 
     def statistics(self, outputs: Tensor) -> dict[str, Tensor]:
         """Return what is worth logging of the outputs: the share of actions at their bounds, [S, B, N]."""
-        length = (outputs.square() @ self.disc).sqrt()
+        length = (self.mode(outputs).square() @ self.disc).sqrt()
         return {"saturation": (length > SATURATED).float().mean(-1)}
 
 

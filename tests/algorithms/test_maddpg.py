@@ -1,5 +1,7 @@
 """MADDPG's own arithmetic: targets, the actor's gradient, target networks, and the policy's consistency."""
 
+import math
+
 import pytest
 import torch
 
@@ -50,7 +52,8 @@ def test_whose_actions_are_the_policys(rule, expected):
     """With Q = (1, 2, 3, 4) . (joint action), own and all see different partners."""
     trained, episodes = prepared(task__num_agents=2, task__actions="continuous", algo__actor_actions=rule)
     linear_critic(trained, torch.arange(1.0, 5.0))
-    own = torch.full((2, 2, 25, 2, 2), 0.25)
+    diagonal = math.atanh(0.25 * 2**0.5) / 2**0.5  # squashed along its length to (0.25, 0.25)
+    own = torch.full((2, 2, 25, 2, 2), diagonal)
     stored = torch.full((2, 2, 25, 2, 2), -0.25)
     value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, own, stored)
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
@@ -156,8 +159,8 @@ def test_the_policy_consistency_vanishes_for_a_policy_that_turns_with_the_world_
         stubborn = torch.log_softmax(torch.arange(5.0), 0).expand(follow.shape)
     else:
         follow = velocity
-        stubborn = torch.tensor([1.0, 0.0]).expand(follow.shape)
+        stubborn = torch.tensor([math.atanh(0.5), 0.0]).expand(follow.shape)
     assert trained._policy_gap(follow, episodes.valid, [g]).max() < 1e-6
     assert trained._policy_gap(stubborn, episodes.valid, [g]).min() > 0.1
-    if actions == "continuous":  # (1, 0) pulled back is (0, -1): |(1, 1)|^2 / 2
-        torch.testing.assert_close(trained._policy_gap(stubborn, episodes.valid, [g]), torch.ones(2))
+    if actions == "continuous":  # (1/2, 0) pulled back is (0, -1/2): |(1/2, 1/2)|^2 / 2
+        torch.testing.assert_close(trained._policy_gap(stubborn, episodes.valid, [g]), torch.full((2,), 0.25))

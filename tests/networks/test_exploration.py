@@ -64,23 +64,33 @@ def test_straight_through_draws_follow_the_probabilities_and_pass_the_soft_gradi
 @pytest.mark.parametrize("space", [PLANAR.action, WHEELS], ids=["planar", "wheels"])
 def test_a_bounded_action_and_its_noise_stay_within_the_bounds(space):
     head = BoundedPoint(space, 2)
-    outputs = head.normalise(10 * torch.randn(2, 500, 3, space.width))
+    outputs = 10 * torch.randn(2, 500, 3, space.width)
+    greedy = head.mode(outputs)
     head.explore(0.7)
     noisy = head.sample(outputs, head.noise((500, 3), generators(SEEDS, "noise")))
-    for action in (outputs, noisy):
+    for action in (greedy, noisy):
         for field, span in zip(space.layout.fields, space.layout.slices().values(), strict=True):
             part = action[..., span]
             size = part.norm(dim=-1) if field.kind is Kind.VECTOR else part.abs()
             assert size.max() <= 1 + 1e-6
-    assert not torch.equal(outputs, noisy)
+    assert not torch.equal(greedy, noisy)
     head.explore(0.0)
-    torch.testing.assert_close(head.sample(outputs, torch.ones_like(outputs)), outputs)
+    torch.testing.assert_close(head.sample(outputs, torch.ones_like(outputs)), greedy)
+
+
+def test_the_penalty_pulls_at_outputs_whose_action_no_longer_moves():
+    head = BoundedPoint(WHEELS, 1)
+    outputs = torch.full((1, 1, 1, WHEELS.width), 30.0, requires_grad=True)
+    (squashed,) = torch.autograd.grad(head.relaxed(outputs, outputs).sum(), outputs)
+    assert squashed.abs().max() < 1e-8
+    (pull,) = torch.autograd.grad(head.penalty(outputs).sum(), outputs)
+    torch.testing.assert_close(pull, torch.full_like(pull, 2 * 30.0 / WHEELS.width))
 
 
 def test_a_bounded_point_at_zero_has_a_finite_gradient():
     head = BoundedPoint(PLANAR.action, 1)
     latent = torch.zeros(1, 1, 1, 2, requires_grad=True)
-    (gradient,) = torch.autograd.grad(head.normalise(latent).sum(), latent)
+    (gradient,) = torch.autograd.grad(head.mode(latent).sum(), latent)
     torch.testing.assert_close(gradient, torch.ones_like(latent))
 
 
@@ -89,8 +99,8 @@ def test_squash_noise_and_bounds_turn_with_the_world():
     head.explore(0.5)
     latent, noise = 2 * torch.randn(2, 40, 3, 2), torch.randn(2, 40, 3, 2)
     g = transform_set("o2", PLANAR).draw(generators(SEEDS, "draws"))
-    plain = head.sample(head.normalise(latent), noise)
-    turned = head.sample(head.normalise(g.action(latent)), g.action(noise))
+    plain = head.sample(latent, noise)
+    turned = head.sample(g.action(latent), g.action(noise))
     torch.testing.assert_close(turned, g.action(plain), atol=1e-5, rtol=1e-5)
     assert not torch.allclose(turned, plain, atol=1e-2)
     torch.testing.assert_close(head.pull_back(turned, g), plain, atol=1e-5, rtol=1e-5)
