@@ -10,5 +10,5 @@ ALGORITHMS: dict[str, type[Learner]] = {"mappo": mappo.Mappo, "maddpg": maddpg.M
 PRESETS = {"mappo": mappo.PRESETS, "maddpg": maddpg.PRESETS, "qmix": qmix.PRESETS}
 """Per algorithm and preset: the settings, by section, that differ from the defaults."""
 
-TUNED = {"mappo": mappo.TUNED}
+TUNED = {"mappo": mappo.TUNED, "maddpg": maddpg.TUNED, "qmix": qmix.TUNED}
 """Per algorithm and task: the settings, by section, that the preset `default` changes there."""

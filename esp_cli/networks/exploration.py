@@ -134,10 +134,10 @@ class ExploringCategorical(ExploringHead, Categorical):
 
 
 class BoundedPoint(ExploringHead):
-    """A deterministic action, the outputs squashed to the bounds; behaviour adds Gaussian noise of deviation epsilon and goes back to the bounds.
+    """A deterministic action: outputs squashed to the bounds. Behaviour adds Gaussian noise of deviation epsilon to it.
 
-    Planar vectors are bounded by the unit disc, other numbers by [-1, 1]. Squash, noise and bounds commute with every
-    rotation and reflection of the action.
+    The noisy action goes back to the bounds. Planar vectors are bounded by the unit disc, other numbers by [-1, 1].
+    Squash, noise and bounds commute with every rotation and reflection of the action.
     """
 
     def __init__(self, space: Continuous, num_seeds: int) -> None:
