@@ -71,6 +71,17 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
         "prior": {"transforms": "c4"},
         "evaluation": {"every_steps": 50_000},
     },
+    "wildlife": {
+        "qmix": {
+            "batch_episodes": 8,
+            "replay_episodes": 200,
+            "epsilon_steps": 20_000,
+            "learning_rate": 2e-3,
+            "critic_input": "state",
+        },
+        "network": {"name": "mpn", "activation": "relu"},
+        "prior": {"transforms": "c4"},
+    },
 }
 """What the preset `default` changes on a task: measured best there.
 
