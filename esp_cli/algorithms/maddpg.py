@@ -102,8 +102,8 @@ Formation's episodes are twelve times as long as those of the particle tasks, so
 Its robots are slow and their actions bounded: without much noise, and a penalty that keeps the outputs off the bounds,
 the critic never sees what steering would have brought.
 
-Wildlife's critic sees all pictures, and the actor's gradient is the expected one with a larger penalty: with the state's
-coordinates and a draw's gradient the actor was sure of itself before it knew anything.
+Wildlife's critic sees all pictures, and the actor's gradient is the expected one with a larger penalty: with the
+state's coordinates and a draw's gradient the actor was sure of itself before it knew anything.
 """
 
 
