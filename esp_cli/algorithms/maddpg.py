@@ -78,7 +78,6 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
             "actor_actions": "own",
             "output_penalty": 0.05,
         },
-        "network": {"activation": "relu"},
         "prior": {"transforms": "c4"},
         "evaluation": {"every_steps": 50_000},
     },
@@ -92,7 +91,7 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
             "actor_gradient": "expected",
             "output_penalty": 0.01,
         },
-        "network": {"name": "mpn", "activation": "relu"},
+        "network": {"name": "mpn"},
         "prior": {"transforms": "c4"},
     },
 }

@@ -67,7 +67,7 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
             "replay_episodes": 80,
             "learning_rate": 2e-3,
         },
-        "network": {"activation": "relu", "separate_parts": True},
+        "network": {"separate_parts": True},
         "prior": {"transforms": "c4"},
         "evaluation": {"every_steps": 50_000},
     },
@@ -79,7 +79,7 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
             "learning_rate": 2e-3,
             "critic_input": "state",
         },
-        "network": {"name": "mpn", "activation": "relu"},
+        "network": {"name": "mpn"},
         "prior": {"transforms": "c4"},
     },
 }

@@ -57,10 +57,6 @@ class EpsilonGreedy(ExploringHead):
         """Draw, per seed, whether to explore and where to: uniform [S, *shape, 2]."""
         return torch.stack([torch.rand((*shape, 2), generator=g, device=g.device) for g in generators])
 
-    def normalise(self, outputs: Tensor) -> Tensor:
-        """Return the action values as they are."""
-        return outputs
-
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Explore where the first number is below epsilon; the second then names the action."""
         whether, where = noise.unbind(-1)
@@ -78,10 +74,6 @@ class EpsilonGreedy(ExploringHead):
     def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
         """Return the values that give action a what `outputs` give to K_g a."""
         return transform.pull_back(outputs)
-
-    def to_environment(self, action: Tensor) -> Tensor:
-        """Return the action as it is."""
-        return action
 
     def encode(self, action: Tensor) -> Tensor:
         """Return one-hot rows."""
@@ -151,10 +143,6 @@ class BoundedPoint(ExploringHead):
         full = (*shape, self.num_outputs)
         return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
 
-    def normalise(self, outputs: Tensor) -> Tensor:
-        """Return the outputs as they are."""
-        return outputs
-
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action plus noise, back within the bounds."""
         noisy = self.mode(outputs) + self._epsilon(outputs) * noise
@@ -171,10 +159,6 @@ class BoundedPoint(ExploringHead):
     def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
         """Return K_g^{-1} applied to the outputs, with which the squash commutes."""
         return transform.pull_back_mean(outputs)
-
-    def to_environment(self, action: Tensor) -> Tensor:
-        """Return the action as it is."""
-        return action
 
     def encode(self, action: Tensor) -> Tensor:
         """Return the action's own numbers."""

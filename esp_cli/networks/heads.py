@@ -29,9 +29,9 @@ class Head(nn.Module, ABC):
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw what `sample` needs for actions of `shape`, per seed from its own generator: [S, *shape(, ...)]."""
 
-    @abstractmethod
     def normalise(self, outputs: Tensor) -> Tensor:
-        """Return the form of the network's outputs that all other methods take."""
+        """Return the form of the outputs that all other methods take: as they are, unless a head says more."""
+        return outputs
 
     @abstractmethod
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
@@ -49,9 +49,9 @@ class Head(nn.Module, ABC):
     def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
         """Bring outputs at L_g s home: the result gives action a what `outputs` give to K_g a."""
 
-    @abstractmethod
     def to_environment(self, action: Tensor) -> Tensor:
-        """Return what `Environment.step` takes."""
+        """Return what `Environment.step` takes: the action as it is, unless a head says more."""
+        return action
 
 
 class Categorical(Head):
@@ -99,10 +99,6 @@ class Categorical(Head):
         """Return the log-probabilities that give action a what `log_probs` give to K_g a."""
         return transform.pull_back(log_probs)
 
-    def to_environment(self, action: Tensor) -> Tensor:
-        """Return what `Environment.step` takes."""
-        return action
-
 
 class BoundedGaussian(Head):
     """A Gaussian over an unbounded latent action, squashed to the task's bounds when it is sent to the task.
@@ -133,10 +129,6 @@ class BoundedGaussian(Head):
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
         full = (*shape, self.num_outputs)
         return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
-
-    def normalise(self, outputs: Tensor) -> Tensor:
-        """Return the means as they are."""
-        return outputs
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the latent action mean + std * noise."""
