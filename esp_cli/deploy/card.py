@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from esp_cli import __version__
 from esp_cli.deploy.check import Sample
 from esp_cli.deploy.program import Program
@@ -24,9 +26,10 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
     Args:
         alone: one seed's policy.
         program: the same as plain arrays.
-        sample: of what it does; its first row, with empty memory, is the worked example.
+        sample: of what it does; its first row (of a team its first world), with empty memory, is the worked example.
     """
     config, spec = alone.config, alone.spec
+    first = slice(program.team) if program.team > 1 else 0
     std, robot = {}, {}
     if spec.name == "formation":
         robot["robot"] = {
@@ -66,11 +69,11 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},
         "example": {
-            "observation": sample.obs[0].tolist(),
-            "memory": sample.memory[0].tolist(),
-            "outputs": sample.outputs[0].tolist(),
-            "action": sample.action[0].tolist(),
-            "memory_after": sample.after[0].tolist(),
+            "observation": sample.obs[first].tolist(),
+            "memory": sample.memory[first].tolist(),
+            "outputs": sample.outputs[first].tolist(),
+            "action": sample.action[first].tolist(),
+            "memory_after": sample.after[first].tolist(),
         },
     }
 
@@ -102,6 +105,7 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
     spec = alone.spec
     lines = [f"{title(alone)}.", f"Written by esp {__version__}.", "", "Observation of one agent (float32):"]
     lines += [f"  {span:>7}  {name}: {kind}{_unit(unit)}" for span, name, kind, unit in spec.observation.table()]
+    lines += [_together(program.team)] if program.team > 1 else []
     lines.append("Action of one agent:")
     if isinstance(spec.action, Discrete):
         lines.append(f"  the index of one of {spec.action.count} options, each a {spec.action.kind.value[0]}:")
@@ -115,6 +119,10 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
     if program.memory_width:
         lines.append(f"Memory of one agent: {program.memory_width} numbers, zeros when an episode begins.")
     return "\n".join(lines)
+
+
+def _together(team: int) -> str:
+    return f"The {team} agents of a world hear each other and act together: their rows stand side by side."
 
 
 def _unit(unit: str) -> str:
@@ -134,6 +142,7 @@ def readme(alone: TrainedPolicy, description: dict[str, Any], sections: list[str
     lines += ["## Observation of one agent", "", "| index | field | kind | unit |", "|---|---|---|---|"]
     lines += [f"| {' | '.join(row)} |" for row in spec.observation.table()]
     lines += ["", "The frame is the world's: x to the right, y up, angles counter-clockwise in radians.", ""]
+    lines += [_together(alone.policy.actor.team), ""] if alone.policy.actor.team > 1 else []
     lines += ["## Action", ""]
     if isinstance(spec.action, Discrete):
         shown = list(describe_action(spec.action))
@@ -159,6 +168,6 @@ def readme(alone: TrainedPolicy, description: dict[str, Any], sections: list[str
 
 
 def _shortly(values: Any) -> str:
-    numbers = values if isinstance(values, list) else [values]
+    numbers = np.ravel(values).tolist()
     text = ", ".join(f"{x:.4g}" for x in numbers[:12])
     return f"{text}, ..." if len(numbers) > 12 else text

@@ -63,9 +63,12 @@ class Agreement:
 
 @torch.no_grad()
 def take_sample(alone: TrainedPolicy, program: Program, count: int = OBSERVATIONS) -> Sample:
-    """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones."""
-    met = _met(alone, count // 2)
-    missing = count - len(met[0])
+    """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones.
+
+    Of a team every world is whole, so there may be a few observations more.
+    """
+    met = _met(alone, _whole(count // 2, program.team))
+    missing = _whole(count - len(met[0]), program.team)
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((missing, program.num_inputs), np.float32)
     memory = rng.uniform(-1, 1, (missing, program.memory_width)).astype(np.float32)
@@ -77,6 +80,10 @@ def take_sample(alone: TrainedPolicy, program: Program, count: int = OBSERVATION
     width = action.shape[3:]
     parts = (rows[0], rows[1], outputs, action.reshape(len(rows[0]), *width), after[0])
     return Sample(*(part.numpy() for part in parts))
+
+
+def _whole(count: int, team: int) -> int:
+    return math.ceil(count / team) * team
 
 
 def _met(alone: TrainedPolicy, count: int) -> tuple[Tensor, Tensor]:
@@ -135,8 +142,12 @@ def numpy_runner(file: Path) -> Runner:
     spec.loader.exec_module(module)
 
     def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
-        action, after = module.POLICY.step(obs, memory)
-        return action, module.POLICY.outputs(obs, memory)[0], after
+        count, team = len(obs), module.POLICY.program["team"]
+        lead = (count // team, team) if team > 1 else (count,)
+        given = [rows.reshape(*lead, rows.shape[1]) for rows in (obs, memory)]
+        results = (*module.POLICY.step(*given), module.POLICY.outputs(*given)[0])
+        action, after, outputs = (rows.reshape(count, *rows.shape[len(lead) :]) for rows in results)
+        return action, outputs, after
 
     return run
 
@@ -186,9 +197,19 @@ def c_runner(file: Path, program: Program) -> Runner:
     code = ctypes.CDLL(str(shared))
     pointer = ctypes.POINTER(ctypes.c_float)
     code.esp_policy_outputs.restype = pointer
-    choose = program.head == "choose"
+    choose, team = program.head == "choose", program.team
     act = code.esp_policy_act
-    act.restype = ctypes.c_int if choose else None
+    act.restype = ctypes.c_int if choose and team == 1 else None
+
+    def run_team(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        obs = np.ascontiguousarray(obs)
+        outputs = np.empty((len(obs), program.num_outputs), np.float32)
+        action = np.empty(len(obs), np.intc)
+        for k in range(0, len(obs), team):
+            act(obs[k:].ctypes.data_as(pointer), action[k:].ctypes.data_as(ctypes.POINTER(ctypes.c_int)))
+            for i in range(team):
+                outputs[k + i] = np.ctypeslib.as_array(code.esp_policy_outputs(i), (program.num_outputs,))
+        return action, outputs, memory
 
     def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
         obs, after = np.ascontiguousarray(obs), memory.copy()
@@ -202,7 +223,7 @@ def c_runner(file: Path, program: Program) -> Runner:
             outputs[k] = np.ctypeslib.as_array(code.esp_policy_outputs(), (program.num_outputs,))
         return action, outputs, after
 
-    return run
+    return run if team == 1 else run_team
 
 
 def example_runs(folder: Path) -> bool:

@@ -9,14 +9,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
+
 from esp_cli.deploy import check
 from esp_cli.deploy.c_source import CSource, c_source, example_source
 from esp_cli.deploy.card import describe, readme, summary
 from esp_cli.deploy.check import Agreement, Sample, take_sample
 from esp_cli.deploy.numpy_file import numpy_source
 from esp_cli.deploy.onnx_file import onnx_model
-from esp_cli.deploy.program import Program, program_of
+from esp_cli.deploy.program import Program
 from esp_cli.deploy.torch_file import torch_archive
+from esp_cli.deploy.translate import program_of
 from esp_cli.training.checkpoint import write_bytes_atomic
 from esp_cli.training.loading import TrainedPolicy
 
@@ -94,11 +97,11 @@ def _numpy(job: _Job) -> Files:
 
 def _c(job: _Job) -> Files:
     written, example = c_source(job.program, job.comment), job.description["example"]
-    action = example["action"] if isinstance(example["action"], list) else [example["action"]]
+    observation, action = (np.ravel(example[name]).tolist() for name in ("observation", "action"))
     return {
         "policy.h": written.header.encode(),
         "policy.c": written.source.encode(),
-        "policy_example.c": example_source(job.program, example["observation"], action).encode(),
+        "policy_example.c": example_source(job.program, observation, action).encode(),
     }
 
 

@@ -27,11 +27,13 @@ Action = NDArray[np.int64] | NDArray[np.float32]
 class LoadedPolicy:
     """One seed's policy, ready to act; agents share it, so every row of observations is an agent of its own.
 
-    Shape letters as in `esp_envs.spec`; `...` stands for any leading axes, none among them.
+    Shape letters as in `esp_envs.spec`; `...` stands for any leading axes, none among them. Where agents hear each
+    other (`team` more than 1), the last of the leading axes has the agents of one world.
 
     Attributes:
         spec: of its task: layout of an observation, meaning of the actions.
         memory_width: numbers that it carries from step to step; 0 for one that remembers nothing.
+        team: agents that act together; 1 where each acts by itself.
         source: the file or run folder that it came from.
     """
 
@@ -40,6 +42,7 @@ class LoadedPolicy:
         self.trained = alone
         self.spec: TaskSpec = alone.spec
         self.source = alone.source
+        self.team = alone.policy.actor.team
         self.memory_width = int(alone.policy.initial_memory(1, torch.empty(0)).shape[-1])
 
     def act(self, obs: ArrayLike, rng: np.random.Generator | None = None) -> Action:
@@ -90,19 +93,28 @@ class LoadedPolicy:
                 f"the memory has shape {carried.shape}, but observations of shape {rows.shape} need "
                 f"{(*lead, self.memory_width)}: one row for each agent"
             )
+        space = self.spec.action
+        shape = (*lead, space.width) if isinstance(space, Continuous) else lead
         count = math.prod(lead)  # told to reshape, as it cannot be guessed where a width is 0
+        if not count:
+            return np.zeros(shape, np.float32 if isinstance(space, Continuous) else np.int64), carried
         policy, noise = self.trained.policy, None
         if rng is not None:
             generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
             noise = policy.head.noise((1, count), [generator])
         seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
         action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise)
-        width = (self.spec.action.width,) if isinstance(self.spec.action, Continuous) else ()
-        return action.numpy().reshape((*lead, *width)), after.numpy().reshape((*lead, self.memory_width))
+        return action.numpy().reshape(shape), after.numpy().reshape((*lead, self.memory_width))
 
     def _checked_obs(self, obs: ArrayLike) -> Floats:
         layout = self.spec.observation
-        return self._checked(obs, layout.width, "observation", field_list(layout))
+        rows = self._checked(obs, layout.width, "observation", field_list(layout))
+        if self.team > 1 and rows.shape[-2:-1] != (self.team,):
+            raise ValueError(
+                f"the observation has shape {rows.shape}, but the agents of {self.source} hear each other: give "
+                f"(..., {self.team}, {layout.width}), one row for each agent of a world"
+            )
+        return rows
 
     def _checked(self, values: ArrayLike, width: int, what: str, meaning: str) -> Floats:
         """Return [..., width] float32 after checking that it is that."""

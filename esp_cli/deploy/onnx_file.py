@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 
 from esp_cli import __version__
-from esp_cli.deploy.program import NORM_EPSILON, SQUASH_EPSILON, Activation, Affine, Floats, Norm, Program
+from esp_cli.deploy.program import (
+    NORM_EPSILON,
+    SQUASH_EPSILON,
+    Activation,
+    Affine,
+    Convolution,
+    Cut,
+    Floats,
+    Hear,
+    Largest,
+    Layer,
+    Norm,
+    Program,
+    Recurrent,
+)
 
 OPSET = 17
 """The first with layer normalisation; runtimes since 2022 read it."""
@@ -33,7 +48,8 @@ def onnx_model(program: Program, description: str) -> bytes:
     """Write a program as an ONNX model.
 
     Inputs: `observation` [rows, D] and, of a recurrent policy, `memory` [rows, H]. Outputs: `action` ([rows] int64 or
-    [rows, width] float32), `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H].
+    [rows, width] float32), `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand
+    side by side, world after world.
 
     Args:
         program: the policy.
@@ -54,15 +70,10 @@ def onnx_model(program: Program, description: str) -> bytes:
     if program.previous:
         x = graph.node("Concat", [x, graph.cut("memory", program.hidden, program.memory_width)], axis=1)
     for layer in program.layers:
-        if isinstance(layer, Affine):
-            x = graph.affine(x, layer)
-        elif isinstance(layer, Activation):
-            x = graph.node("Relu" if layer.name == "relu" else "Tanh", [x])
-        elif isinstance(layer, Norm):
-            arrays = [graph.constant(array) for array in layer.arrays]
-            x = graph.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=NORM_EPSILON)
-        else:
+        if isinstance(layer, Recurrent):
             x = hidden = graph.recur(graph.affine(x, layer.input), graph.affine(hidden, layer.recurrent), hidden)
+        else:
+            x = graph.layer(x, layer)
     graph.name(x, "outputs")
     outputs = [value("outputs", float_type, ["rows", program.num_outputs])]
     if program.head == "choose":
@@ -117,6 +128,55 @@ class _Graph:
 
     def affine(self, x: str, layer: Affine) -> str:
         return self.node("Gemm", [x, self.constant(layer.weight), self.constant(layer.bias)])
+
+    def layer(self, x: str, layer: Layer) -> str:
+        """Return what a layer without memory makes of x."""
+        writers: dict[type, Callable[[str, Any], str]] = {
+            Affine: self.affine,
+            Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
+            Norm: self.normalise,
+            Cut: lambda x, layer: self.cut(x, layer.begin, layer.end),
+            Convolution: self.convolve,
+            Largest: lambda x, layer: self.reduce("ReduceMax", self.reshape(x, -1, layer.channels, layer.places), 2),
+            Hear: self.hear,
+        }
+        return writers[type(layer)](x, layer)
+
+    def normalise(self, x: str, layer: Norm) -> str:
+        arrays = [self.constant(array) for array in layer.arrays]
+        return self.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=NORM_EPSILON)
+
+    def reshape(self, value: str, *shape: int) -> str:
+        return self.node("Reshape", [value, self.constant(np.array(shape, np.int64))])
+
+    def reduce(self, kind: str, value: str, axis: int, keepdims: int = 0) -> str:
+        if kind == "ReduceSum":  # of these the first whose axes became an input
+            return self.node(kind, [value, self.constant(np.array([axis], np.int64))], keepdims=keepdims)
+        return self.node(kind, [value], axes=[axis], keepdims=keepdims)
+
+    def convolve(self, x: str, layer: Convolution) -> str:
+        shape = (layer.outputs, layer.channels, layer.side, layer.side)
+        weight = self.constant(layer.weight.T.reshape(shape))
+        pictures = self.reshape(x, -1, layer.channels, layer.rows, layer.columns)
+        out = self.node("Conv", [pictures, weight, self.constant(layer.bias)], strides=[layer.stride, layer.stride])
+        return self.reshape(out, -1, layer.width)
+
+    def hear(self, x: str, layer: Hear) -> str:
+        """Return own features beside the means over the near."""
+        number = [self.constant(np.array(value, np.float32)) for value in (1, layer.reach_squared, layer.reach)]
+        one, reach_squared, reach = number
+        others = layer.team - 1
+        ways = self.reshape(self.cut("observation", layer.begin, layer.end), -1, others, 2)
+        squares = self.reduce("ReduceSum", self.node("Mul", [ways, ways]), 2, keepdims=1)
+        near = self.node("Cast", [self.node("Less", [squares, reach_squared])], to=self.onnx.TensorProto.FLOAT)
+        count = self.node("Add", [self.reduce("ReduceSum", near, 1, keepdims=1), one])
+        share = self.node("Div", [near, count])  # [rows, N - 1, 1]
+        mean_way = self.reduce("ReduceSum", self.node("Mul", [share, self.node("Div", [ways, reach])]), 1)
+        index = self.constant(np.array(layer.others, np.int64))
+        said = self.node("Gather", [self.reshape(x, -1, layer.team, layer.width), index], axis=1)
+        said = self.reshape(said, -1, others, layer.width)
+        heard = self.reduce("ReduceSum", self.node("Mul", [share, said]), 1)
+        return self.node("Concat", [x, mean_way, heard], axis=1)
 
     def recur(self, p: str, q: str, hidden: str) -> str:
         """Return the next hidden state from both projections."""

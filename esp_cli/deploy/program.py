@@ -3,28 +3,23 @@
 A program maps a row of observation, and of memory where it has one, to outputs, an action and the next memory:
 
     x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
-    x = layer(x) for each layer            affine x W + b, activation, layer normalisation, gated recurrent unit
+    x = layer(x) for each layer            affine x W + b, activation, layer normalisation, gated recurrent unit;
+                                           for pictures a cut, convolutions, the largest response, and what is heard
     action = argmax(x)                     head `choose`, or
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
-The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice.
+The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
+agents hear each other, the rows of a world's agents stand side by side.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
-
-from esp_cli.networks.bodies import GRU, MLP
-from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
-from esp_cli.networks.heads import BoundedGaussian, Categorical
-from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
-from esp_cli.networks.policy import HistoryPolicy, Policy
-from esp_cli.networks.separate import Separate
 
 Floats = NDArray[np.float32]
 
@@ -109,7 +104,117 @@ class Recurrent:
         return self.input.flops + self.recurrent.flops + 14 * self.hidden
 
 
-Layer = Affine | Norm | Activation | Recurrent
+@dataclass(frozen=True)
+class Cut:
+    """Columns `begin` to `end` of a row."""
+
+    begin: int
+    end: int
+
+    @property
+    def arrays(self) -> tuple[Floats, ...]:
+        """Nothing: it learned nothing."""
+        return ()
+
+    @property
+    def flops(self) -> int:
+        """None."""
+        return 0
+
+
+@dataclass(frozen=True)
+class Convolution(Learned):
+    """A filter of side k at every `stride`-th place: [channels x rows x columns] to [outputs x h x w], channels first.
+
+    The weight is [channels * k * k, outputs], counted by channel, then row, then column.
+    """
+
+    channels: int
+    rows: int
+    columns: int
+    side: int
+    stride: int
+
+    @property
+    def outputs(self) -> int:
+        """Channels that it gives."""
+        return self.bias.size
+
+    @property
+    def places(self) -> tuple[int, int]:
+        """Rows h and columns w of what it gives."""
+        return (self.rows - self.side) // self.stride + 1, (self.columns - self.side) // self.stride + 1
+
+    @property
+    def width(self) -> int:
+        """Numbers that it gives."""
+        return self.outputs * self.places[0] * self.places[1]
+
+    @property
+    def flops(self) -> int:
+        """A multiplication and an addition for each weight and place."""
+        return 2 * self.weight.size * self.places[0] * self.places[1]
+
+
+@dataclass(frozen=True)
+class Largest:
+    """The largest number of each channel: [channels x places] to [channels]."""
+
+    channels: int
+    places: int
+
+    @property
+    def arrays(self) -> tuple[Floats, ...]:
+        """Nothing: it learned nothing."""
+        return ()
+
+    @property
+    def flops(self) -> int:
+        """A comparison for each place but the first."""
+        return self.channels * (self.places - 1)
+
+
+@dataclass(frozen=True)
+class Hear:
+    """Own features x beside what the near ones say: [x, mean of their way / reach, mean of their x].
+
+    The others of the team stand in the observation's columns from `begin`, two numbers each, in the team's order
+    without the agent itself. Near are those whose squared distance is less than `reach_squared`; the means divide by
+    their number and one, for the agent itself.
+    """
+
+    begin: int
+    team: int
+    width: int
+    reach_squared: float
+
+    @property
+    def end(self) -> int:
+        """The column behind the last way."""
+        return self.begin + 2 * (self.team - 1)
+
+    @property
+    def reach(self) -> float:
+        """In which ways are measured."""
+        return math.sqrt(self.reach_squared)
+
+    @property
+    def others(self) -> list[list[int]]:
+        """For each agent the others, in their order."""
+        return [[j for j in range(self.team) if j != i] for i in range(self.team)]
+
+    @property
+    def arrays(self) -> tuple[Floats, ...]:
+        """Nothing: it learned nothing."""
+        return ()
+
+    @property
+    def flops(self) -> int:
+        """For each other distance (3), comparison, count, and two operations for each number of way and features."""
+        return (self.team - 1) * (9 + 2 * self.width) + 4
+
+
+Layer = Affine | Norm | Activation | Recurrent | Cut | Convolution | Largest | Hear
 
 
 @dataclass(frozen=True)
@@ -124,6 +229,7 @@ class Program:
         previous: numbers of the previous action in the memory.
         head: how the outputs become an action.
         groups: widths of what is squashed together; empty where the head chooses.
+        team: agents that act together, with their rows side by side; 1 where each acts by itself.
     """
 
     num_inputs: int
@@ -133,6 +239,7 @@ class Program:
     previous: int
     head: Literal["choose", "squash"]
     groups: tuple[int, ...]
+    team: int = 1
 
     @property
     def memory_width(self) -> int:
@@ -164,6 +271,7 @@ class Program:
             "previous": self.previous,
             "head": self.head,
             "groups": list(self.groups),
+            "team": self.team,
             "layers": [_describe(layer) for layer in self.layers],
         }
 
@@ -175,88 +283,16 @@ def _describe(layer: Layer) -> dict[str, object]:
         return {"kind": "norm", "width": layer.weight.size}
     if isinstance(layer, Activation):
         return {"kind": layer.name, "width": layer.width}
+    if isinstance(layer, Cut):
+        return {"kind": "cut", "begin": layer.begin, "end": layer.end}
+    if isinstance(layer, Convolution):
+        return {"kind": "convolution", **_named(layer, "channels", "rows", "columns", "side", "stride", "outputs")}
+    if isinstance(layer, Largest):
+        return {"kind": "largest", "channels": layer.channels, "places": layer.places}
+    if isinstance(layer, Hear):
+        return {"kind": "hear", **_named(layer, "begin", "end", "team", "reach_squared")}
     return {"kind": "gru", "inputs": layer.input.weight.shape[0], "hidden": layer.hidden}
 
 
-def program_of(policy: Policy) -> Program:
-    """Return the program of a policy with a single seed.
-
-    Raises:
-        ValueError: a network or head that exports do not know.
-    """
-    actor, head = policy.actor, policy.head
-    parts = actor.parts if isinstance(actor, Separate) else None
-    actor = actor.network if isinstance(actor, Separate) else actor
-    if isinstance(actor, MLP):
-        layers = _perceptron(actor)
-    elif isinstance(actor, GRU):
-        norm = [_norm(actor.norm)] if isinstance(actor.norm, SeedLayerNorm) else []
-        unit = Recurrent(_affine(actor.gru.input), _affine(actor.gru.recurrent))
-        layers = [*_perceptron(actor.body), unit, *norm, _affine(actor.head)]
-    else:
-        raise ValueError(f"a network of the kind {type(actor).__name__} cannot be exported; mlp and gru can")
-    if parts is not None:
-        layers.append(_sums(parts))
-    if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
-        groups: tuple[int, ...] = ()
-    elif isinstance(head, BoundedGaussian | BoundedPoint):
-        groups = _groups(head.disc)
-    else:
-        raise ValueError(f"a head of the kind {type(head).__name__} cannot be exported")
-    hidden = actor.memory_width
-    previous = policy.head.action_width if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
-    first = next(layer for layer in layers if not isinstance(layer, Activation))
-    width = first.weight.shape[0] if isinstance(first, Affine | Norm) else first.input.weight.shape[0]
-    return Program(
-        num_inputs=width - previous,
-        layers=tuple(layers),
-        num_outputs=head.num_outputs,
-        hidden=hidden,
-        previous=previous,
-        head="squash" if groups else "choose",
-        groups=groups,
-    )
-
-
-def _perceptron(mlp: SeedMLP) -> list[Layer]:
-    """Return the layers in the order in which `SeedMLP` applies them."""
-    norms = None if mlp.norms is None else [_norm(norm) for norm in mlp.norms]
-    layers: list[Layer] = [norms[0]] if norms else []
-    last = len(mlp.layers) - 1
-    for k, linear in enumerate(mlp.layers):
-        affine = _affine(linear)
-        layers.append(affine)
-        if k < last or mlp.activate_output:
-            layers.append(Activation("relu" if mlp.activation == "relu" else "tanh", affine.bias.size))
-            layers += [norms[k + 1]] if norms else []
-    return layers
-
-
-def _affine(linear: object) -> Affine:
-    assert isinstance(linear, SeedLinear)
-    return Affine(_plain(linear.weight[0]), _plain(linear.bias[0, 0]))
-
-
-def _sums(parts: Tensor) -> Affine:
-    """Return the sums of an action's parts as one more layer."""
-    matrix = _plain(parts)
-    return Affine(matrix, np.zeros(matrix.shape[1], np.float32))
-
-
-def _norm(norm: object) -> Norm:
-    assert isinstance(norm, SeedLayerNorm)
-    return Norm(_plain(norm.weight[0, 0]), _plain(norm.bias[0, 0]))
-
-
-def _plain(tensor: Tensor) -> Floats:
-    return tensor.detach().cpu().float().numpy().copy()
-
-
-def _groups(disc: Tensor) -> tuple[int, ...]:
-    """Return the widths of the blocks of a block-diagonal matrix of ones."""
-    widths, place = [], 0
-    while place < len(disc):
-        width = int(disc[place].sum())
-        widths.append(width)
-        place += width
-    return tuple(widths)
+def _named(layer: Layer, *names: str) -> dict[str, object]:
+    return {name: getattr(layer, name) for name in names}

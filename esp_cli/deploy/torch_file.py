@@ -7,7 +7,20 @@ from io import BytesIO
 import torch
 from torch import Tensor, nn
 
-from esp_cli.deploy.program import NORM_EPSILON, SQUASH_EPSILON, Activation, Affine, Norm, Program
+from esp_cli.deploy.program import (
+    NORM_EPSILON,
+    SQUASH_EPSILON,
+    Activation,
+    Affine,
+    Convolution,
+    Cut,
+    Hear,
+    Largest,
+    Layer,
+    Norm,
+    Program,
+    Recurrent,
+)
 
 
 class TorchProgram(nn.Module):
@@ -16,6 +29,7 @@ class TorchProgram(nn.Module):
     Shape:
         observation: [rows, D]; memory: [rows, H], for recurrent policies.
         Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
+        A team's rows stand side by side, world after world.
     """
 
     def __init__(self, program: Program) -> None:
@@ -33,14 +47,10 @@ class TorchProgram(nn.Module):
             x = torch.cat([x, memory[:, program.hidden :]], 1)
         for k, layer in enumerate(program.layers):
             arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
-            if isinstance(layer, Affine):
-                x = torch.addmm(arrays[1], x, arrays[0])
-            elif isinstance(layer, Activation):
-                x = torch.relu(x) if layer.name == "relu" else torch.tanh(x)
-            elif isinstance(layer, Norm):
-                x = nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], NORM_EPSILON)
-            else:
+            if isinstance(layer, Recurrent):
                 x = hidden = _recur(x, hidden, arrays)
+            else:
+                x = _apply(x, layer, arrays, observation)
         if program.head == "choose":
             action = x.argmax(-1)
             done = nn.functional.one_hot(action, program.num_outputs).float()
@@ -52,21 +62,56 @@ class TorchProgram(nn.Module):
 
 
 def torch_archive(program: Program, description: str) -> bytes:
-    """Write a program as an archive of torch.export, for any number of rows.
+    """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team.
 
     Args:
         program: the policy.
         description: JSON that goes into the archive as `policy.json`.
     """
-    rows = torch.export.Dim("rows", min=1)
-    arguments = [torch.zeros(2, program.num_inputs)]
+    worlds = torch.export.Dim("worlds", min=1)
+    rows = worlds if program.team == 1 else program.team * worlds
+    arguments = [torch.zeros(2 * program.team, program.num_inputs)]
     if program.memory_width:
-        arguments.append(torch.zeros(2, program.memory_width))
+        arguments.append(torch.zeros(2 * program.team, program.memory_width))
     shapes = tuple({0: rows} for _ in arguments)
     exported = torch.export.export(TorchProgram(program).eval(), tuple(arguments), dynamic_shapes=shapes)
     content = BytesIO()
     torch.export.save(exported, content, extra_files={"policy.json": description})
     return content.getvalue()
+
+
+def _apply(x: Tensor, layer: Layer, arrays: list[Tensor], observation: Tensor) -> Tensor:
+    """Apply a layer without memory."""
+    if isinstance(layer, Affine):
+        return torch.addmm(arrays[1], x, arrays[0])
+    if isinstance(layer, Activation):
+        return torch.relu(x) if layer.name == "relu" else torch.tanh(x)
+    if isinstance(layer, Norm):
+        return nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], NORM_EPSILON)
+    if isinstance(layer, Cut):
+        return x[:, layer.begin : layer.end]
+    if isinstance(layer, Convolution):
+        return _convolve(x, layer, arrays)
+    if isinstance(layer, Hear):
+        return _hear(x, observation, layer)
+    assert isinstance(layer, Largest)
+    return x.unflatten(1, (layer.channels, layer.places)).amax(2)
+
+
+def _convolve(x: Tensor, layer: Convolution, arrays: list[Tensor]) -> Tensor:
+    """Apply filters to rows that hold pictures."""
+    weight = arrays[0].T.reshape(layer.outputs, layer.channels, layer.side, layer.side)
+    pictures = x.unflatten(1, (layer.channels, layer.rows, layer.columns))
+    return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
+
+
+def _hear(x: Tensor, observation: Tensor, layer: Hear) -> Tensor:
+    """Put what the near ones say beside each agent's own features."""
+    ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
+    near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()
+    share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
+    said = x.unflatten(0, (-1, layer.team))[:, torch.tensor(layer.others)].flatten(0, 1)
+    return torch.cat([x, (share * (ways / layer.reach)).sum(1), (share * said).sum(1)], 1)
 
 
 def _recur(x: Tensor, hidden: Tensor, arrays: list[Tensor]) -> Tensor:

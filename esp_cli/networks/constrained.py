@@ -125,13 +125,13 @@ class Equivariant(Network):
         self.layers = nn.ModuleList(
             ConstrainedLinear(generators, a, b, gain) for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
         )
-        self.activate = torch.relu if config.activation == "relu" else torch.tanh
+        self.activation = config.activation
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, B, in] to [S, B, out]."""
         *hidden, last = self.layers
         for layer in hidden:
-            x = self.activate(layer(x))
+            x = torch.relu(layer(x)) if self.activation == "relu" else torch.tanh(layer(x))
         return last(x)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:

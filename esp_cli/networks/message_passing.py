@@ -25,8 +25,9 @@ from esp_envs.spec import Field, Items, Kind, Layout
 
 CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
 """Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
-REACH = 3 * math.sqrt(2)
-"""Drones nearer than this exchange messages, in cells; van der Pol's code."""
+REACH_SQUARED = 18.0
+"""Drones nearer than its root, 3 sqrt 2 cells, exchange messages; van der Pol's code. Squares of cells are integers, so
+whether two that are just so far apart hear each other (they do not) depends on no rounding."""
 _LOT = 16
 """Different pictures are encoded in multiples of this, so that few lengths of products occur."""
 
@@ -176,7 +177,7 @@ class MessagePassing(Network):
             )
         picture, others = _fields(ports)
         self.group = ports.group("c1" if config.name == "mpn" else config.group)
-        self.num_agents = ports.spec.num_agents
+        self.team = ports.spec.num_agents
         self.picture, self.others = (ports.layout.slices()[field.name] for field in (picture, others))
         self.encoder = PictureEncoder(generators, picture, self.group)
         (vector,) = layout_blocks(Layout((Field("way", Kind.VECTOR),)), self.group)
@@ -188,7 +189,7 @@ class MessagePassing(Network):
             block = following
         self.layers = nn.ModuleList(layers)
         self.head = ConstrainedLinear(generators, [block], ports.outputs(self.group), output_gain)
-        index = [[j for j in range(self.num_agents) if j != i] for i in range(self.num_agents)]
+        index = [[j for j in range(self.team) if j != i] for i in range(self.team)]
         self.index: Tensor
         self.register_buffer("index", torch.tensor(index), False)
 
@@ -198,10 +199,10 @@ class MessagePassing(Network):
 
     def features(self, x: Tensor) -> list[Tensor]:
         """Return the features [S, W * N, C] behind the encoder and behind each message passing layer."""
-        way = x[..., self.others].unflatten(-1, (-1, 2)) / REACH
-        near = (way.square().sum(-1) < 1).float()
+        way = x[..., self.others].unflatten(-1, (-1, 2))
+        near = (way.square().sum(-1) < REACH_SQUARED).float()
         share = near / (1 + near.sum(-1, keepdim=True))  # [S, W * N, N - 1]
-        mean_way = (share.unsqueeze(-1) * way).sum(-2)
+        mean_way = (share.unsqueeze(-1) * (way / math.sqrt(REACH_SQUARED))).sum(-2)
         features = [self.encoder(x[..., self.picture])]
         for layer in self.layers:
             own = features[-1]
@@ -211,10 +212,10 @@ class MessagePassing(Network):
 
     def _hear(self, own: Tensor, share: Tensor) -> Tensor:
         """Return for each drone the sum of the others' features by their shares: [S, W * N, C]."""
-        worlds = own.unflatten(1, (-1, self.num_agents))
-        shares = share.unflatten(1, (-1, self.num_agents)).unsqueeze(-1)
+        worlds = own.unflatten(1, (-1, self.team))
+        shares = share.unflatten(1, (-1, self.team)).unsqueeze(-1)
         heard = torch.zeros_like(worlds)
-        for k in range(self.num_agents - 1):
+        for k in range(self.team - 1):
             heard = torch.addcmul(heard, shares[:, :, :, k], worlds[:, :, self.index[:, k]])
         return heard.flatten(1, 2)
 
@@ -224,7 +225,7 @@ class MessagePassing(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""
-        worlds = x.unflatten(1, (-1, self.num_agents)).transpose(2, 3)  # [S, W, T, N, D]
+        worlds = x.unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
         outputs = self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4])
         return outputs.transpose(2, 3).flatten(1, 2)
 

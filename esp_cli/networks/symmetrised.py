@@ -30,6 +30,7 @@ class Symmetrised(Network):
         self.network = network
         self.group = ports.group(group)
         self.memory_width = network.memory_width * self.group.order
+        self.team = network.team
         planar = planar_matrices(self.group)
         self.pictured = any(field.pixels is not None for field in ports.layout.fields)
         self.push: Tensor

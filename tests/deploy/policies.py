@@ -26,21 +26,27 @@ KINDS = {
     "exploring choice, recurrent": ("navigation", "maddpg", {"network.name": "gru"}),
     "point, recurrent": ("navigation", "maddpg", {"network.name": "gru", "task.actions": "continuous"}),
     "point": ("formation", "maddpg", {}),
+    "equivariant": ("navigation", "mappo", {"network.name": "equivariant"}),
+    "team": ("wildlife", "mappo", {}),
 }
-"""Every head, on a perceptron and on a recurrent network where they differ."""
+"""Every head, on a perceptron and on a recurrent network where they differ; every network."""
+LARGE = {"team, values, equivariant": ("wildlife", "qmix", {"network.name": "empn"})}
+"""Exported alike; a comparison on thousands of observations takes long."""
+REFUSED = {"ensemble": ("navigation", "mappo", {"network.symmetrise": "c4"})}
+"""What no export takes."""
 
 
 def drawn_policy(kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10)) -> TrainedPolicy:
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
-    task, algorithm, settings = KINDS[kind]
+    task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
     overrides = {"network.hidden": list(hidden), **settings}
     config = resolve_config(task, algorithm, seeds=seeds, steps=100, overrides=overrides)
     spec = build_environment(config, 1, "shape").spec
     policy = ALGORITHMS[algorithm].build_policy(spec, config.network, generators(seeds, "shape")).eval()
-    generator = torch.Generator().manual_seed(1)
+    generator, size = torch.Generator().manual_seed(1), 0.1 if policy.actor.team > 1 else 0.3  # pictures sum up more
     with torch.no_grad():
         for parameter in policy.parameters():
-            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=0.3)
+            parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=size)
     return TrainedPolicy(config, policy, spec, 100, Path("drawn"))
 
 

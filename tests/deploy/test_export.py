@@ -14,10 +14,11 @@ import torch
 
 from esp_cli.deploy import check, onnx_file
 from esp_cli.deploy.c_source import c_source
-from esp_cli.deploy.check import OBSERVATIONS, compare, take_sample
+from esp_cli.deploy.check import compare, take_sample
 from esp_cli.deploy.export import WRITERS, export
-from esp_cli.deploy.program import Affine, Recurrent, program_of
+from esp_cli.deploy.program import Affine, Recurrent
 from esp_cli.deploy.takeaway.runtime import NumpyPolicy
+from esp_cli.deploy.translate import program_of
 from esp_cli.training.trainer import build_environment
 from tests.deploy.policies import KINDS, drawn_policy
 
@@ -32,18 +33,18 @@ def test_exports_agree_with_the_policy(kind: str, tmp_path: Path) -> None:
     assert [result.name for result in results] == list(FAST)
     for result in results:
         assert result.agreement is not None
-        assert result.agreement.observations == OBSERVATIONS == 10_000
+        assert result.agreement.observations == (10_002 if kind.startswith("team") else 10_000)
         assert result.agreement.max_difference < 5e-5
         assert (result.agreement.other_actions or 0) <= 2
         assert (result.agreement.other_actions is None) == (kind in ("vector", "wheels", "point", "point, recurrent"))
         assert all((tmp_path / "out" / file).stat().st_size for file in result.files)
 
 
-@pytest.mark.parametrize("kind", ["wheels", "values, recurrent"])
+@pytest.mark.parametrize("kind", ["wheels", "values, recurrent", "team"])
 def test_torch_archives_agree_with_the_policy(kind: str, tmp_path: Path) -> None:
     (result,) = export(drawn_policy(kind), ["torch"], tmp_path).formats
     assert result.agreement is not None
-    assert result.agreement.observations == 10_000
+    assert result.agreement.observations >= 10_000
     assert result.agreement.max_difference < 5e-5
 
 

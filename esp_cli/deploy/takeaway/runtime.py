@@ -8,7 +8,7 @@ import numpy as np
 
 
 class NumpyPolicy:
-    """One greedy policy; every row of observations is an agent of its own.
+    """One greedy policy; every row of observations is an agent of its own, or those of a team stand side by side.
 
     Args:
         program: layers and head.
@@ -19,19 +19,19 @@ class NumpyPolicy:
         self.program = program
         self.hidden, self.previous = program["hidden"], program["previous"]
         numbers = np.frombuffer(weights, "<f4").astype(np.float32)
-        self.layers: list[tuple[str, list[Any]]] = []
+        self.layers: list[tuple[dict[str, Any], list[Any]]] = []
         for layer in program["layers"]:
             arrays = []
             for shape in _shapes(layer):
                 count = int(np.prod(shape))
                 arrays.append(numbers[:count].reshape(shape))
                 numbers = numbers[count:]
-            self.layers.append((layer["kind"], arrays))
+            self.layers.append((layer, arrays))
         if numbers.size:
             raise ValueError("the weights do not fit the layers; export the policy again")
 
     def act(self, obs: Any) -> Any:
-        """Return the actions [...] or [..., width] of agents that see obs [..., D]."""
+        """Return the actions [...] or [..., width] of agents that see obs [..., D], a team's [..., N, D]."""
         if self.hidden:
             raise ValueError("this policy remembers: begin with initial_memory(), and call step(obs, memory)")
         return self.step(obs, np.zeros((*np.shape(obs)[:-1], 0), np.float32))[0]
@@ -55,23 +55,17 @@ class NumpyPolicy:
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
+        if self.program["team"] > 1 and x.shape[-2:-1] != (self.program["team"],):
+            raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['team']}, D) is needed")
         if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
             raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")
         hidden = memory[..., : self.hidden]
-        x = np.concatenate([x, memory[..., self.hidden :]], -1)
-        for kind, arrays in self.layers:
-            if kind == "affine":
-                x = x @ arrays[0] + arrays[1]
-            elif kind == "relu":
-                x = np.maximum(x, 0)
-            elif kind == "tanh":
-                x = np.tanh(x)
-            elif kind == "norm":
-                centred = x - x.mean(-1, keepdims=True)
-                x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
-                x = x * arrays[0] + arrays[1]
-            else:
+        obs, x = x, np.concatenate([x, memory[..., self.hidden :]], -1)
+        for layer, arrays in self.layers:
+            if layer["kind"] == "gru":
                 x = hidden = _recur(x, hidden, arrays)
+            else:
+                x = _apply(x, layer, arrays, obs)
         return x, hidden
 
     def _squash(self, outputs: Any) -> Any:
@@ -95,12 +89,58 @@ def _recur(x: Any, hidden: Any, arrays: list[Any]) -> Any:
     return candidate + update * (hidden - candidate)
 
 
+def _apply(x: Any, layer: dict[str, Any], arrays: list[Any], obs: Any) -> Any:
+    """Apply a layer without memory."""
+    kind = layer["kind"]
+    if kind == "affine":
+        x = x @ arrays[0] + arrays[1]
+    elif kind == "relu":
+        x = np.maximum(x, 0)
+    elif kind == "tanh":
+        x = np.tanh(x)
+    elif kind == "norm":
+        centred = x - x.mean(-1, keepdims=True)
+        x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
+        x = x * arrays[0] + arrays[1]
+    elif kind == "cut":
+        x = x[..., layer["begin"] : layer["end"]]
+    elif kind == "convolution":
+        x = _convolve(x, layer, arrays)
+    elif kind == "largest":
+        x = x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1)
+    else:
+        x = _hear(x, layer, obs)
+    return x
+
+
+def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any]) -> Any:
+    """Apply filters to rows that hold pictures, channels first."""
+    side, stride = layer["side"], layer["stride"]
+    pictures = x.reshape(*x.shape[:-1], layer["channels"], layer["rows"], layer["columns"])
+    seen = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
+    patches = np.moveaxis(seen, -5, -3).reshape(*seen.shape[:-5], seen.shape[-4] * seen.shape[-3], -1)
+    return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], -1)
+
+
+def _hear(x: Any, layer: dict[str, Any], obs: Any) -> Any:
+    """Put what the near ones say beside each agent's own features."""
+    team, reach_squared = layer["team"], np.float32(layer["reach_squared"])
+    ways = obs[..., layer["begin"] : layer["end"]].reshape(*obs.shape[:-1], team - 1, 2)
+    near = ((ways * ways).sum(-1, keepdims=True) < reach_squared).astype(np.float32)
+    share = near / (1 + near.sum(-2, keepdims=True))  # [..., N, N - 1, 1]
+    others = [[j for j in range(team) if j != i] for i in range(team)]
+    heard = (share * x[..., others, :]).sum(-2)
+    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), heard], -1)
+
+
 def _shapes(layer: dict[str, Any]) -> list[tuple[int, ...]]:
     """Return the shapes of a layer's arrays, in their order."""
     if layer["kind"] == "affine":
         return [(layer["inputs"], layer["outputs"]), (layer["outputs"],)]
     if layer["kind"] == "norm":
         return [(layer["width"],)] * 2
+    if layer["kind"] == "convolution":
+        return [(layer["channels"] * layer["side"] ** 2, layer["outputs"]), (layer["outputs"],)]
     if layer["kind"] == "gru":
         wide = 3 * layer["hidden"]
         return [(layer["inputs"], wide), (wide,), (layer["hidden"], wide), (wide,)]
