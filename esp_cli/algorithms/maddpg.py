@@ -18,8 +18,8 @@ from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.bodies import MLP, NetworkConfig
-from esp_cli.networks.exchange import in_a_circle, with_one_exchanged
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
+from esp_cli.networks.joint import OneValueEach
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import PriorConfig, policy_consistency_loss
 from esp_cli.symmetry import Transform
@@ -126,7 +126,8 @@ class Maddpg(OffPolicyLearner):
         super().__init__(env, config, network, prior, generators, prior_generators)
         self.config, spec = config, self.spec
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
-        self.shared = spec.shared_reward
+        if not spec.shared_reward:
+            self.joint = OneValueEach(spec, config.critic_input)
         plain = {"name": "mlp", "activation": config.critic_activation, "symmetrise": None}
         shape = network.model_copy(update=plain)
         width = self.critic_width + spec.num_agents * self.head.action_width
@@ -163,7 +164,7 @@ class Maddpg(OffPolicyLearner):
 
     def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
         """Return S_pi and S_Q of a batch with its copies."""
-        values = self._value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
+        values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
         valid = rows.valid[:, : rows.valid.shape[1] // (1 + len(transforms))]
         outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
         return {
@@ -176,7 +177,7 @@ class Maddpg(OffPolicyLearner):
     ) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q."""
         count = batch.obs.shape[1]
-        values = self._value(self.critic, seen[:, :, :-1], self.head.encode(rows.action))
+        values = self.joint.value(self.critic, seen[:, :, :-1], self.head.encode(rows.action))
         target = self._targets(batch, seen[:, :count])
         learned, valid = values[:, :count], batch.valid
         if self.prior.config.augments_batches:
@@ -218,32 +219,6 @@ class Maddpg(OffPolicyLearner):
         metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
         return metrics | {name: masked_mean(x, used.valid) for name, x in self.head.statistics(learned).items()}
 
-    def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
-        """Return what the critic sees beside actions: [S, B, T + 1, critic width], or one such row per agent.
-
-        Where rewards are each agent's own, all agents share one critic, which sees them in a circle that ends with
-        the agent whose value it tells; beside a global state, it sees that agent's observation.
-        """
-        if self.shared:
-            return super()._critic_rows(batch)
-        if self.config.critic_input == "observations":
-            return self._with_time(in_a_circle(batch.obs))
-        state = batch.state.unsqueeze(-2).expand(*batch.obs.shape[:-1], -1)
-        return self._with_time(torch.cat([state, batch.obs], -1))
-
-    @property
-    def critic_width(self) -> int:
-        """Numbers that the critic sees of a state."""
-        own = 0 if self.shared or self.config.critic_input == "observations" else self.spec.observation.width
-        return super().critic_width + own
-
-    def _value(self, critic: MLP, seen: Tensor, action: Tensor) -> Tensor:
-        """Return Q [S, B, T, C] of encoded joint actions [S, B, T, N, width]; C is 1 or N."""
-        joint = action.flatten(-2) if self.shared else in_a_circle(action)
-        rows = torch.cat([seen, joint], -1)
-        values = critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
-        return values if self.shared else values.squeeze(-1)
-
     def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, stored: Tensor) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
@@ -257,38 +232,18 @@ class Maddpg(OffPolicyLearner):
         joint = own if self.config.actor_actions == "all" else head.encode(stored)
         if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):
             others = head.choices.expand(*own.shape, -1)
-            values = self._exchanged(seen, joint.detach(), others)
+            values = self.joint.exchanged(self.critic, seen, joint.detach(), others)
             return (outputs.exp() * values).sum(-1)
         if self.config.actor_actions == "all":
-            return self._value(self.critic, seen, own)
-        return self._exchanged(seen, joint, own.unsqueeze(-2)).squeeze(-1)
-
-    def _exchanged(self, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-        """Return each agent's Q if it alone did otherwise.
-
-        Args:
-            seen: [S, B, T(, N), critic width].
-            joint: [S, B, T, N, width] encoded actions.
-            others: [S, B, T, N, K, width] what each might do instead.
-
-        Returns:
-            [S, B, T, N, K].
-        """
-        if not self.shared:  # of the actions in an agent's row, its own stands last and is exchanged alone
-            width = joint.shape[-1]
-            seen = torch.cat([seen, in_a_circle(joint)[..., :-width]], -1)
-            joint, others = joint.unsqueeze(-2), others.unsqueeze(-3)
-        shape = joint.shape[1:-2]
-        rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
-        values = with_one_exchanged(self.critic, *rows).unflatten(1, shape).squeeze(-1)
-        return values if self.shared else values.squeeze(-2)
+            return self.joint.value(self.critic, seen, own)
+        return self.joint.exchanged(self.critic, seen, joint, own.unsqueeze(-2)).squeeze(-1)
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
         outputs = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
         following = self.head.encode(self.head.mode(outputs))
-        return self._td_targets(batch, batch.reward, self._value(self.target_critic, seen[:, :, 1:], following))
+        return self._td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))
 
     def _policy_gap(self, outputs: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
         """Return S_pi (Eq. 8) per seed, averaged over the copies; outputs [S, B (1 + copies), T, N, ...]."""

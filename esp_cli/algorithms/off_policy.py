@@ -16,6 +16,7 @@ from esp_cli.algorithms.losses import clip_gradients_per_seed, masked_mean, td_t
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.joint import OneValue
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior, value_consistency_loss
 from esp_cli.symmetry import Transform
@@ -79,6 +80,7 @@ class OffPolicyLearner(Learner):
             raise ValueError(
                 f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
             )
+        self.joint = OneValue(spec, config.critic_input)
         self.policy = self.build_policy(spec, network, generators).to(device)  # type: ignore[assignment]
         self.reward_scale = ValueNormaliser(env.num_seeds, config.reward_decay**config.num_envs).to(device)
         self.replay = EpisodeReplay(spec, env.num_seeds, config.replay_episodes, device)
@@ -95,9 +97,7 @@ class OffPolicyLearner(Learner):
     @property
     def critic_width(self) -> int:
         """Numbers that the critic or the mixer sees of a state."""
-        spec, config = self.spec, self.off_policy
-        seen = spec.state.width if config.critic_input == "state" else spec.num_agents * spec.observation.width
-        return seen + config.critic_sees_time
+        return self.joint.width + self.off_policy.critic_sees_time
 
     def iterate(self, progress: float) -> dict[str, Tensor]:
         """Collect episodes, learn from the replay, and return metrics, each [S]."""
@@ -155,8 +155,8 @@ class OffPolicyLearner(Learner):
         return EpisodeBatch.concatenate([batch, *(batch.transformed(g) for g in transforms)])
 
     def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
-        """Return what the critic or the mixer sees of every state: [S, B, T + 1, critic width]."""
-        return self._with_time(batch.state if self.off_policy.critic_input == "state" else batch.obs.flatten(-2))
+        """Return what the critic or the mixer sees of every state: [S, B, T + 1(, N), critic width]."""
+        return self._with_time(self.joint.rows(batch.obs, batch.state))
 
     def _with_time(self, rows: Tensor) -> Tensor:
         """Append the share of the horizon gone, where the critic sees it, to rows [S, B, T + 1, ..., width]."""

@@ -69,7 +69,7 @@ def own_rewards(**choice):
 def test_agents_with_rewards_of_their_own_share_a_critic_that_sees_them_last():
     trained, episodes, done = own_rewards()
     seen = trained._critic_rows(episodes)[:, :, :-1]
-    value = trained._value(trained.critic, seen, trained.head.encode(done))
+    value = trained.joint.value(trained.critic, seen, trained.head.encode(done))
     torch.testing.assert_close(value, torch.tensor([321.0, 132.0, 213.0]).expand(2, 2, 25, 3))
 
 

@@ -1,0 +1,91 @@
+"""How a centralised critic is asked: once for the team, or once for each agent where their rewards are their own.
+
+Shape letters: S seeds, W agents' scenes (any axes), N agents, C values (1 or N), A numbers of an encoded action.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from esp_cli.networks.exchange import in_a_circle, with_one_exchanged
+from esp_cli.networks.layers import SeedMLP
+from esp_envs.spec import TaskSpec
+
+
+class OneValue:
+    """Of agents that share their reward: the critic sees a scene once, all actions in the agents' order.
+
+    Args:
+        spec: the task.
+        reads: what the critic sees of a scene: the global state, or all observations.
+    """
+
+    def __init__(self, spec: TaskSpec, reads: Literal["state", "observations"]) -> None:
+        self.spec, self.reads = spec, reads
+
+    @property
+    def width(self) -> int:
+        """Numbers that the critic sees of a scene, without actions and time."""
+        spec = self.spec
+        return spec.state.width if self.reads == "state" else spec.num_agents * spec.observation.width
+
+    def rows(self, obs: Tensor, state: Tensor) -> Tensor:
+        """Return what the critic sees of scenes with obs [S, W, N, D] and state [S, W, G]: [S, W, width]."""
+        return state if self.reads == "state" else obs.flatten(-2)
+
+    def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
+        """Return Q [S, W, C] of encoded joint actions [S, W, N, A] where the critic has seen `seen`."""
+        rows = torch.cat([seen, action.flatten(-2)], -1)
+        return critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
+
+    def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+        """Return each agent's Q if it alone did otherwise.
+
+        Args:
+            critic: with frozen parameters.
+            seen: what it sees of the scenes.
+            joint: [S, W, N, A] encoded actions.
+            others: [S, W, N, K, A] what each might do instead.
+
+        Returns:
+            [S, W, N, K].
+        """
+        return _exchanged(critic, seen, joint, others)
+
+
+class OneValueEach(OneValue):
+    """Of agents with rewards of their own, which share one critic: it sees a scene once for each of them.
+
+    All agents stand in the order of a circle that ends with the one whose value it tells; beside a global state the
+    critic sees that agent's observation.
+    """
+
+    @property
+    def width(self) -> int:
+        """Numbers that the critic sees of a scene, without actions and time."""
+        return super().width + (self.spec.observation.width if self.reads == "state" else 0)
+
+    def rows(self, obs: Tensor, state: Tensor) -> Tensor:
+        """Return what the critic sees of scenes, for each agent: [S, W, N, width]."""
+        if self.reads == "observations":
+            return in_a_circle(obs)
+        return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
+
+    def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
+        """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""
+        return super().value(critic, seen, in_a_circle(action).unsqueeze(-2)).squeeze(-1)
+
+    def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+        """Return each agent's own Q if it alone did otherwise: [S, W, N, K]; arguments as of `OneValue`."""
+        # of the actions in an agent's row, its own stands last and is exchanged alone
+        seen = torch.cat([seen, in_a_circle(joint)[..., : -joint.shape[-1]]], -1)
+        return _exchanged(critic, seen, joint.unsqueeze(-2), others.unsqueeze(-3)).squeeze(-2)
+
+
+def _exchanged(critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+    shape = joint.shape[1:-2]
+    rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
+    return with_one_exchanged(critic, *rows).unflatten(1, shape).squeeze(-1)
