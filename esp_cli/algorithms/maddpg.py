@@ -228,15 +228,15 @@ class Maddpg(OffPolicyLearner):
             noise: of the shape of `outputs`, uniform in [0, 1).
             stored: [S, B, T, N(, width)] what was done.
         """
-        own, head = self.head.relaxed(outputs, noise), self.head
-        joint = own if self.config.actor_actions == "all" else head.encode(stored)
+        head, together = self.head, self.config.actor_actions == "all"
         if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):
-            others = head.choices.expand(*own.shape, -1)
-            values = self.joint.exchanged(self.critic, seen, joint.detach(), others)
+            joint = head.relaxed(outputs, noise).detach() if together else head.encode(stored)
+            values = self.joint.exchanged(self.critic, seen, joint, head.choices.expand(*joint.shape, -1))
             return (outputs.exp() * values).sum(-1)
-        if self.config.actor_actions == "all":
+        own = head.relaxed(outputs, noise)
+        if together:
             return self.joint.value(self.critic, seen, own)
-        return self.joint.exchanged(self.critic, seen, joint, own.unsqueeze(-2)).squeeze(-1)
+        return self.joint.exchanged(self.critic, seen, head.encode(stored), own.unsqueeze(-2)).squeeze(-1)
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
