@@ -47,7 +47,12 @@ def c_source(program: Program, comment: str) -> CSource:
     Args:
         program: the policy.
         comment: what it is, line by line; stands at the top of the header.
+
+    Raises:
+        ValueError: agents that hear each other, and whose actions are no choices.
     """
+    if program.team > 1 and program.head != "choose":
+        raise ValueError("of agents that hear each other, only choices are written as C; use onnx, torch or numpy")
     scratch = _Scratch(program)
     return CSource(
         header=_header(program, comment),

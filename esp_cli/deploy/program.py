@@ -42,6 +42,15 @@ class Learned:
         return self.weight, self.bias
 
 
+class Fixed:
+    """What a layer without weights holds."""
+
+    @property
+    def arrays(self) -> tuple[Floats, ...]:
+        """Nothing: it learned nothing."""
+        return ()
+
+
 class Affine(Learned):
     """x W + b with W [in, out] and b [out]."""
 
@@ -61,16 +70,11 @@ class Norm(Learned):
 
 
 @dataclass(frozen=True)
-class Activation:
+class Activation(Fixed):
     """Relu or tanh of every number of a row `width` wide."""
 
     name: Literal["relu", "tanh"]
     width: int
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Nothing: it learned nothing."""
-        return ()
 
     @property
     def flops(self) -> int:
@@ -105,16 +109,11 @@ class Recurrent:
 
 
 @dataclass(frozen=True)
-class Cut:
+class Cut(Fixed):
     """Columns `begin` to `end` of a row."""
 
     begin: int
     end: int
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Nothing: it learned nothing."""
-        return ()
 
     @property
     def flops(self) -> int:
@@ -157,16 +156,11 @@ class Convolution(Learned):
 
 
 @dataclass(frozen=True)
-class Largest:
+class Largest(Fixed):
     """The largest number of each channel: [channels x places] to [channels]."""
 
     channels: int
     places: int
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Nothing: it learned nothing."""
-        return ()
 
     @property
     def flops(self) -> int:
@@ -175,7 +169,7 @@ class Largest:
 
 
 @dataclass(frozen=True)
-class Hear:
+class Hear(Fixed):
     """Own features x beside what the near ones say: [x, mean of their way / reach, mean of their x].
 
     The others of the team stand in the observation's columns from `begin`, two numbers each, in the team's order
@@ -202,11 +196,6 @@ class Hear:
     def others(self) -> list[list[int]]:
         """For each agent the others, in their order."""
         return [[j for j in range(self.team) if j != i] for i in range(self.team)]
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Nothing: it learned nothing."""
-        return ()
 
     @property
     def flops(self) -> int:

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from esp_cli.deploy import check
+from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.export import export
 from esp_cli.deploy.library import LoadedPolicy
 from esp_cli.deploy.program import Affine, Convolution, Cut, Hear, Largest, Program
@@ -169,6 +170,12 @@ def test_an_equivariant_team_is_exported_as_plain_layers() -> None:
     moved = Program(**{**vars(program), "layers": (Cut(1, 442), *program.layers[1:])})
     with pytest.raises(RuntimeError, match="differs from the policy"):
         check.compare(sample, runner_of(moved))
+
+
+def test_c_refuses_a_team_whose_actions_are_no_choices() -> None:
+    program = Program(5, (Cut(0, 1), Hear(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
+    with pytest.raises(ValueError, match="only choices are written as C"):
+        c_source(program, "")
 
 
 def test_an_ensemble_is_refused_by_a_sentence(tmp_path: Path) -> None:
