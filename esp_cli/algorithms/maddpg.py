@@ -238,6 +238,13 @@ class Maddpg(OffPolicyLearner):
             return self.joint.value(self.critic, seen, own)
         return self.joint.exchanged(self.critic, seen, head.encode(stored), own.unsqueeze(-2)).squeeze(-1)
 
+    def _condition(self, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Return the share of the critic's hidden units that a whole batch leaves at 0."""
+        if self.config.critic_activation != "relu":
+            return {}
+        rows = self.joint.inputs(self._critic_rows(batch)[:, :, :-1], self.head.encode(batch.action))
+        return {"train/critic_idle_units": self.critic.idle_units(rows.flatten(1, -2))}
+
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""

@@ -122,7 +122,7 @@ class OffPolicyLearner(Learner):
         metrics["train/augmented_share"] = torch.full_like(mean_return, self.prior.augmented_share)
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
-            metrics |= self._symmetry_errors(batch)
+            metrics |= self._symmetry_errors(batch) | self._condition(batch)
         return metrics
 
     @abstractmethod
@@ -215,6 +215,10 @@ class OffPolicyLearner(Learner):
             return {}
         rows = self._with_copies(batch.first(PROBE_EPISODES), probe)
         return {f"train/{name}_symmetry_error": gap for name, gap in self.gaps(rows, probe).items()}
+
+    def _condition(self, _: EpisodeBatch) -> dict[str, Tensor]:
+        """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""
+        return {}
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return what a resumed run needs; a complete run's replay is left out."""

@@ -36,9 +36,13 @@ class OneValue:
         """Return what the critic sees of scenes with obs [S, W, N, D] and state [S, W, G]: [S, W, width]."""
         return state if self.reads == "state" else obs.flatten(-2)
 
+    def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
+        """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A] in what it sees."""
+        return torch.cat([seen, action.flatten(-2)], -1)
+
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A] where the critic has seen `seen`."""
-        rows = torch.cat([seen, action.flatten(-2)], -1)
+        rows = self.inputs(seen, action)
         return critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
@@ -74,9 +78,13 @@ class OneValueEach(OneValue):
             return in_a_circle(obs)
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
+    def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
+        """Return the critic's inputs [S, W, N, D] for encoded joint actions [S, W, N, A] in what it sees."""
+        return torch.cat([seen, in_a_circle(action)], -1)
+
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""
-        return super().value(critic, seen, in_a_circle(action).unsqueeze(-2)).squeeze(-1)
+        return super().value(critic, seen, action).squeeze(-1)
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's own Q if it alone did otherwise: [S, W, N, K]; arguments as of `OneValue`."""

@@ -110,6 +110,21 @@ class SeedMLP(nn.Module):
         x = torch.relu_(sums) if self.activation == "relu" else torch.tanh_(sums)
         return x.float() if len(self.layers) == 1 else self._from_layer(1, x)
 
+    @torch.no_grad()
+    def idle_units(self, x: Tensor) -> Tensor:
+        """Return the share of hidden units that no row of x [S, B, in] wakes: [S]; of relu networks.
+
+        A unit that is 0 everywhere gets no gradient and is lost to the network (Sokar et al., 2023).
+        """
+        x = x if self.norms is None else self.norms[0](x)
+        idle = []
+        for k, layer in enumerate(self.layers if self.activate_output else self.layers[:-1]):
+            x = torch.relu(layer(x))
+            idle.append((x <= 0).all(1))
+            if self.norms is not None and k + 1 < len(self.norms):
+                x = self.norms[k + 1](x)
+        return torch.cat(idle, 1).float().mean(1)
+
     def _from_layer(self, first: int, x: Tensor) -> Tensor:
         parameters = [p for layer in self.layers[first:] for p in (layer.weight, layer.bias)]
         return _Perceptron.apply(  # type: ignore[no-untyped-call]

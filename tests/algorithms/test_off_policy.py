@@ -117,7 +117,7 @@ def test_every_iteration_logs_what_the_page_promises(algorithm):
     names = (
         "return epsilon augmented_share td_loss value value_symmetry_error "
         + {
-            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error",
+            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error critic_idle_units",
             "qmix": "grad_norm",
         }[algorithm]
     )
