@@ -53,8 +53,8 @@ def test_idle_units_by_hand():
     second.weight.data.fill_(1.0)
     second.bias.data.copy_(torch.tensor([[[-3.0, 0]], [[-3.0, -9]]]))
     x = torch.tensor([[[2.0], [-1.0]], [[1.0], [2.0]]])
-    # seed 0: of the first layer the third (-5) and the fourth (0) stay idle, of the second the one that needs 3, gets 2;
-    # seed 1: the one that needs 9 and gets 8
+    # seed 0: of the first layer the third (-5) and the fourth (0) stay idle, of the second the one that lacks 1;
+    # seed 1: of the second layer the one that lacks 1
     torch.testing.assert_close(mlp.idle_units(x), torch.tensor([3 / 6, 1 / 6]))
 
 
