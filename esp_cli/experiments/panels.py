@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -129,7 +129,12 @@ def _draw_anchors(axes: Axes, anchors: Mapping[str, float]) -> None:
 
 
 def sensitivity(
-    lines: Sequence[Sensitivity], path: str | os.PathLike[str], title: str, xlabel: str, ylabel: str
+    lines: Sequence[Sensitivity],
+    path: str | os.PathLike[str],
+    title: str,
+    xlabel: str,
+    ylabel: str,
+    order: Iterable[str] = (),
 ) -> tuple[Path, Path]:
     """Draw returns over a setting, a line for each horizon, with intervals and the paper's means as crosses.
 
@@ -139,6 +144,7 @@ def sensitivity(
         title: heading.
         xlabel: the setting; its values stand at equal distances, as in figure 5c.
         ylabel: what is plotted.
+        order: the setting's values from left to right, where not every line has all of them.
 
     Returns:
         The PNG and the SVG file.
@@ -148,7 +154,9 @@ def sensitivity(
     """
     if not lines or not all(line.values for line in lines):
         raise ValueError("there is no line to draw")
-    places = {value: k for k, value in enumerate(dict.fromkeys(v for line in lines for v in line.values))}
+    known_values = dict.fromkeys(v for line in lines for v in line.values)
+    ordered = [value for value in dict.fromkeys([*order, *known_values]) if value in known_values]
+    places = {value: k for k, value in enumerate(ordered)}
     with written_figure(path, (6.4, 4.4)) as (figure, files):
         axes = figure.add_subplot()
         for index, line in enumerate(lines):

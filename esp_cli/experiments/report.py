@@ -148,7 +148,8 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> list[tu
             for name in names
         ]
         title = "Return over the weight of the consistency loss"
-        pictures.append(sensitivity(lines, out / "coefficient", title, "weight", f"{results['mode']} return"))
+        weights, label = [cell["variant"] for cell in results["cells"]], f"{results['mode']} return"
+        pictures.append(sensitivity(lines, out / "coefficient", title, "weight", label, weights))
     elif results["rows"] == "variants":
         for k, name in enumerate(dict.fromkeys(cell["panel"] for cell in finished)):
             own = [cell for cell in finished if cell["panel"] == name]

@@ -50,6 +50,15 @@ def test_the_coefficient_is_drawn_with_the_papers_means(tmp_path):
     assert "paper, 3M" not in text
 
 
+def test_the_settings_values_stand_in_their_order_though_no_line_has_all(tmp_path):
+    lines = [Sensitivity("a", {"c = 0": [1.0], "c = 1": [2.0]}), Sensitivity("b", {"c = 0": [1.0], "c = 0.5": [3.0]})]
+    for order, expected in ((("c = 0", "c = 0.1", "c = 0.5", "c = 1"), [0, 2, 1]), ((), [0, 1, 2])):
+        text = sensitivity(lines, tmp_path / "c", "t", "x", "y", order)[1].read_text()
+        places = [text.index(f"<!-- {name} -->") for name in ("c = 0", "c = 1", "c = 0.5")]
+        assert [sorted(places).index(place) for place in places] == expected
+        assert "c = 0.1" not in text
+
+
 def test_nothing_to_draw_is_told(tmp_path):
     for panels in ([], [Panel("empty", [])]):
         with pytest.raises(ValueError, match="no curve"):
