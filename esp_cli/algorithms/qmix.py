@@ -71,6 +71,7 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
         "prior": {"transforms": "c4"},
         "evaluation": {"every_steps": 50_000},
     },
+    "predator-prey": {"qmix": {"replay_episodes": 5000}},
     "wildlife": {
         "qmix": {
             "batch_episodes": 8,

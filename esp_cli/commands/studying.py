@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -17,7 +17,7 @@ from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 
 if TYPE_CHECKING:
-    from esp_cli.experiments.cost import Cost
+    from esp_cli.experiments.forecast import Forecast
     from esp_cli.experiments.scheduler import Snapshot
     from esp_cli.experiments.study import StudyFolder
 
@@ -102,73 +102,36 @@ def _report(folder: StudyFolder, json: str | None) -> None:
 
 def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
     """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
-    from esp_cli.experiments.cost import probe
-    from esp_cli.experiments.scheduler import Scheduler, makespan
+    from esp_cli.experiments.forecast import forecast
 
-    study = folder.study
-    states = Scheduler(folder, study.cells, jobs, ()).runs
-    for run in states:
-        if folder.find_twin(run.cell, others) is not None:
-            run.status = "finished"
-    costs: list[Cost] = []
-    with console.TrainingProgress(len(states), description="measure") as progress:
-        for run in states:
-            costs.append(probe(run.cell.config, study.episodes))
-            progress.update(len(costs))
-    left = [_left_s(run, cost) for run, cost in zip(states, costs, strict=True)]
-    waiting = [seconds for seconds in left if seconds > 0]
-    kept = sum(cost.disk_bytes for cost in costs)
-    peak = kept + sum(sorted((cost.peak_bytes - cost.disk_bytes for cost in costs), reverse=True)[:jobs])
-    plan: dict[str, Any] = {
-        "kind": study.kind,
-        "title": study.title,
-        "out": folder.path,
-        "jobs": jobs,
-        "seconds": makespan([], waiting, jobs),
-        "core_seconds": sum(left),
-        "disk_bytes": kept,
-        "disk_peak_bytes": peak,
-        "runs": [
-            {
-                "name": run.cell.name,
-                "status": run.status,
-                "step": run.step,
-                "seconds_left": seconds,
-                "seconds": cost.training_s + cost.judgement_s,
-                "config": run.cell.config,
-            }
-            for run, cost, seconds in zip(states, costs, left, strict=True)
-        ],
-    }
+    with console.TrainingProgress(len(folder.study.cells), description="measure") as progress:
+        found = forecast(folder, others, jobs, progress.update)
     if json is not None:
-        console.write_json(json, plan)
-    if json == "-":
-        return
+        console.write_json(json, found.as_json())
+    if json != "-":
+        _print_forecast(found)
+
+
+def _print_forecast(found: Forecast) -> None:
     rows = [
         (
-            run.cell.name,
-            f"{console.format_count(run.cell.config.steps)} x {len(run.cell.config.seeds)}",
+            run.name,
+            f"{console.format_count(run.config.steps)} x {len(run.config.seeds)}",
             run.status if run.status == "finished" else f"at {console.format_count(run.step)}" if run.step else "new",
-            console.format_duration(seconds),
+            console.format_duration(run.seconds_left),
         )
-        for run, seconds in zip(states, left, strict=True)
+        for run in found.runs
     ]
-    console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=study.title)
+    console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=found.title)
     console.say(
-        f"{len(waiting)} runs to do: {console.format_duration(plan['core_seconds'])} on one core, "
-        f"{console.format_duration(plan['seconds'])} with {jobs} side by side, if nothing else runs here"
+        f"{sum(run.status != 'finished' for run in found.runs)} runs to do: "
+        f"{console.format_duration(found.core_seconds)} on one core, "
+        f"{console.format_duration(found.seconds)} with {found.jobs} side by side, if nothing else runs here"
     )
-    free = shutil.disk_usage(next(p for p in (folder.path, *folder.path.absolute().parents) if p.exists())).free
+    free = shutil.disk_usage(next(p for p in (found.out, *found.out.absolute().parents) if p.exists())).free
     console.say(
-        f"disk: {kept / _MEBIBYTE:.0f} MiB when done, at most {peak / _MEBIBYTE:.0f} MiB on the way; "
-        f"{free / _MEBIBYTE:.0f} MiB are free -> {folder.path}"
+        f"disk: {found.disk_bytes / _MEBIBYTE:.0f} MiB when done, at most {found.disk_peak_bytes / _MEBIBYTE:.0f} MiB "
+        f"on the way; {free / _MEBIBYTE:.0f} MiB are free -> {found.out}"
     )
-    if peak > free:
+    if found.disk_peak_bytes > free:
         console.note("the disk is too small for that; choose another --out, or fewer --jobs")
-
-
-def _left_s(run: Any, cost: Cost) -> float:
-    """Return the seconds that are left of a run."""
-    if run.status == "finished":
-        return 0.0
-    return cost.training_s * (1 - run.step / run.cell.config.steps) + cost.judgement_s
