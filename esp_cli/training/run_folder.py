@@ -4,7 +4,7 @@ Layout::
 
     config.json                             the resolved configuration
     metrics.jsonl                           a row per update, see esp_cli.training.metrics
-    checkpoints/step-000000500000.safetensors   the newest two; step-...-final.safetensors when training is done
+    checkpoints/step-000000500000.safetensors   the newest two; only step-...-final.safetensors when training is done
     policy.safetensors                      the trained policy
     run.lock                                held by the process that trains; says which
 
@@ -244,15 +244,24 @@ class RunFolder:
         return path
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> Path:
-        """Write the trained policy as a file of its own that needs no run folder.
+        """Write the trained policy as a file of its own that needs no run folder; training is done with that.
+
+        Checkpoints before the final one go: with a replay they are large, and nothing goes on from them any more.
 
         Returns:
             The file.
 
         Raises:
-            CheckpointError: the content cannot be stored, or the file cannot be written.
+            RunFolderError: a checkpoint cannot be removed (CheckpointError where the content cannot be stored, or the
+                file cannot be written).
         """
         save_checkpoint(self.policy_path, tensors, meta, format_name=POLICY_FORMAT)
+        files = self.checkpoints()
+        if any(map(_is_final, files)):
+            with _told(f"cannot remove old checkpoints in {self.path / _CHECKPOINTS}"):
+                for file in files:
+                    if not _is_final(file):
+                        file.unlink()
         return self.policy_path
 
     def latest_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:

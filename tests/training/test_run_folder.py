@@ -192,6 +192,16 @@ def test_the_newest_two_checkpoints_and_the_final_one_are_kept(folder):
     ]
 
 
+def test_only_the_final_checkpoint_stays_beside_the_trained_policy(folder):
+    write_checkpoints(folder, 100, 200)
+    folder.write_policy(weights(200), {})
+    assert len(names(folder)) == 2, "without a final one they are all that there is to go on from"
+    folder.write_checkpoint(300, weights(300), {}, final=True)
+    folder.write_policy(weights(300), {})
+    assert names(folder) == ["step-000000000300-final.safetensors"]
+    assert folder.latest_checkpoint()[1]["step"] == 300
+
+
 def test_the_latest_checkpoint_is_that_of_the_highest_step(folder):
     write_checkpoints(folder, 900, 1000)
     tensors, meta = folder.latest_checkpoint()
