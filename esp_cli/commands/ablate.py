@@ -6,21 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from esp_cli.commands.options import DeviceOption, EpisodesOption, JsonOption, SeedsOption, SetOption
-from esp_cli.commands.study_options import (
-    DEFAULT_EPISODES,
-    DEFAULT_PRESET,
-    DEFAULT_SEEDS,
-    AlgosOption,
-    DryRunOption,
-    JobsOption,
-    PresetOption,
-    ReuseOption,
-    StudyChoices,
-    StudyOutOption,
-    StudyStepsOption,
-    TasksOption,
-)
+from esp_cli.commands.study_options import StudyChoices, study_command
 from esp_cli.commands.studying import run_study
 
 EPILOG = """Examples:\n
@@ -30,6 +16,7 @@ EPILOG = """Examples:\n
     esp ablate modules --reuse runs/table1 --reuse runs/transforms"""
 
 
+@study_command
 def ablate(
     part: Annotated[
         Literal["transforms", "coefficient", "modules"],
@@ -39,22 +26,7 @@ def ablate(
             metavar="PART",
         ),
     ],
-    tasks: TasksOption = None,
-    algos: AlgosOption = None,
-    steps: StudyStepsOption = None,
-    seeds: SeedsOption = DEFAULT_SEEDS,
-    out: StudyOutOption = None,
-    preset: PresetOption = DEFAULT_PRESET,
-    settings: SetOption = None,
-    device: DeviceOption = "cpu",
-    episodes: EpisodesOption = DEFAULT_EPISODES,
-    jobs: JobsOption = None,
-    dry_run: DryRunOption = False,
-    reuse: ReuseOption = None,
-    json: JsonOption = None,
+    choices: StudyChoices,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""
-    choices = StudyChoices(
-        tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, reuse, json
-    )
     run_study(f"ablate-{part}", ("ablate", part), choices)

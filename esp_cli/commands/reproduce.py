@@ -6,21 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from esp_cli.commands.options import DeviceOption, EpisodesOption, JsonOption, SeedsOption, SetOption
-from esp_cli.commands.study_options import (
-    DEFAULT_EPISODES,
-    DEFAULT_PRESET,
-    DEFAULT_SEEDS,
-    AlgosOption,
-    DryRunOption,
-    JobsOption,
-    PresetOption,
-    ReuseOption,
-    StudyChoices,
-    StudyOutOption,
-    StudyStepsOption,
-    TasksOption,
-)
+from esp_cli.commands.study_options import StudyChoices, study_command
 from esp_cli.commands.studying import run_study
 
 EPILOG = """Examples:\n
@@ -30,27 +16,13 @@ EPILOG = """Examples:\n
     esp reproduce agents --algos qmix"""
 
 
+@study_command
 def reproduce(
     table: Annotated[
         Literal["table1", "agents"],
         typer.Argument(help="Table 1, or the supplement's table for 2, 3 and 4 agents.", metavar="TABLE"),
     ],
-    tasks: TasksOption = None,
-    algos: AlgosOption = None,
-    steps: StudyStepsOption = None,
-    seeds: SeedsOption = DEFAULT_SEEDS,
-    out: StudyOutOption = None,
-    preset: PresetOption = DEFAULT_PRESET,
-    settings: SetOption = None,
-    device: DeviceOption = "cpu",
-    episodes: EpisodesOption = DEFAULT_EPISODES,
-    jobs: JobsOption = None,
-    dry_run: DryRunOption = False,
-    reuse: ReuseOption = None,
-    json: JsonOption = None,
+    choices: StudyChoices,
 ) -> None:
     """Train, judge and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    choices = StudyChoices(
-        tasks, algos, steps, seeds, out, preset, settings, device, episodes, jobs, dry_run, reuse, json
-    )
     run_study(table, ("reproduce", table), choices)

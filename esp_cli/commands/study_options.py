@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from esp_cli.commands.options import parse_assignments, parse_count, resolve_device
+from esp_cli.commands.options import (
+    DeviceOption,
+    EpisodesOption,
+    JsonOption,
+    SeedsOption,
+    SetOption,
+    parse_assignments,
+    parse_count,
+    resolve_device,
+)
 
 if TYPE_CHECKING:
     from esp_cli.experiments.catalogue import Request
@@ -83,21 +94,21 @@ def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, in
 
 @dataclass(frozen=True)
 class StudyChoices:
-    """What a study command was called with, as typer hands it over; see the options above."""
+    """What a study command was called with, and by its annotations what can be said to it: an option for each field."""
 
-    tasks: list[str] | None
-    algos: list[str] | None
-    steps: list[str] | None
-    seeds: tuple[int, ...]
-    out: Path | None
-    preset: str
-    settings: list[str] | None
-    device: str
-    episodes: int
-    jobs: int | None
-    dry_run: bool
-    reuse: list[Path] | None
-    json: str | None
+    tasks: TasksOption = None
+    algos: AlgosOption = None
+    steps: StudyStepsOption = None
+    seeds: SeedsOption = DEFAULT_SEEDS
+    out: StudyOutOption = None
+    preset: PresetOption = DEFAULT_PRESET
+    settings: SetOption = None
+    device: DeviceOption = "cpu"
+    episodes: EpisodesOption = DEFAULT_EPISODES
+    jobs: JobsOption = None
+    dry_run: DryRunOption = False
+    reuse: ReuseOption = None
+    json: JsonOption = None
 
     def request(self, words: Sequence[str], out: Path) -> Request:
         """Return what a study is asked for.
@@ -136,3 +147,17 @@ class StudyChoices:
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
         return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])
+
+
+def study_command(command: Callable[[Any, StudyChoices], None]) -> Callable[..., None]:
+    """Give a command of an argument and `StudyChoices` the options of these, where typer looks for them."""
+    argument = next(iter(inspect.signature(command, eval_str=True).parameters.values()))
+    options = inspect.signature(StudyChoices, eval_str=True).parameters.values()
+
+    @functools.wraps(command)
+    def with_options(**given: Any) -> None:
+        command(given.pop(argument.name), StudyChoices(**given))
+
+    with_options.__signature__ = inspect.Signature([argument, *options])  # type: ignore[attr-defined]
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in (argument, *options)}
+    return with_options
