@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.policy import Policy
-from esp_cli.prior import PriorConfig
+from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators
 from esp_envs.spec import TaskSpec
 
@@ -41,7 +41,8 @@ class Worlds(Protocol):
 class Learner(ABC):
     """S seeds of one algorithm.
 
-    A subclass sets the attributes below in its constructor and implements `iterate`.
+    A subclass makes policy, modules, optimisers and collector in `build` and implements `iterate`; the constructor sets
+    the other attributes below.
 
     Args:
         env: the training worlds.
@@ -54,6 +55,10 @@ class Learner(ABC):
     Attributes:
         config_class: model of its hyperparameters.
         task_settings: what it asks of a task that has such settings, where a user says nothing else.
+        config: hyperparameters.
+        spec: of the task.
+        device: where everything is.
+        prior: the symmetry prior.
         policy: what acts, and what evaluation, rendering and export take.
         modules: every network and statistic with a seed axis, by name.
         optimisers: by name.
@@ -63,13 +68,12 @@ class Learner(ABC):
 
     config_class: ClassVar[type[LearnerConfig]]
     task_settings: ClassVar[Mapping[str, object]] = MappingProxyType({})
+    config: LearnerConfig
     policy: Policy
     modules: dict[str, nn.Module]
     optimisers: dict[str, torch.optim.Optimizer]
     collector: Worlds
-    generators: dict[str, list[torch.Generator]]
 
-    @abstractmethod
     def __init__(
         self,
         env: Environment,
@@ -78,7 +82,19 @@ class Learner(ABC):
         prior: PriorConfig,
         generators: Sequence[torch.Generator],
         prior_generators: Sequence[torch.Generator],
-    ) -> None: ...
+    ) -> None:
+        self.config, self.spec, self.device = config, env.spec, env.device
+        self.prior = SymmetryPrior(prior, env.spec, env.device)
+        self.generators = {"learner": list(generators), "prior": list(prior_generators)}
+        self.build(env, network)
+
+    @abstractmethod
+    def build(self, env: Environment, network: NetworkConfig) -> None:
+        """Make networks, statistics, optimisers and collector; initial weights are drawn from the generators "learner".
+
+        Raises:
+            ValueError: settings, network and task do not go together.
+        """
 
     @classmethod
     @abstractmethod

@@ -21,7 +21,7 @@ from esp_cli.networks.bodies import MLP, NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.joint import OneValueEach
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
-from esp_cli.prior import PriorConfig, policy_consistency_loss
+from esp_cli.prior import policy_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment
 from esp_envs.spec import TaskSpec
@@ -113,18 +113,12 @@ class Maddpg(OffPolicyLearner):
     """
 
     config_class = MaddpgConfig
+    config: MaddpgConfig
 
-    def __init__(
-        self,
-        env: Environment,
-        config: MaddpgConfig,
-        network: NetworkConfig,
-        prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
-    ) -> None:
-        super().__init__(env, config, network, prior, generators, prior_generators)
-        self.config, spec = config, self.spec
+    def build(self, env: Environment, network: NetworkConfig) -> None:
+        """Make all that the learner consists of; see `Learner.build`."""
+        super().build(env, network)
+        config, spec, generators = self.config, self.spec, self.generators["learner"]
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
         if not spec.shared_reward:
             self.joint = OneValueEach(spec, config.critic_input)

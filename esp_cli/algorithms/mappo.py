@@ -29,7 +29,7 @@ from esp_cli.algorithms.rollout import Collector, Rollout
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.critic import Critic, CriticInput
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
+from esp_cli.prior import policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment, Observation
 from esp_envs.spec import TaskSpec
@@ -129,22 +129,13 @@ class Mappo(Learner):
     """
 
     config_class = MappoConfig
+    config: MappoConfig
     policy: StochasticPolicy
     collector: Collector
 
-    def __init__(
-        self,
-        env: Environment,
-        config: MappoConfig,
-        network: NetworkConfig,
-        prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
-    ) -> None:
-        spec, device = env.spec, env.device
-        self.config, self.spec, self.device = config, spec, device
-        self.generators = {"learner": list(generators), "prior": list(prior_generators)}
-        self.prior = SymmetryPrior(prior, spec, device)
+    def build(self, env: Environment, network: NetworkConfig) -> None:
+        """Make all that the learner consists of; see `Learner.build`."""
+        config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
         self.policy = self.build_policy(spec, network, generators).to(device)
         critic_network = network.model_copy(update={"activation": config.critic_activation})
         self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)

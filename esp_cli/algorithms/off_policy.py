@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
@@ -18,7 +18,7 @@ from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.joint import OneValue
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.prior import PriorConfig, SymmetryPrior, value_consistency_loss
+from esp_cli.prior import value_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment
 
@@ -59,23 +59,14 @@ class OffPolicyLearner(Learner):
         ValueError: the replay cannot hold what one round collects.
     """
 
+    config: OffPolicyConfig
     policy: HistoryPolicy
     collector: EpisodeCollector
 
-    def __init__(
-        self,
-        env: Environment,
-        config: OffPolicyConfig,
-        network: NetworkConfig,
-        prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
-    ) -> None:
-        spec, device = env.spec, env.device
-        self.off_policy, self.spec, self.device = config, spec, device
-        self.generators = {"learner": list(generators), "prior": list(prior_generators)}
-        self.prior = SymmetryPrior(prior, spec, device)
-        per_round = config.num_envs * (1 + self.prior.num_copies * prior.augments_replay)
+    def build(self, env: Environment, network: NetworkConfig) -> None:
+        """Make what the off-policy learners have in common; see `Learner.build`."""
+        config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
+        per_round = config.num_envs * (1 + self.prior.num_copies * self.prior.config.augments_replay)
         if per_round > config.replay_episodes:
             raise ValueError(
                 f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
@@ -84,7 +75,7 @@ class OffPolicyLearner(Learner):
         self.policy = self.build_policy(spec, network, generators).to(device)  # type: ignore[assignment]
         self.reward_scale = ValueNormaliser(env.num_seeds, config.reward_decay**config.num_envs).to(device)
         self.replay = EpisodeReplay(spec, env.num_seeds, config.replay_episodes, device)
-        self.collector = EpisodeCollector(env, self.policy, self.generators["learner"])
+        self.collector = EpisodeCollector(env, self.policy, generators)
         self.modules = {"policy": self.policy, "reward_scale": self.reward_scale}
         self.episodes = self.updates = 0
         self._time = torch.linspace(0, 1, spec.horizon + 1, device=device)
@@ -92,16 +83,16 @@ class OffPolicyLearner(Learner):
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps per seed of one iteration."""
-        return self.off_policy.rounds * self.off_policy.num_envs * self.spec.horizon
+        return self.config.rounds * self.config.num_envs * self.spec.horizon
 
     @property
     def critic_width(self) -> int:
         """Numbers that the critic or the mixer sees of a state."""
-        return self.joint.width + self.off_policy.critic_sees_time
+        return self.joint.width + self.config.critic_sees_time
 
     def iterate(self, progress: float) -> dict[str, Tensor]:
         """Collect episodes, learn from the replay, and return metrics, each [S]."""
-        config, sums, returns = self.off_policy, dict[str, Tensor](), []
+        config, sums, returns = self.config, dict[str, Tensor](), []
         if config.anneal_learning_rate:
             self.anneal(1.0 - progress)
         learned = 0
@@ -135,7 +126,7 @@ class OffPolicyLearner(Learner):
 
     def _epsilon(self) -> float:
         """Return the exploration of the next round."""
-        config = self.off_policy
+        config = self.config
         if self.episodes < config.warmup_episodes:
             return 1.0
         share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
@@ -148,7 +139,7 @@ class OffPolicyLearner(Learner):
         self.replay.add(episodes)
         for g in self.prior.for_replay(self.generators["prior"]):
             self.replay.add(episodes.transformed(g))
-        self.episodes += self.off_policy.num_envs
+        self.episodes += self.config.num_envs
 
     def _with_copies(self, batch: EpisodeBatch, transforms: list[Transform]) -> EpisodeBatch:
         """Return the batch with its transformed copies behind it along the batch axis."""
@@ -160,7 +151,7 @@ class OffPolicyLearner(Learner):
 
     def _with_time(self, rows: Tensor) -> Tensor:
         """Append the share of the horizon gone, where the critic sees it, to rows [S, B, T + 1, ..., width]."""
-        if not self.off_policy.critic_sees_time:
+        if not self.config.critic_sees_time:
             return rows
         time = self._time.view(-1, *[1] * (rows.dim() - 3))
         return torch.cat([rows, time.expand(*rows.shape[:-1], 1)], -1)
@@ -172,7 +163,7 @@ class OffPolicyLearner(Learner):
         Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
         values, and with them S_Q and c, mean about the same in every task.
         """
-        config = self.off_policy
+        config = self.config
         ended = batch.terminated.clone()
         if not config.bootstrap_truncated:
             ended[:, :, -1] = True
@@ -203,7 +194,7 @@ class OffPolicyLearner(Learner):
         optimiser.zero_grad(set_to_none=True)
         loss.sum().backward(inputs=parameters)
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        norm = clip_gradients_per_seed(gradients, self.off_policy.max_grad_norm)
+        norm = clip_gradients_per_seed(gradients, self.config.max_grad_norm)
         optimiser.step()
         return norm
 

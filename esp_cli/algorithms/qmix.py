@@ -23,7 +23,6 @@ from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
 from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment
 from esp_envs.spec import Discrete, TaskSpec
@@ -102,19 +101,13 @@ class Qmix(OffPolicyLearner):
     """
 
     config_class = QmixConfig
+    config: QmixConfig
     task_settings = MappingProxyType({"actions": "discrete"})
 
-    def __init__(
-        self,
-        env: Environment,
-        config: QmixConfig,
-        network: NetworkConfig,
-        prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
-    ) -> None:
-        super().__init__(env, config, network, prior, generators, prior_generators)
-        self.config = config
+    def build(self, env: Environment, network: NetworkConfig) -> None:
+        """Make all that the learner consists of; see `Learner.build`."""
+        super().build(env, network)
+        config, generators = self.config, self.generators["learner"]
         widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
         self.mixer = MonotonicMixer(generators, *widths).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
