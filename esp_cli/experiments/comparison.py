@@ -46,6 +46,11 @@ class RunCurve:
     values: NDArray[np.float64]
     seconds: float
 
+    @property
+    def convention(self) -> str:
+        """What the returns count, in the words of the task."""
+        return build_environment(self.config.model_copy(update={"device": "cpu"}), 1, "shape").spec.convention
+
     def at(self, step: int) -> NDArray[np.float64] | None:
         """Return the returns [S] of the evaluation nearest to a step, or None where the run did not get there."""
         if step - self.steps[-1] > self.config.evaluation.every_steps:

@@ -123,7 +123,7 @@ def _results(
         if verdicts is not None:
             entry |= _judged(verdicts)
         elif curve is not None and study.kind == "runs":
-            entry["returns"] = {mode: _rounded(curve.values[-1])}
+            entry |= _last_evaluation(curve, mode)
     results = {
         "format": RESULTS_FORMAT,
         "version": RESULTS_VERSION,
@@ -153,6 +153,15 @@ def _judged(verdicts: Mapping[str, Any]) -> dict[str, Any]:
         "returns": {mode: _rounded(verdicts[mode]["per_seed"]) for mode in ("greedy", "stochastic")},
         "anchors": {name: round(value, _DIGITS) for name, value in verdicts["anchors"].items()},
         "metrics": {name: round(value, _DIGITS) for name, value in verdicts["metrics"].items()},
+    }
+
+
+def _last_evaluation(curve: RunCurve, mode: Mode) -> dict[str, Any]:
+    """Return what the end of a curve says of a run that was not judged."""
+    return {
+        "convention": curve.convention,
+        "episodes": curve.config.evaluation.episodes,
+        "returns": {mode: _rounded(curve.values[-1])},
     }
 
 

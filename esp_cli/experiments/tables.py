@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -184,13 +184,17 @@ def _short(results: Mapping[str, Any], cell: Mapping[str, Any]) -> str:
 
 def _caption(results: Mapping[str, Any]) -> str:
     conventions = list(dict.fromkeys(cell["convention"] for cell in results["cells"] if "convention" in cell))
-    counted = {len(cell["seeds"]) for cell in results["cells"]}
-    seeds = f"{min(counted)} to {max(counted)}" if len(counted) > 1 else f"{max(counted)}"
+    seeds = _span({len(cell["seeds"]) for cell in results["cells"]})
+    episodes = _span({cell.get("episodes", results["episodes"]) for cell in results["cells"]})
     said = f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
     return (
-        f"Mean ± standard error over {seeds} seeds of the {results['mode']} return, {results['episodes']} episodes a "
-        f"seed.{said}"
+        f"Mean ± standard error over {seeds} seeds of the {results['mode']} return, {episodes} episodes a seed.{said}"
     )
+
+
+def _span(counts: Collection[int]) -> str:
+    low, high = min(counts), max(counts)
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def _steps_to(cell: Mapping[str, Any]) -> str:

@@ -101,6 +101,18 @@ def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Pat
     assert json.loads((tmp_path / "r").read_text())["kind"] == "runs"
 
 
+def test_runs_that_were_evaluated_on_unlike_numbers_of_episodes_say_so(finished: Path, copied: Path, tmp_path: Path) -> None:
+    config = json.loads((copied / "config.json").read_text())
+    fewer = config["evaluation"]["episodes"]
+    config["evaluation"]["episodes"] = 5 * fewer
+    (copied / "config.json").write_text(json.dumps(config))
+    esp("report", finished, copied, "--out", tmp_path / "page")
+    text = (tmp_path / "page" / "report.md").read_text()
+    assert f"greedy return, {fewer} to {5 * fewer} episodes a seed. Convention of the returns: esp: team sum" in text
+    esp("report", copied, "--out", tmp_path / "alone")
+    assert f"greedy return, {5 * fewer} episodes a seed." in (tmp_path / "alone" / "report.md").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
