@@ -101,7 +101,7 @@ def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Pat
     assert json.loads((tmp_path / "r").read_text())["kind"] == "runs"
 
 
-def test_runs_that_were_evaluated_on_unlike_numbers_of_episodes_say_so(finished: Path, copied: Path, tmp_path: Path) -> None:
+def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_path: Path) -> None:
     config = json.loads((copied / "config.json").read_text())
     fewer = config["evaluation"]["episodes"]
     config["evaluation"]["episodes"] = 5 * fewer
