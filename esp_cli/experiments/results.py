@@ -123,7 +123,7 @@ def _results(
         if verdicts is not None:
             entry |= _judged(verdicts)
         elif curve is not None and study.kind == "runs":
-            entry |= _last_evaluation(curve, mode)
+            entry |= {"esp_version": study.esp_version} | _last_evaluation(curve, mode)
     results = {
         "format": RESULTS_FORMAT,
         "version": RESULTS_VERSION,
