@@ -4,8 +4,8 @@
     ... written by `esp report --fill PAGE`, never by hand ...
     <!-- end of results -->
 
-The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`. A comment that does not
-begin its line is none of these, as this example is not.
+The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`. Several files of one kind
+of study, with spaces between, give one table. A comment that does not begin its line is none of these, as this example.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from esp_cli.experiments.results import read_results
+from esp_cli.experiments.results import join, read_results
 from esp_cli.experiments.tables import TABLES
 
 _BLOCK = re.compile(
-    r"^(<!-- results: (?P<file>\S+) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)", re.DOTALL | re.MULTILINE
+    r"^(<!-- results: (?P<files>\S+(?: \S+)*) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)",
+    re.DOTALL | re.MULTILINE,
 )
 
 
@@ -36,7 +37,7 @@ def filled(page: Path) -> str:
         name = match["table"]
         if name not in TABLES:
             raise ValueError(f"{page} asks for the table '{name}'; the tables are {', '.join(TABLES)}")
-        table = TABLES[name](read_results(page.parent / match["file"]))
+        table = TABLES[name](join([read_results(page.parent / file) for file in match["files"].split()]))
         content = "Nothing yet." if table is None else table.markdown()
         return f"{match[1]}\n{content}\n\n{match[4]}"
 
@@ -45,4 +46,5 @@ def filled(page: Path) -> str:
 
 def files_of(page: Path) -> list[str]:
     """Return the results files that a page's tables come from, each once."""
-    return list(dict.fromkeys(match["file"] for match in _BLOCK.finditer(page.read_text(encoding="utf-8"))))
+    blocks = _BLOCK.finditer(page.read_text(encoding="utf-8"))
+    return list(dict.fromkeys(file for match in blocks for file in match["files"].split()))

@@ -81,6 +81,28 @@ def read_results(path: Path) -> dict[str, Any]:
     return found
 
 
+def join(several: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the results of studies of one kind as those of one study, the cells in their order.
+
+    Raises:
+        ValueError: kinds or evaluations that do not go together, or a cell that two of them have.
+    """
+    first = several[0]
+    if any(results[key] != first[key] for results in several for key in ("kind", "mode", "rows")):
+        raise ValueError("results of studies of different kinds, or of different evaluations, have no table in common")
+    cells = [
+        cell | {"config": results["config"] | cell["config"], "episodes": cell.get("episodes", results["episodes"])}
+        for results in several
+        for cell in results["cells"]
+    ]
+    names = [cell["name"] for cell in cells]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{twice[0]} stands in two of the results files")
+    commands = "\n".join(dict.fromkeys(results["command"] for results in several))
+    return dict(first) | {"command": commands, "config": {}, "cells": cells}
+
+
 def read_curve_of(run: Path, cell: Cell, mode: Mode) -> RunCurve | None:
     """Read the evaluations of a cell's run; None where there are none yet."""
     if not (run / "config.json").is_file():

@@ -50,7 +50,8 @@ def returns_table(results: Mapping[str, Any], whole: bool = False) -> Table:
         whole: with all that the paper's table has; what we did not run is marked so.
     """
     cells = {(cell["panel"], cell["variant"]): cell for cell in results["cells"]}
-    entries = {place: _short(results, cell) for place, cell in cells.items()}
+    most = max(len(cell["seeds"]) for cell in results["cells"])
+    entries = {place: _short(results, cell) + _fewer_seeds(cell, most) for place, cell in cells.items()}
     theirs = {place: cell["paper"] for place, cell in cells.items() if cell["paper"]}
     if whole:
         listed = {(panel, variant): paper.reported(key) for panel, variant, key in paper_cells(results["kind"])}
@@ -180,6 +181,12 @@ def _short(results: Mapping[str, Any], cell: Mapping[str, Any]) -> str:
     if found is not None:
         return format_mean(found["mean"], found["sem"]) if found["mean"] is not None else "every seed stopped"
     return NOT_RUN if cell["status"] == "not run" else f"at {format_count(cell['step'])}"
+
+
+def _fewer_seeds(cell: Mapping[str, Any], most: int) -> str:
+    """Say how many seeds a finished cell has where others have more."""
+    count = len(cell["seeds"])
+    return f" (n = {count})" if count < most and cell["status"] == "finished" else ""
 
 
 def _caption(results: Mapping[str, Any]) -> str:

@@ -61,3 +61,29 @@ def test_a_table_or_file_that_is_not_there_is_told(page, old, new, sentence):
         filled(page)
     with pytest.raises(ValueError, match="cannot read"):
         filled(page.with_name("no.md"))
+
+
+def longer(page, seeds=(0, 1), **change):
+    """Write the results of a second study, of more steps and fewer seeds, beside those of the page."""
+    study = small_study(steps=((None, 400),), seeds=seeds)
+    found = collect(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})) | change
+    (page.parent / "measured" / "b.json").write_text(json.dumps(found))
+    page.write_text("<!-- results: measured/a.json measured/b.json returns -->\n<!-- end of results -->\n")
+
+
+def test_studies_of_one_kind_stand_in_one_table_and_fewer_seeds_are_told(page):
+    longer(page)
+    text = filled(page)
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in text
+    assert "| navigation, 400 | -111.00 ± 1.00 (n = 2) | not run |" in text
+    assert "over 2 to 3 seeds" in text
+    assert files_of(page) == ["measured/a.json", "measured/b.json"]
+
+
+def test_studies_that_do_not_go_together_are_refused(page):
+    longer(page, kind="agents")
+    with pytest.raises(ValueError, match="different kinds"):
+        filled(page)
+    page.write_text(page.read_text().replace("b.json", "a.json"))
+    with pytest.raises(ValueError, match="navigation-200-mappo-esp stands in two"):
+        filled(page)
