@@ -26,6 +26,7 @@ from esp_cli.formatting import format_count as format_count  # noqa: PLC0414 # a
 from esp_cli.formatting import format_duration as format_duration  # noqa: PLC0414 # also console's
 from esp_cli.formatting import format_interval as format_interval  # noqa: PLC0414 # also console's
 from esp_cli.formatting import format_mean as format_mean  # noqa: PLC0414 # also console's
+from esp_cli.formatting import format_span as format_span  # noqa: PLC0414 # also console's
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)

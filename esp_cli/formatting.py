@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 
 def format_mean(mean: float, sem: float | None = None, digits: int = 2) -> str:
@@ -17,6 +17,12 @@ def format_interval(interval: Sequence[float], digits: int = 2) -> str:
     """Return an interval (low, high) as "[low, high]"."""
     low, high = interval
     return f"[{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def format_span(counts: Collection[int]) -> str:
+    """Return the smallest to the largest of some counts, or the one that they all are: {32, 160} -> "32 to 160"."""
+    low, high = min(counts), max(counts)
+    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def format_count(count: float) -> str:

@@ -16,7 +16,7 @@ from esp_cli.training.config import EvaluationConfig
 DOCS = Path(__file__).parents[1] / "docs"
 SHARED: dict[str, type[BaseModel]] = {"network": NetworkConfig, "prior": PriorConfig, "evaluation": EvaluationConfig}
 TUNED_ROW = re.compile(r"^\| ([\w-]+) \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
-ROW = re.compile(r"^\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \| [^|]+ \|$", re.MULTILINE)
+ROW = re.compile(r"\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \|")
 
 
 def written(value: object) -> str:

@@ -87,6 +87,8 @@ TUNED: dict[str, dict[str, dict[str, object]]] = {
 
 Formation's episodes are twelve times as long as those of the particle tasks, so batch and replay hold fewer of them.
 One value per wheel speed learns faster than one per pair of speeds.
+
+On predator-prey the plain learner learns few and recent episodes by heart; with many both learners end higher.
 """
 
 VALUE_GAIN = 0.1

@@ -233,8 +233,7 @@ def _print(result: dict[str, Any]) -> None:
         for step, verdict in run["returns"].items():
             seeds = sum(x is not None for x in verdict["per_seed"]) if verdict else 0
             rows.append((run["label"], console.format_count(int(step)), seeds, *_cells(verdict)))
-    counts = sorted({run["config"]["evaluation"]["episodes"] for run in result["runs"]})
-    episodes = " to ".join(str(count) for count in dict.fromkeys((counts[0], counts[-1])))
+    episodes = console.format_span({run["config"]["evaluation"]["episodes"] for run in result["runs"]})
     title = f"{result['task']} version {result['task_version']}, {episodes} episodes a seed"
     caption = f"convention {result['convention']}; mean ± s.e.m. over seeds; difference from the first run"
     headings = ("run", "steps>", "seeds>", "return>", "95 % interval>", "difference>", "95 % interval>")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +25,7 @@ from esp_cli.training.loading import parse_config
 from esp_cli.training.metrics import column, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import build_environment
+from esp_envs.spec import TaskSpec
 
 Mode = Literal["greedy", "stochastic"]
 
@@ -46,10 +48,10 @@ class RunCurve:
     values: NDArray[np.float64]
     seconds: float
 
-    @property
-    def convention(self) -> str:
-        """What the returns count, in the words of the task."""
-        return build_environment(self.config.model_copy(update={"device": "cpu"}), 1, "shape").spec.convention
+    @cached_property
+    def spec(self) -> TaskSpec:
+        """What the task says of itself, the convention of its returns among it."""
+        return build_environment(self.config.model_copy(update={"device": "cpu"}), 1, "shape").spec
 
     def at(self, step: int) -> NDArray[np.float64] | None:
         """Return the returns [S] of the evaluation nearest to a step, or None where the run did not get there."""
@@ -96,7 +98,7 @@ def compare(curves: Sequence[RunCurve], at: Sequence[int], thresholds: Sequence[
     if len(conventions) > 1:
         raise ValueError("these runs have different tasks or task settings, so their returns do not compare")
     at = at or [int(min(curve.steps[-1] for curve in curves))]
-    spec = build_environment(curves[0].config.model_copy(update={"device": "cpu"}), 1, "shape").spec
+    spec = curves[0].spec
     return {
         "task": spec.name,
         "task_version": spec.version,

@@ -105,8 +105,16 @@ def forecast(
 
 def _finished(run: Run, path: Path) -> RunForecast:
     size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    config = run.cell.config
-    return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, size, size, config)
+    return RunForecast(
+        name=run.cell.name,
+        status="finished",
+        step=run.cell.config.steps,
+        seconds_left=0.0,
+        seconds=None,
+        disk_bytes=size,
+        peak_bytes=size,
+        config=run.cell.config,
+    )
 
 
 def _measured(run: Run, episodes: int) -> RunForecast:

@@ -181,7 +181,7 @@ def _judged(verdicts: Mapping[str, Any]) -> dict[str, Any]:
 def _last_evaluation(curve: RunCurve, mode: Mode) -> dict[str, Any]:
     """Return what the end of a curve says of a run that was not judged."""
     return {
-        "convention": curve.convention,
+        "convention": curve.spec.convention,
         "episodes": curve.config.evaluation.episodes,
         "returns": {mode: _rounded(curve.values[-1])},
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,7 @@ from esp_cli.experiments import paper
 from esp_cli.experiments.catalogue import paper_cells
 from esp_cli.experiments.results import aggregates, verdict
 from esp_cli.experiments.statistics import Estimate
-from esp_cli.formatting import format_count, format_duration, format_interval, format_mean
+from esp_cli.formatting import format_count, format_duration, format_interval, format_mean, format_span
 
 NOTHING = "-"
 NOT_RUN = "not run"
@@ -191,17 +191,12 @@ def _fewer_seeds(cell: Mapping[str, Any], most: int) -> str:
 
 def _caption(results: Mapping[str, Any]) -> str:
     conventions = list(dict.fromkeys(cell["convention"] for cell in results["cells"] if "convention" in cell))
-    seeds = _span({len(cell["seeds"]) for cell in results["cells"]})
-    episodes = _span({cell.get("episodes", results["episodes"]) for cell in results["cells"]})
+    seeds = format_span({len(cell["seeds"]) for cell in results["cells"]})
+    episodes = format_span({cell.get("episodes", results["episodes"]) for cell in results["cells"]})
     said = f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
     return (
         f"Mean ± standard error over {seeds} seeds of the {results['mode']} return, {episodes} episodes a seed.{said}"
     )
-
-
-def _span(counts: Collection[int]) -> str:
-    low, high = min(counts), max(counts)
-    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def _steps_to(cell: Mapping[str, Any]) -> str:

@@ -12,7 +12,7 @@ import torch
 from pydantic import BaseModel
 
 from esp_cli import console
-from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean
+from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean, format_span
 
 
 class Model(BaseModel):
@@ -102,6 +102,7 @@ def test_means_and_intervals() -> None:
     assert format_mean(-122.251, math.nan) == "-122.25"
     assert format_mean(3.0) == "3.00"
     assert format_interval((-125.04, -119.96), digits=1) == "[-125.0, -120.0]"
+    assert [format_span(counts) for counts in ([160, 32, 64], {10})] == ["32 to 160", "10"]
 
 
 class Clock:
