@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from esp_cli.algorithms.registry import ALGORITHMS, PRESETS, TUNED
+from esp_cli.algorithms.presets import PRESETS, TUNED
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig

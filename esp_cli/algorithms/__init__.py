@@ -1,1 +1,1 @@
-"""Learners. Each is one file: its config, its linear `update`, and the presets that were measured for it."""
+"""Learners. Each is one file: its config and its linear `update`."""

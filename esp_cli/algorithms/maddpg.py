@@ -46,66 +46,6 @@ class MaddpgConfig(OffPolicyConfig):
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
 
-PRESETS: dict[str, dict[str, dict[str, object]]] = {
-    "default": {"network": {"activation": "relu"}},
-    "paper": {
-        "maddpg": {
-            "num_envs": 1,
-            "rounds": 20,
-            "replay_episodes": 5000,
-            "td_lambda": 0.0,
-            "learning_rate": 7e-4,
-            "actor_learning_rate": 7e-4,
-            "anneal_learning_rate": False,
-            "critic_sees_time": False,
-            "actor_actions": "own",
-            "output_penalty": 0.0,
-        },
-        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
-        "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
-    },
-}
-"""What a preset changes; "paper" is supplement table 3 with the MAPPO paper's defaults where it is silent."""
-
-TUNED: dict[str, dict[str, dict[str, object]]] = {
-    "formation": {
-        "maddpg": {
-            "updates_per_episode": 4,
-            "batch_episodes": 4,
-            "replay_episodes": 80,
-            "td_lambda": 0.9,
-            "epsilon_finish": 0.4,
-            "actor_actions": "own",
-            "output_penalty": 0.05,
-        },
-        "prior": {"transforms": "c4"},
-        "evaluation": {"every_steps": 50_000},
-    },
-    "wildlife": {
-        "maddpg": {
-            "batch_episodes": 8,
-            "replay_episodes": 200,
-            "epsilon_steps": 20_000,
-            "learning_rate": 2e-3,
-            "actor_learning_rate": 2e-3,
-            "actor_gradient": "expected",
-            "output_penalty": 0.01,
-        },
-        "network": {"name": "mpn"},
-        "prior": {"transforms": "c4"},
-    },
-}
-"""What the preset `default` changes on a task: measured best there.
-
-Formation's episodes are twelve times as long as those of the particle tasks, so batch and replay hold fewer of them.
-Its robots are slow and their actions bounded: without much noise, and a penalty that keeps the outputs off the bounds,
-the critic never sees what steering would have brought.
-
-Wildlife's critic sees all pictures, and the actor's gradient is the expected one with a larger penalty: with the
-state's coordinates and a draw's gradient the actor was sure of itself before it knew anything.
-"""
-
-
 class Maddpg(OffPolicyLearner):
     """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`.
 

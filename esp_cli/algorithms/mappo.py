@@ -65,58 +65,6 @@ class MappoConfig(LearnerConfig):
     chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
 
 
-PRESETS: dict[str, dict[str, dict[str, object]]] = {
-    "default": {},
-    "paper": {
-        "mappo": {
-            "num_envs": 128,
-            "num_minibatches": 1,
-            "learning_rate": 7e-4,
-            "anneal_learning_rate": False,
-            "anneal_entropy": False,
-            "clip_value": True,
-            "value_decay": 0.99999,
-        },
-        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
-        "prior": {"transforms": "rot90", "consistency_coef": 0.5},
-    },
-}
-"""What a preset changes; "paper" is supplement table 2 with the MAPPO paper's defaults where it is silent."""
-
-TUNED: dict[str, dict[str, dict[str, object]]] = {
-    "formation": {
-        "mappo": {
-            "num_envs": 8,
-            "num_steps": 300,
-            "num_epochs": 5,
-            "num_minibatches": 8,
-            "gae_lambda": 0.98,
-            "entropy_coef": 0.003,
-            "critic_input": "own",
-        },
-        "network": {"activation": "relu"},
-        "prior": {"transforms": "c4"},
-        "evaluation": {"every_steps": 100_000},
-    },
-    "wildlife": {
-        "mappo": {
-            "num_envs": 64,
-            "num_steps": 16,
-            "num_epochs": 4,
-            "num_minibatches": 2,
-            "critic_input": "own",
-        },
-        "network": {"name": "mpn", "activation": "relu"},
-        "prior": {"transforms": "c4"},
-    },
-}
-"""What the preset `default` changes on a task: measured best there.
-
-Formation's worlds are in lockstep, so a rollout has to span an episode: one of its last seconds alone, in which
-everybody rests, leaves nothing but noise for the normalised advantages.
-"""
-
-
 PROBE_STEPS = 100
 """Environment steps per seed on which the symmetry errors are measured after every update."""
 

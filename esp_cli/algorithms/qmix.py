@@ -39,58 +39,6 @@ class QmixConfig(OffPolicyConfig):
     target_every: int = Field(100, ge=1, description="gradient steps between hard copies into the target networks")
 
 
-PRESETS: dict[str, dict[str, dict[str, object]]] = {
-    "default": {"network": {"activation": "relu"}},
-    "paper": {
-        "qmix": {
-            "num_envs": 1,
-            "rounds": 20,
-            "replay_episodes": 5000,
-            "critic_input": "state",
-            "learning_rate": 7e-4,
-            "anneal_learning_rate": False,
-            "td_lambda": 0.0,
-            "critic_sees_time": False,
-        },
-        "network": {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True},
-        "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
-    },
-}
-"""What a preset changes; "paper" is supplement table 3 with the MAPPO paper's defaults where it is silent."""
-
-TUNED: dict[str, dict[str, dict[str, object]]] = {
-    "formation": {
-        "qmix": {
-            "updates_per_episode": 4,
-            "batch_episodes": 4,
-            "replay_episodes": 80,
-            "learning_rate": 2e-3,
-        },
-        "network": {"separate_parts": True},
-        "prior": {"transforms": "c4"},
-        "evaluation": {"every_steps": 50_000},
-    },
-    "predator-prey": {"qmix": {"replay_episodes": 5000}},
-    "wildlife": {
-        "qmix": {
-            "batch_episodes": 8,
-            "replay_episodes": 200,
-            "epsilon_steps": 20_000,
-            "learning_rate": 2e-3,
-            "critic_input": "state",
-        },
-        "network": {"name": "mpn"},
-        "prior": {"transforms": "c4"},
-    },
-}
-"""What the preset `default` changes on a task: measured best there.
-
-Formation's episodes are twelve times as long as those of the particle tasks, so batch and replay hold fewer of them.
-One value per wheel speed learns faster than one per pair of speeds.
-
-On predator-prey the plain learner learns few and recent episodes by heart; with many both learners end higher.
-"""
-
 VALUE_GAIN = 0.1
 """Orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards."""
 

@@ -6,9 +6,3 @@ from esp_cli.algorithms import maddpg, mappo, qmix
 from esp_cli.algorithms.learner import Learner
 
 ALGORITHMS: dict[str, type[Learner]] = {"mappo": mappo.Mappo, "maddpg": maddpg.Maddpg, "qmix": qmix.Qmix}
-
-PRESETS = {"mappo": mappo.PRESETS, "maddpg": maddpg.PRESETS, "qmix": qmix.PRESETS}
-"""Per algorithm and preset: the settings, by section, that differ from the defaults."""
-
-TUNED = {"mappo": mappo.TUNED, "maddpg": maddpg.TUNED, "qmix": qmix.TUNED}
-"""Per algorithm and task: the settings, by section, that the preset `default` changes there."""

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from esp_cli.algorithms.registry import ALGORITHMS, PRESETS, TUNED
+from esp_cli.algorithms.presets import PRESETS, TUNED
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class

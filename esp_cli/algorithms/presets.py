@@ -1,0 +1,167 @@
+"""Presets: what `--preset` and the task change in the defaults of an algorithm, a network, the prior and evaluation.
+
+`PRESETS` holds settings by algorithm, preset and section. `TUNED` holds what the preset `default` changes on a task:
+the settings that measured best there. A setting that neither table names keeps the default of its config class.
+"""
+
+from __future__ import annotations
+
+Sections = dict[str, dict[str, object]]
+"""Settings by section: the algorithm's name, "network", "prior" or "evaluation"."""
+
+_MAPPO_PAPER_NETWORK: dict[str, object] = {
+    "name": "gru",
+    "hidden": (64, 64),
+    "activation": "relu",
+    "layer_norm": True,
+}
+
+# "paper" is supplement table 2 (MAPPO) or 3 (MADDPG, QMIX), and the MAPPO paper's defaults where these are silent.
+PRESETS: dict[str, dict[str, Sections]] = {
+    "mappo": {
+        "default": {},
+        "paper": {
+            "mappo": {
+                "num_envs": 128,
+                "num_minibatches": 1,
+                "learning_rate": 7e-4,
+                "anneal_learning_rate": False,
+                "anneal_entropy": False,
+                "clip_value": True,
+                "value_decay": 0.99999,
+            },
+            "network": _MAPPO_PAPER_NETWORK,
+            "prior": {"transforms": "rot90", "consistency_coef": 0.5},
+        },
+    },
+    "maddpg": {
+        "default": {"network": {"activation": "relu"}},
+        "paper": {
+            "maddpg": {
+                "num_envs": 1,
+                "rounds": 20,
+                "replay_episodes": 5000,
+                "td_lambda": 0.0,
+                "learning_rate": 7e-4,
+                "actor_learning_rate": 7e-4,
+                "anneal_learning_rate": False,
+                "critic_sees_time": False,
+                "actor_actions": "own",
+                "output_penalty": 0.0,
+            },
+            "network": _MAPPO_PAPER_NETWORK,
+            "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+        },
+    },
+    "qmix": {
+        "default": {"network": {"activation": "relu"}},
+        "paper": {
+            "qmix": {
+                "num_envs": 1,
+                "rounds": 20,
+                "replay_episodes": 5000,
+                "critic_input": "state",
+                "learning_rate": 7e-4,
+                "anneal_learning_rate": False,
+                "td_lambda": 0.0,
+                "critic_sees_time": False,
+            },
+            "network": _MAPPO_PAPER_NETWORK,
+            "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+        },
+    },
+}
+
+TUNED: dict[str, dict[str, Sections]] = {
+    "mappo": {
+        # All worlds are in lockstep, so a rollout has to span an episode. In the last seconds of an episode all robots
+        # rest, and the normalised advantages of these seconds alone are noise.
+        "formation": {
+            "mappo": {
+                "num_envs": 8,
+                "num_steps": 300,
+                "num_epochs": 5,
+                "num_minibatches": 8,
+                "gae_lambda": 0.98,
+                "entropy_coef": 0.003,
+                "critic_input": "own",
+            },
+            "network": {"activation": "relu"},
+            "prior": {"transforms": "c4"},
+            "evaluation": {"every_steps": 100_000},
+        },
+        "wildlife": {
+            "mappo": {
+                "num_envs": 64,
+                "num_steps": 16,
+                "num_epochs": 4,
+                "num_minibatches": 2,
+                "critic_input": "own",
+            },
+            "network": {"name": "mpn", "activation": "relu"},
+            "prior": {"transforms": "c4"},
+        },
+    },
+    "maddpg": {
+        # Episodes are twelve times as long as those of the particle tasks, so batch and replay hold fewer of them.
+        # The robots are slow and their actions bounded. Without strong noise, and a penalty that keeps the outputs off
+        # the bounds, the replay holds too few steering actions for the critic to value them.
+        "formation": {
+            "maddpg": {
+                "updates_per_episode": 4,
+                "batch_episodes": 4,
+                "replay_episodes": 80,
+                "td_lambda": 0.9,
+                "epsilon_finish": 0.4,
+                "actor_actions": "own",
+                "output_penalty": 0.05,
+            },
+            "prior": {"transforms": "c4"},
+            "evaluation": {"every_steps": 50_000},
+        },
+        # The critic sees all pictures. The actor's gradient is the expected one, with a larger penalty: with the
+        # state's coordinates and the gradient of a draw, the actor becomes nearly deterministic before the critic is
+        # accurate.
+        "wildlife": {
+            "maddpg": {
+                "batch_episodes": 8,
+                "replay_episodes": 200,
+                "epsilon_steps": 20_000,
+                "learning_rate": 2e-3,
+                "actor_learning_rate": 2e-3,
+                "actor_gradient": "expected",
+                "output_penalty": 0.01,
+            },
+            "network": {"name": "mpn"},
+            "prior": {"transforms": "c4"},
+        },
+    },
+    "qmix": {
+        # Batch and replay hold fewer episodes, as for MADDPG. One value per wheel speed learns faster than one per
+        # pair of speeds.
+        "formation": {
+            "qmix": {
+                "updates_per_episode": 4,
+                "batch_episodes": 4,
+                "replay_episodes": 80,
+                "learning_rate": 2e-3,
+            },
+            "network": {"separate_parts": True},
+            "prior": {"transforms": "c4"},
+            "evaluation": {"every_steps": 50_000},
+        },
+        # With few and recent episodes the plain learner memorises them; with 5000 both learners end higher.
+        "predator-prey": {"qmix": {"replay_episodes": 5000}},
+        "wildlife": {
+            "qmix": {
+                "batch_episodes": 8,
+                "replay_episodes": 200,
+                "epsilon_steps": 20_000,
+                "learning_rate": 2e-3,
+                "critic_input": "state",
+            },
+            "network": {"name": "mpn"},
+            "prior": {"transforms": "c4"},
+        },
+    },
+}
