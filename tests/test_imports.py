@@ -1,6 +1,7 @@
 """Imports point one way, heavy or chatty libraries stay in their rooms, and no file format can run code.
 
-commands -> experiments -> deploy -> training -> algorithms -> prior, networks -> symmetry -> esp_envs.spec
+commands -> deploy, reporting -> drawing -> evaluation -> training -> algorithms -> prior, networks -> symmetry
+reporting -> studies -> evaluation; all that knows tasks by their contract alone -> esp_envs.spec
 
 The environment classes behind the contract (`esp_envs.spec` and `esp_envs.base`) are known to training and above only.
 """
@@ -24,11 +25,14 @@ RANKS = {
     "networks": 2,
     "algorithms": 3,
     "training": 4,
-    "deploy": 5,
-    "": 5.5,  # esp_cli itself: the version, and what other programs use of deploy
-    "experiments": 6,
-    "commands": 7,
-    "app": 8,
+    "evaluation": 5,
+    "drawing": 6,
+    "studies": 6,
+    "deploy": 7,
+    "reporting": 7,
+    "": 7.5,  # esp_cli itself: the version, and what other programs use of deploy
+    "commands": 8,
+    "app": 9,
 }
 """A part may import parts of a lower rank, and itself; parts of one rank do not know each other."""
 CONTRACT_ONLY_UP_TO = RANKS["algorithms"]
@@ -162,7 +166,7 @@ def test_a_forbidden_import_is_found(tmp_path: Path, path: str, source: str, rul
         ),
         ("esp_cli/prior/losses.py", "from esp_cli.symmetry.groups import Group\nfrom esp_envs.spec import Layout"),
         ("esp_cli/console.py", "from esp_cli.formatting import format_count as format_count"),
-        ("esp_cli/experiments/tables.py", "from esp_cli.formatting import format_count"),
+        ("esp_cli/reporting/tables.py", "from esp_cli.formatting import format_count"),
         ("esp_cli/training/loop.py", "import torch\nfrom esp_envs import make\nfrom esp_cli.prior import losses"),
         ("esp_cli/symmetry/transforms.py", "from esp_cli.symmetry.groups import Group\nfrom .groups import Element"),
         ("environments/esp_envs/epuck/planar.py", "import mujoco\nfrom esp_envs.spec import Layout"),

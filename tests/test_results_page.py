@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.experiments.pages import files_of, filled
-from esp_cli.experiments.results import read_results
-from esp_cli.experiments.tables import TABLES
+from esp_cli.reporting.pages import files_of, filled
+from esp_cli.reporting.results import read_results
+from esp_cli.reporting.tables import TABLES
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if files_of(page)]

@@ -42,7 +42,7 @@ def compare_homomorphic(
 
     The same command goes on where it was stopped.
     """
-    from esp_cli.experiments import homomorphic
+    from esp_cli.reporting import homomorphic
 
     names = [name.strip() for name in contestants.split(",") if name.strip()]
     configs = homomorphic.plan(names, steps, seeds, drones, grid, group, parse_assignments(settings or []))

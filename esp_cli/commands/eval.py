@@ -37,7 +37,7 @@ def evaluate(
     A policy may be judged under other settings of its task than it was trained under: another physics, more noise.
     """
     from esp_cli.deploy.box import open_policy
-    from esp_cli.experiments.judgement import judge
+    from esp_cli.evaluation.final import judge
     from esp_cli.training.loading import transfer
 
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))

@@ -62,8 +62,8 @@ def export(
     for unknown in set(formats) - set(FORMATS):
         raise ValueError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
     from esp_cli.deploy.box import open_policy
+    from esp_cli.deploy.bundling import add_to_box
     from esp_cli.deploy.export import export as write
-    from esp_cli.experiments.boxing import add_to_box
     from esp_cli.training.loading import single_seed
 
     if "policy" in formats and len(formats) > 1:
@@ -95,7 +95,7 @@ def export(
 
 
 def _best(trained: TrainedPolicy, episodes: int) -> int:
-    from esp_cli.experiments.boxing import best_seed
+    from esp_cli.deploy.bundling import best_seed
 
     seeds = trained.config.seeds
     best = best_seed(trained, episodes)

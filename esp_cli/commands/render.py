@@ -80,7 +80,7 @@ def render(
     if out.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
     from esp_cli.deploy.box import open_policy
-    from esp_cli.experiments import films, rendering
+    from esp_cli.drawing import films, rendering
     from esp_cli.training.loading import transfer
     from esp_cli.training.trainer import build_environment
 

@@ -14,8 +14,8 @@ from esp_cli import console
 from esp_cli.commands.options import JsonOption, parse_count
 
 if TYPE_CHECKING:
-    from esp_cli.experiments.comparison import RunCurve
-    from esp_cli.experiments.report import Material
+    from esp_cli.reporting.curves import RunCurve
+    from esp_cli.reporting.page import Material
 
 EPILOG = """Examples:\n
     esp report runs/table1\n
@@ -63,7 +63,7 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
-    from esp_cli.experiments.study import StudyFolder
+    from esp_cli.studies.study import StudyFolder
 
     if fill is not None:
         _fill(fill)
@@ -91,9 +91,9 @@ def _report_study(
     json: str | None,
 ) -> None:
     """Print the tables of a study and write its page."""
-    from esp_cli.experiments.report import Material
-    from esp_cli.experiments.results import collect, read_curve_of
-    from esp_cli.experiments.study import StudyFolder
+    from esp_cli.reporting.page import Material
+    from esp_cli.reporting.results import collect, read_curve_of
+    from esp_cli.studies.study import StudyFolder
 
     folder = StudyFolder.open(path)
     cells = folder.study.cells
@@ -122,7 +122,7 @@ def _report_runs(
     view: tuple[float, float] | None,
 ) -> None:
     """Compare runs put together by hand."""
-    from esp_cli.experiments import comparison
+    from esp_cli.reporting import curves as comparison
 
     steps = [parse_count(text) for text in at]
     lines = _references(reference)
@@ -150,9 +150,9 @@ def _material(
     thresholds: Sequence[float],
 ) -> Material:
     """Return runs put together by hand as a study, the first of which the others are held against."""
-    from esp_cli.experiments.report import Material
-    from esp_cli.experiments.results import of_runs
-    from esp_cli.experiments.study import Cell, Study
+    from esp_cli.reporting.page import Material
+    from esp_cli.reporting.results import of_runs
+    from esp_cli.studies.study import Cell, Study
 
     names = [f"{k}-{curve.label}" for k, curve in enumerate(curves)]
     cells = [
@@ -175,7 +175,7 @@ def _material(
 
 def _write(material: Material, out: Path | None, films: bool, small: Path | None) -> None:
     """Write what was asked for beside the tables."""
-    from esp_cli.experiments.report import draw_films, write_report
+    from esp_cli.reporting.page import draw_films, write_report
 
     if films:
         with console.TrainingProgress(len(material.runs), description="draw") as progress:
@@ -191,8 +191,8 @@ def _write(material: Material, out: Path | None, films: bool, small: Path | None
 
 
 def _fill(page: Path) -> None:
-    from esp_cli.experiments.films import write_file
-    from esp_cli.experiments.pages import filled
+    from esp_cli.drawing.films import write_file
+    from esp_cli.reporting.pages import filled
 
     write_file(page, filled(page).encode())
     console.note(f"tables -> {page}")
@@ -200,7 +200,7 @@ def _fill(page: Path) -> None:
 
 def print_tables(results: dict[str, Any]) -> None:
     """Print every table of a study's results."""
-    from esp_cli.experiments.tables import all_tables
+    from esp_cli.reporting.tables import all_tables
 
     for table in all_tables(results):
         console.table(table.headings, table.rows, title=table.title, caption=table.caption)

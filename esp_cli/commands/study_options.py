@@ -24,7 +24,7 @@ from esp_cli.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from esp_cli.experiments.catalogue import Request
+    from esp_cli.studies.catalogue import Request
 
 DEFAULT_SEEDS = tuple(range(10))
 DEFAULT_EPISODES = 320
@@ -120,7 +120,7 @@ class StudyChoices:
         Raises:
             ValueError: a name, number or setting that cannot be read.
         """
-        from esp_cli.experiments.catalogue import Request
+        from esp_cli.studies.catalogue import Request
 
         return Request(
             tasks=parse_names(self.tasks),

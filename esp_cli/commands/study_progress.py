@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from esp_cli import console
 
 if TYPE_CHECKING:
-    from esp_cli.experiments.scheduler import Run, Snapshot
+    from esp_cli.studies.scheduler import Run, Snapshot
 
 LINE_INTERVAL_S = 60.0
 """Seconds between two plain lines where standard error is no terminal."""

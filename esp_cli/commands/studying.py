@@ -17,11 +17,11 @@ from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 
 if TYPE_CHECKING:
-    from esp_cli.experiments.forecast import Forecast
-    from esp_cli.experiments.scheduler import Snapshot
-    from esp_cli.experiments.study import StudyFolder
+    from esp_cli.studies.forecast import Forecast
+    from esp_cli.studies.scheduler import Snapshot
+    from esp_cli.studies.study import StudyFolder
 
-_BOOT = "from esp_cli.experiments.workers import follow_parent; follow_parent(); from esp_cli.app import main; main()"
+_BOOT = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); from esp_cli.app import main; main()"
 """The application as a child process: it stops cleanly when the study that started it ends."""
 _MEBIBYTE = 2**20
 
@@ -37,9 +37,9 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
     Raises:
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
-    from esp_cli.experiments.catalogue import plan
-    from esp_cli.experiments.scheduler import Scheduler, available_cores
-    from esp_cli.experiments.study import StudyFolder
+    from esp_cli.studies.catalogue import plan
+    from esp_cli.studies.scheduler import Scheduler, available_cores
+    from esp_cli.studies.study import StudyFolder
     from esp_cli.training.trainer import build_learner
 
     out = choices.out or Path("runs") / kind
@@ -90,7 +90,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
 def _report(folder: StudyFolder, json: str | None) -> None:
     """Print the table of a study and say what to do next."""
     from esp_cli.commands.report import print_tables
-    from esp_cli.experiments.results import collect
+    from esp_cli.reporting.results import collect
 
     results = collect(folder)
     if json != "-":
@@ -102,7 +102,7 @@ def _report(folder: StudyFolder, json: str | None) -> None:
 
 def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
     """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
-    from esp_cli.experiments.forecast import forecast
+    from esp_cli.studies.forecast import forecast
 
     with console.TrainingProgress(len(folder.study.cells), description="measure") as progress:
         found = forecast(folder, others, jobs, progress.update)

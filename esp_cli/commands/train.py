@@ -165,7 +165,7 @@ def _shown(news: Progress) -> dict[str, float]:
 def _report(trainer: Trainer, folder: RunFolder) -> None:
     import numpy as np
 
-    from esp_cli.experiments.statistics import mean_and_sem
+    from esp_cli.evaluation.statistics import mean_and_sem
 
     rows = []
     for mode, values in trainer.final_returns().items():

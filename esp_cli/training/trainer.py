@@ -19,8 +19,8 @@ from esp_cli import __version__
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
-from esp_cli.training.evaluation import PolicyController, play
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
+from esp_cli.training.play import PolicyController, play
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.experiments.homomorphic import CONTESTANTS, flops_per_action, plan
+from esp_cli.reporting.homomorphic import CONTESTANTS, flops_per_action, plan
 from esp_cli.training.config import resolve_config
 from tests.cli.running import esp, refused
 

@@ -15,12 +15,12 @@ import pytest
 from esp_cli import console
 from esp_cli.commands.study_options import parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
-from esp_cli.experiments.scheduler import Scheduler, Snapshot
-from esp_cli.experiments.study import StudyFolder
+from esp_cli.studies.scheduler import Scheduler, Snapshot
+from esp_cli.studies.study import StudyFolder
 from esp_cli.training.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
-from tests.experiments.studies import small_study, stand_in
+from tests.studies.small_studies import small_study, stand_in
 
 ROOT = Path(__file__).parents[2]
 TINY = ("reproduce", "table1", "--tasks", "navigation", "--algos", "mappo", "--seeds", "2", "--episodes", "4")

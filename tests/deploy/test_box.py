@@ -14,8 +14,8 @@ import pytest
 from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
 from esp_cli.deploy import box
 from esp_cli.deploy.box import MANIFEST, Entry, box_folder, config_of, find, load_entry, open_policy, read_box
-from esp_cli.experiments.boxing import add_to_box, best_seed, command_of, play_greedily, score_of
-from esp_cli.experiments.judgement import judge
+from esp_cli.deploy.bundling import add_to_box, best_seed, command_of, play_greedily, score_of
+from esp_cli.evaluation.final import judge
 from esp_cli.training.config import resolve_config
 from tests.deploy.policies import drawn_policy
 

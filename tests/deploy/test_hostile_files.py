@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.deploy.box import MANIFEST, read_box, write_box
+from esp_cli.deploy.bundling import add_to_box
 from esp_cli.deploy.library import load_policy
-from esp_cli.experiments.boxing import add_to_box
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.loading import load_policy as load_trained

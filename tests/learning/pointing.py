@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from esp_cli.training.evaluation import Controller, play
+from esp_cli.training.play import Controller, play
 from esp_cli.training.streams import stream_seeds
 from esp_envs.base import (
     Environment,

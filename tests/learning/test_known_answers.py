@@ -10,7 +10,7 @@ from esp_cli.algorithms.mappo import Mappo, MappoConfig
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import transform_set
-from esp_cli.training.evaluation import HeuristicController, PolicyController, RandomController
+from esp_cli.training.play import HeuristicController, PolicyController, RandomController
 from esp_cli.training.streams import generators, stream_seeds
 from tests.learning.pointing import HORIZON, SEEDS, AlwaysRight, Pointing, iterations_to, score
 

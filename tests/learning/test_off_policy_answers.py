@@ -9,7 +9,7 @@ from torch import Tensor
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
-from esp_cli.training.evaluation import PolicyController
+from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators, stream_seeds
 from tests.learning.pointing import SEEDS, AlwaysRight, Pointing, score
 

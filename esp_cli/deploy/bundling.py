@@ -1,0 +1,125 @@
+"""Putting a trained policy into the box: the run's best seed, judged on episodes that nobody chose it by."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from esp_cli import __version__
+from esp_cli.deploy.box import Entry, Score, read_box, standard_name, write_box
+from esp_cli.evaluation.final import play_batches
+from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.training.checkpoint import save_checkpoint
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.loading import TrainedPolicy, single_seed
+from esp_cli.training.play import Episodes, PolicyController
+from esp_cli.training.run_folder import POLICY_FORMAT
+from esp_cli.training.trainer import policy_description
+
+_SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
+_OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
+
+
+def best_seed(trained: TrainedPolicy, episodes: int) -> int:
+    """Return the seed with the largest mean greedy return over episodes that no verdict uses."""
+    if len(trained.config.seeds) == 1:
+        return trained.config.seeds[0]
+    returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns
+    return trained.config.seeds[int(returns.mean(1).argmax())]
+
+
+def score_of(episodes: Episodes) -> Score:
+    """Return mean, standard error and 95 % bootstrap interval over the episodes of one seed."""
+    returns = episodes.returns[0].double().numpy()
+    mean, sem = mean_and_sem(returns)
+    interval = bootstrap_interval(returns)
+    if sem is None or interval is None or np.ptp(returns) == 0:
+        raise ValueError("these episodes all brought the same return, or there is only one; a score needs more of them")
+    return Score(mean=mean, sem=sem, ci95=(float(interval[0]), float(interval[1])), episodes=returns.size)
+
+
+def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:
+    """Play the episodes of one seed's policy that `esp eval` plays too."""
+    return play_batches(alone, PolicyController(alone.policy), "greedy", episodes)
+
+
+def add_to_box(
+    trained: TrainedPolicy, folder: Path, episodes: int, seed: int | None = None, name: str | None = None
+) -> Entry:
+    """Write one seed's policy into a box and list it in the manifest, in the place of one of the same name.
+
+    Args:
+        trained: a run.
+        folder: of the box; made where it is missing.
+        episodes: to choose the seed by, and as many others to judge it by.
+        seed: which one; by default the best.
+        name: of the policy; by default from task, algorithm and prior.
+
+    Returns:
+        Its line in the manifest.
+
+    Raises:
+        ValueError: no such seed, a name that is none, a damaged manifest, or a file that cannot be written.
+    """
+    config = trained.config
+    name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
+    if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name) or len(name) > 100:
+        raise ValueError(f"'{name}' is no name for a policy; write words of a-z and 0-9 with - between them")
+    alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
+    played = play_greedily(alone, episodes)
+    score = score_of(played)
+    folder.mkdir(parents=True, exist_ok=True)
+    others = tuple(entry for entry in read_box(folder) if entry.name != name)
+    file = folder / f"{name}.safetensors"
+    description = policy_description(alone.config, alone.spec, alone.step, [score.mean])
+    save_checkpoint(file, alone.policy.state_dict(), description, POLICY_FORMAT)
+    entry = Entry(
+        name=name,
+        file=file.name,
+        sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+        task=config.task,
+        task_version=alone.spec.version,
+        convention=alone.spec.convention,
+        algorithm=config.algorithm,
+        prior=config.prior.kind,
+        seed=alone.config.seeds[0],
+        chosen_from=len(config.seeds),
+        step=alone.step,
+        score=score,
+        metrics={key: float(value.mean()) for key, value in played.metrics.items()},
+        command=command_of(config),
+        esp_version=__version__,
+        config=config.model_dump(mode="json"),
+    )
+    write_box(folder, (*others, entry))
+    return entry
+
+
+def command_of(config: RunConfig) -> str:
+    """Return the command line that trains a run of this configuration: what is not a default of its preset is set."""
+    plain = resolve_config(
+        config.task, config.algorithm, config.preset, config.steps, config.seeds, config.device
+    ).model_dump(mode="json")
+    own = config.model_dump(mode="json")
+    words = ["esp train", f"--task {config.task}", f"--algo {config.algorithm}"]
+    words += [f"--preset {config.preset}"] if config.preset != "default" else []
+    seeds = config.seeds
+    counted = seeds == tuple(range(len(seeds)))
+    words += [f"--seeds {len(seeds) if counted else ','.join(map(str, seeds)) + ','}", f"--steps {config.steps}"]
+    words += [f"--device {config.device}"] if config.device != "cpu" else []
+    for section, key in ({config.algorithm: "algorithm_settings"} | _SECTIONS).items():
+        words += [
+            _assignment(f"{section}.{name}", value) for name, value in own[key].items() if value != plain[key].get(name)
+        ]
+    return " ".join(words)
+
+
+def _assignment(name: str, value: Any) -> str:
+    """Write one setting as an option."""
+    text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return f"{_OPTIONS[name]} {text}" if name in _OPTIONS else f"--set {name}={text}"

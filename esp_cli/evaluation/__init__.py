@@ -1,0 +1,1 @@
+"""How good a policy is: the final evaluation beside reference policies, and statistics over seeds."""

@@ -1,1 +1,0 @@
-"""The studies of the paper: statistics over seeds, and the figures drawn from them."""

@@ -1,0 +1,1 @@
+"""What studies say: results, tables, figures and pages."""

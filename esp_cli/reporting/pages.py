@@ -1,0 +1,50 @@
+"""Tables of a documentation page that are computed from results files: each stands between two comments.
+
+    <!-- results: measured/table1.json paper -->
+    ... written by `esp report --fill PAGE`, never by hand ...
+    <!-- end of results -->
+
+The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`. Several files of one kind
+of study, with spaces between, give one table. A comment that does not begin its line is none of these, as this example.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from esp_cli.reporting.results import join, read_results
+from esp_cli.reporting.tables import TABLES
+
+_BLOCK = re.compile(
+    r"^(<!-- results: (?P<files>\S+(?: \S+)*) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)",
+    re.DOTALL | re.MULTILINE,
+)
+
+
+def filled(page: Path) -> str:
+    """Return the text of a page with every such table computed anew.
+
+    Raises:
+        ValueError: the page, a file or a table is not there, or a file is damaged.
+    """
+    try:
+        text = page.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"cannot read {page}: {error.strerror or error}") from None
+
+    def compute(match: re.Match[str]) -> str:
+        name = match["table"]
+        if name not in TABLES:
+            raise ValueError(f"{page} asks for the table '{name}'; the tables are {', '.join(TABLES)}")
+        table = TABLES[name](join([read_results(page.parent / file) for file in match["files"].split()]))
+        content = "Nothing yet." if table is None else table.markdown()
+        return f"{match[1]}\n{content}\n\n{match[4]}"
+
+    return _BLOCK.sub(compute, text)
+
+
+def files_of(page: Path) -> list[str]:
+    """Return the results files that a page's tables come from, each once."""
+    blocks = _BLOCK.finditer(page.read_text(encoding="utf-8"))
+    return list(dict.fromkeys(file for match in blocks for file in match["files"].split()))

@@ -1,0 +1,307 @@
+"""Figures of the studies: learning curves with bands over seeds, and bars with every seed shown.
+
+Each figure is written as PNG and as SVG, the same bytes for the same numbers. Colours are those of Okabe and Ito, which
+people with any common colour blindness can tell apart; curves differ in their line style too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+from numpy.typing import ArrayLike
+
+from esp_cli.evaluation.statistics import Band, bootstrap_interval, curve_band, mean_and_sem
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito, "Color Universal Design", 2008, without the yellow, which is too light for lines on white."""
+
+LineStyle = str | tuple[int, tuple[int, ...]]
+
+_LINE_STYLES: tuple[LineStyle, ...] = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+_LABEL_CHARACTERS = 44
+"""Of one line beside the vertical axis."""
+_STYLE: dict[Any, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "font.family": ["DejaVu Sans"],
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E5E5E5",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    # names are not mathematics: a dollar sign stays one
+    "text.parse_math": False,
+    # identifiers in SVG files are drawn at random unless salted
+    "svg.hashsalt": "esp",
+}
+_LABEL_GAP = 0.045  # of the height of the axes
+_BAND_NAMES = {"ci95": "95 % bootstrap interval", "sem": "standard error"}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One learning curve.
+
+    Attributes:
+        label: its name in the legend.
+        steps: env steps per seed [K].
+        values: [K, S].
+    """
+
+    label: str
+    steps: ArrayLike
+    values: ArrayLike
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bar.
+
+    Attributes:
+        label: its name on the axis.
+        values: one number per seed [S].
+    """
+
+    label: str
+    values: ArrayLike
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A value drawn across the axes, dotted for an anchor, dashed for a reference."""
+
+    name: str
+    value: float
+    style: LineStyle
+    colour: str
+
+
+def learning_curves(
+    curves: Sequence[Curve],
+    path: str | os.PathLike[str],
+    title: str,
+    ylabel: str,
+    anchors: Mapping[str, float] | None = None,
+    references: Mapping[str, float] | None = None,
+    band: Band = "ci95",
+    ylim: tuple[float, float] | None = None,
+) -> tuple[Path, Path]:
+    """Draw means over seeds with a band, beside horizontal lines for anchors and for numbers of others.
+
+    Args:
+        curves: at least one.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        title: heading.
+        ylabel: what is plotted, with its convention.
+        anchors: dotted lines: name -> value, as of the random and the heuristic policy.
+        references: dashed lines: name -> value, as of a paper.
+        band: what the shade is.
+        ylim: lowest and highest value in view; by default all of the curves and lines.
+
+    Returns:
+        The PNG and the SVG file.
+
+    Raises:
+        ValueError: no curve, shapes that do not fit, or a file that cannot be written.
+    """
+    if not curves:
+        raise ValueError("there is no curve to draw")
+    with _figure(path, title) as (figure, axes, files):
+        for index, curve in enumerate(curves):
+            draw_curve(axes, curve, index, band)
+        if ylim is not None:
+            axes.set_ylim(*ylim)
+        lines = _lines(anchors, references)
+        for line in lines:
+            axes.axhline(line.value, linestyle=line.style, color=line.colour, linewidth=1.0, zorder=1)
+        _label_lines(axes, lines)
+        axes.set_xlabel("environment steps per seed")
+        axes.set_ylabel(fill(ylabel, _LABEL_CHARACTERS))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        # below the axes: inside, it would cover a curve sooner or later
+        columns = 2 if len(curves) > 1 else 1
+        figure.legend(
+            loc="outside lower left", ncols=columns, title=_caption(band, [np.shape(c.values)[1] for c in curves])
+        )
+    return files
+
+
+def draw_curve(axes: Axes, curve: Curve, index: int, band: Band) -> None:
+    """Draw a curve with its band into axes.
+
+    Args:
+        axes: where to.
+        curve: the curve.
+        index: which colour and line style it has.
+        band: what the shade is.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    mean, low, high = curve_band(curve.values, band)
+    steps = np.asarray(curve.steps, dtype=np.float64)
+    if steps.shape != mean.shape:
+        raise ValueError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
+    num_seeds = np.shape(curve.values)[1]
+    colour, style = appearance(index)
+    marker = "o" if steps.size == 1 else None
+    label = f"{curve.label} ({_seeds(num_seeds)})"
+    axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=label)
+    if num_seeds > 1:
+        axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
+
+
+def appearance(index: int) -> tuple[str, LineStyle]:
+    """Return the colour and the line style of the curve with this index."""
+    return PALETTE[index % len(PALETTE)], _LINE_STYLES[index % len(_LINE_STYLES)]
+
+
+def bars(
+    groups: Sequence[Bar],
+    path: str | os.PathLike[str],
+    title: str,
+    xlabel: str,
+    baseline: float = 0.0,
+    anchors: Mapping[str, float] | None = None,
+    references: Mapping[str, float] | None = None,
+    band: Band = "ci95",
+) -> tuple[Path, Path]:
+    """Draw a horizontal bar per group with its interval and every seed as a dot.
+
+    Args:
+        groups: at least one, drawn from top to bottom.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        title: heading.
+        xlabel: what is plotted, with its convention.
+        baseline: where bars begin. The random policy's return makes a bar's length what was learned.
+        anchors: dotted lines: name -> value.
+        references: dashed lines: name -> value.
+        band: what the whiskers are.
+
+    Returns:
+        The PNG and the SVG file.
+
+    Raises:
+        ValueError: no bar, a value that is not finite, or a file that cannot be written.
+    """
+    if not groups:
+        raise ValueError("there is no bar to draw")
+    height = 1.8 + 0.5 * len(groups)
+    with _figure(path, title, height) as (_, axes, files):
+        for index, group in enumerate(groups):
+            colour = PALETTE[index % len(PALETTE)]
+            mean, sem = mean_and_sem(group.values)
+            values = np.asarray(group.values, dtype=np.float64)
+            axes.barh(index, mean - baseline, left=baseline, height=0.6, color=colour, alpha=0.55)
+            # a fixed spread instead of a random one keeps the dots apart and the file the same
+            spread = np.linspace(-0.18, 0.18, values.size) if values.size > 1 else np.zeros(1)
+            axes.plot(values, index + spread, "o", color=colour, markersize=3.5, markeredgewidth=0)
+            interval = bootstrap_interval(values) if band == "ci95" else (mean - (sem or 0.0), mean + (sem or 0.0))
+            if interval is not None and values.size > 1:
+                axes.plot(interval, [index, index], color="black", linewidth=1.6, marker="|", markersize=9)
+        axes.set_yticks(range(len(groups)), [f"{group.label}\n({_seeds(np.size(group.values))})" for group in groups])
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        for line in _lines(anchors, references):
+            label = f"{line.name} {line.value:g}"
+            axes.axvline(line.value, linestyle=line.style, color=line.colour, linewidth=1.2, label=label)
+        if baseline:
+            axes.axvline(baseline, color="black", linewidth=0.8)
+        caption = _caption(band, [np.size(group.values) for group in groups])
+        axes.set_xlabel(f"{xlabel}\n{caption}" if caption else xlabel)
+        if anchors or references:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return files
+
+
+@contextmanager
+def _figure(
+    path: str | os.PathLike[str], title: str, height: float = 4.6
+) -> Iterator[tuple[Figure, Axes, tuple[Path, Path]]]:
+    """Set up a figure with one pair of axes, written at the end."""
+    with written_figure(path, (7.2, height)) as (figure, files):
+        axes = figure.add_subplot()
+        axes.set_title(title, loc="left", fontweight="bold")
+        yield figure, axes, files
+
+
+@contextmanager
+def written_figure(
+    path: str | os.PathLike[str], size: tuple[float, float]
+) -> Iterator[tuple[Figure, tuple[Path, Path]]]:
+    """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched.
+
+    Args:
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        size: width and height, inches.
+
+    Raises:
+        ValueError: the files cannot be written.
+    """
+    path = Path(path)
+    stem = path.stem if path.suffix in {".png", ".svg"} else path.name
+    png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure, (png, svg)
+        try:
+            # dates and versions would make every file differ from the last
+            figure.savefig(png, metadata={"Software": None})
+            figure.savefig(svg, metadata={"Date": None, "Creator": None})
+        except OSError as error:
+            raise ValueError(f"cannot write the figure {path}: {error.strerror or error}") from None
+
+
+def _lines(anchors: Mapping[str, float] | None, references: Mapping[str, float] | None) -> list[_Line]:
+    dotted = [_Line(name, value, ":", "#777777") for name, value in (anchors or {}).items()]
+    dashed = [_Line(name, value, (0, (8, 4)), "#333333") for name, value in (references or {}).items()]
+    return dotted + dashed
+
+
+def _label_lines(axes: Axes, lines: Sequence[_Line]) -> None:
+    """Write the names of the horizontal lines in view at the right, pushed apart where values are close."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high)
+    shown = [line for line in lines if low <= line.value <= high]
+    heights = _spread([(line.value - low) / (high - low) for line in shown])
+    for line, height in zip(shown, heights, strict=True):
+        axes.text(1.01, height, f"{line.name} {line.value:g}", transform=axes.transAxes, va="center", fontsize=8)
+
+
+def _spread(heights: Sequence[float]) -> list[float]:
+    """Return heights in the same order, at least a line of text apart, around where they were."""
+    order = np.argsort(heights, kind="stable")
+    placed = np.array(heights, dtype=np.float64)
+    for _ in range(50):
+        moved = False
+        for below, above in pairwise(order):
+            missing = _LABEL_GAP - (placed[above] - placed[below])
+            if missing > 1e-9:
+                placed[below] -= missing / 2
+                placed[above] += missing / 2
+                moved = True
+        if not moved:
+            break
+    return placed.tolist()
+
+
+def _seeds(count: int) -> str:
+    return f"{count} seed" if count == 1 else f"{count} seeds"
+
+
+def _caption(band: Band, seed_counts: Sequence[int]) -> str | None:
+    return f"mean and {_BAND_NAMES[band]} over seeds" if max(seed_counts) > 1 else None

@@ -1,0 +1,111 @@
+"""What a study costs before it is started: time from a short measured probe of each run, and disk."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+
+import torch
+
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.off_policy import OffPolicyLearner
+from esp_cli.training.config import RunConfig
+from esp_cli.training.play import PolicyController, play
+from esp_cli.training.streams import generators
+from esp_cli.training.trainer import build_environment, build_learner
+from esp_envs.registry import task_class
+
+PROBE_SECONDS = 1.0
+"""How long iterations of a run are timed, after a first that is not."""
+_LONG_SECONDS = 3.0
+"""An iteration that takes as long is measured once."""
+_PROBED_EPISODES = 8
+"""Of an evaluation, at most; longer ones take their share more."""
+_CHECKPOINTS = 3
+"""Two are kept while a third is written."""
+_JUDGED = 3
+"""A judgement plays greedily, with drawn actions, at random, and with each heuristic of the task."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one run takes on this machine, alone on one thread.
+
+    Attributes:
+        training_s: for all of its steps, evaluations included.
+        judgement_s: for its judgement.
+        disk_bytes: of what stays when it is done.
+        peak_bytes: of what lies on the disk at most while it trains.
+    """
+
+    training_s: float
+    judgement_s: float
+    disk_bytes: int
+    peak_bytes: int
+
+
+def probe(config: RunConfig, episodes: int) -> Cost:
+    """Measure a run by some of its iterations and an evaluation, without writing anything.
+
+    Args:
+        config: of the run.
+        episodes: per seed, of its judgement.
+
+    Raises:
+        ValueError: its parts do not go together.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the runs of a study do
+    try:
+        return _probe(config, episodes)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _probe(config: RunConfig, episodes: int) -> Cost:
+    learner = build_learner(config)
+    iterations = -(-config.steps // learner.steps_per_iteration)
+    begun = time.monotonic()
+    metrics = learner.iterate(0.0)
+    per_iteration = time.monotonic() - begun
+    if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
+        done, begun = 0, time.monotonic()
+        while done == 0 or (time.monotonic() - begun < PROBE_SECONDS and done < iterations):
+            metrics = learner.iterate(done / iterations)
+            done += 1
+        per_iteration = (time.monotonic() - begun) / done
+    per_episode = _seconds_per_episode(config, learner)
+    evaluations = 1 + config.steps // config.evaluation.every_steps
+    weights = sum(tensor.nbytes for tensor in learner.policy.state_dict().values())
+    row = len(json.dumps({name: value.tolist() for name, value in metrics.items()}))
+    kept = weights + _bytes(learner, complete=True) + iterations * row
+    return Cost(
+        training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
+        judgement_s=(_JUDGED + len(task_class(config.task).heuristics)) * episodes * per_episode,
+        disk_bytes=kept,
+        peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + _replay_to_come(config, learner)),
+    )
+
+
+def _seconds_per_episode(config: RunConfig, learner: Learner) -> float:
+    """Return the seconds that one greedy episode of every seed takes, played side by side with others."""
+    count = min(config.evaluation.episodes, _PROBED_EPISODES)
+    env = build_environment(config, count, "probe")
+    begun = time.monotonic()
+    play(env, PolicyController(learner.policy, generators(config.seeds, "probe")))
+    return (time.monotonic() - begun) / count
+
+
+def _bytes(learner: Learner, complete: bool = False) -> int:
+    return sum(tensor.nbytes for tensor in learner.state_dict(complete).values())
+
+
+def _replay_to_come(config: RunConfig, learner: Learner) -> int:
+    """Return by how much the replay in a checkpoint will grow."""
+    if not isinstance(learner, OffPolicyLearner):
+        return 0
+    replay = learner.replay
+    copies = 1 + learner.prior.num_copies * config.prior.augments_replay
+    episodes = min(replay.capacity, config.steps // learner.spec.horizon * copies)
+    return replay.num_bytes * max(0, episodes - replay.size) // replay.capacity

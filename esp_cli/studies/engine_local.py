@@ -1,0 +1,98 @@
+"""Child processes that train and judge the runs of a study, none outliving the process that started it."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import esp_envs
+
+_SET_PARENT_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of Linux's prctl."""
+_PARENT = "ESP_PARENT_PROCESS"
+_TAIL_BYTES = 8192
+
+
+class Worker:
+    """One command line in a process of its own; what it says is appended to a file.
+
+    Args:
+        program: what is started; it has to call `follow_parent` first.
+        arguments: of the program.
+        log: file that takes what it prints.
+        threads: of its matrix products.
+    """
+
+    def __init__(self, program: Sequence[str], arguments: Sequence[str], log: Path, threads: int = 1) -> None:
+        self.log = log
+        roots = [str(Path(__file__).parents[2]), str(Path(esp_envs.__path__[0]).parent)]
+        path = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = os.environ | {
+            "OMP_NUM_THREADS": str(threads),
+            "PYTHONPATH": path,
+            "PYTHONSAFEPATH": "1",  # a file called random.py in the user's folder is not imported
+            "PYTHONUNBUFFERED": "1",
+            _PARENT: str(os.getpid()),
+        }
+        with log.open("ab") as file:
+            file.write(f"$ esp {' '.join(arguments)}\n".encode())
+            file.flush()
+            self._process = subprocess.Popen(
+                [*program, *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                env=environment,
+                start_new_session=True,  # Ctrl-C reaches the study alone, which then asks its workers to stop
+            )
+
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code, negative for a signal, or None while it runs."""
+        return self._process.poll()
+
+    def ask_to_stop(self) -> None:
+        """Ask it to end after its iteration, with a checkpoint."""
+        if self.poll() is None:
+            self._process.terminate()
+
+    def kill(self) -> None:
+        """End it at once and wait until it is gone."""
+        if self.poll() is None:
+            self._process.kill()
+        self._process.wait()
+
+    def last_words(self) -> str:
+        """Return why it failed: its last error message, or its last line."""
+        code = self.poll()
+        if code is not None and code < 0:
+            return f"ended by {signal.Signals(-code).name}"
+        with self.log.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _TAIL_BYTES))
+            lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+        errors = [line for line in lines if line.startswith("error: ")]
+        return (errors or lines or ["it said nothing"])[-1].removeprefix("error: ")
+
+
+def follow_parent() -> None:
+    """Let this process stop cleanly when the one that started it ends; for whoever a Worker starts.
+
+    Where the operating system does not tell of a parent's end (it does on Linux), the process goes on to its own end; a
+    study that is started again meanwhile finds the run in use and waits for it.
+    """
+    parent = os.environ.get(_PARENT)
+    if parent is None or sys.platform != "linux":
+        return
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    if os.getppid() != int(parent):  # it ended before this process asked to be told
+        raise SystemExit(0)

@@ -1,0 +1,133 @@
+"""What is left of a study: time and disk of each of its runs, and of them all on so many cores."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from esp_cli.studies.cost import probe
+from esp_cli.studies.scheduler import Run, Scheduler, Status, makespan
+from esp_cli.studies.study import StudyFolder
+from esp_cli.training.config import RunConfig
+
+
+@dataclass(frozen=True)
+class RunForecast:
+    """What is left of one run.
+
+    Attributes:
+        name: of its cell.
+        status: of its cell; "finished" also where another study has it.
+        step: environment steps per seed that are done.
+        seconds_left: alone on one thread.
+        seconds: of the whole run; None where nothing is left of it, which is not measured.
+        disk_bytes: of what stays when it is done.
+        peak_bytes: of what lies on the disk at most while it trains.
+        config: what is run.
+    """
+
+    name: str
+    status: Status
+    step: int
+    seconds_left: float
+    seconds: float | None
+    disk_bytes: int
+    peak_bytes: int
+    config: RunConfig
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What is left of a study.
+
+    Attributes:
+        kind: of the study.
+        title: of the study.
+        out: its folder.
+        jobs: runs side by side.
+        runs: in the order in which they are begun.
+    """
+
+    kind: str
+    title: str
+    out: Path
+    jobs: int
+    runs: tuple[RunForecast, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Seconds until the last run ends, where `jobs` run side by side and nothing else does."""
+        return makespan([], [run.seconds_left for run in self.runs if run.status != "finished"], self.jobs)
+
+    @property
+    def core_seconds(self) -> float:
+        """Seconds of all runs added up."""
+        return sum(run.seconds_left for run in self.runs)
+
+    @property
+    def disk_bytes(self) -> int:
+        """Bytes of the folder when all is done."""
+        return sum(run.disk_bytes for run in self.runs)
+
+    @property
+    def disk_peak_bytes(self) -> int:
+        """Bytes of the folder at most, where the `jobs` runs that need most on the way come together at the end."""
+        extra = sorted((run.peak_bytes - run.disk_bytes for run in self.runs), reverse=True)
+        return self.disk_bytes + sum(extra[: self.jobs])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all of it, the sums too, as what `console.write_json` takes."""
+        names = ("kind", "title", "out", "jobs", "seconds", "core_seconds", "disk_bytes", "disk_peak_bytes", "runs")
+        return {name: getattr(self, name) for name in names}
+
+
+def forecast(
+    folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
+) -> Forecast:
+    """Measure what is left of a study by a probe of each run that is not finished, without writing anything.
+
+    Args:
+        folder: of the study; need not exist.
+        others: studies whose finished runs are taken over.
+        jobs: runs side by side.
+        listener: told how many runs have been looked at.
+    """
+    study = folder.study
+    found = []
+    for run in Scheduler(folder, study.cells, jobs, ()).runs:
+        twin = folder.run_path(run.cell) if run.status == "finished" else folder.find_twin(run.cell, others)
+        found.append(_finished(run, twin) if twin is not None else _measured(run, study.episodes))
+        listener(len(found))
+    return Forecast(study.kind, study.title, folder.path, jobs, tuple(found))
+
+
+def _finished(run: Run, path: Path) -> RunForecast:
+    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+    return RunForecast(
+        name=run.cell.name,
+        status="finished",
+        step=run.cell.config.steps,
+        seconds_left=0.0,
+        seconds=None,
+        disk_bytes=size,
+        peak_bytes=size,
+        config=run.cell.config,
+    )
+
+
+def _measured(run: Run, episodes: int) -> RunForecast:
+    config = run.cell.config
+    cost = probe(config, episodes)
+    left = cost.training_s * (1 - run.step / config.steps) + cost.judgement_s
+    return RunForecast(
+        name=run.cell.name,
+        status=run.status,
+        step=run.step,
+        seconds_left=left,
+        seconds=cost.training_s + cost.judgement_s,
+        disk_bytes=cost.disk_bytes,
+        peak_bytes=cost.peak_bytes,
+        config=config,
+    )

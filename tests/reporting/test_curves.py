@@ -1,0 +1,188 @@
+"""Runs side by side, against metrics written by hand and numbers worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from esp_cli.reporting.curves import RunCurve, compare, plot, read_curve
+from esp_cli.training.run_folder import RunFolder
+from tests.training.runs import tiny_config, tiny_folder
+
+NAN = math.nan
+SEEDS = (0, 1, 2)
+STEPS = (0, 100, 200, 300)
+PLAIN = [[-9.0, -8.0, -10.0], [-6.0, -7.0, -8.0], [-4.0, -6.0, -5.0], [-3.0, -5.0, -4.0]]
+ESP = [[-9.0, -8.0, -10.0], [-5.0, -4.0, -6.0], [-3.0, -1.0, -5.0], [-1.0, -2.0, -3.0]]
+
+
+def curve(values, label="run", steps=STEPS, seeds=SEEDS, **choice) -> RunCurve:
+    return RunCurve(label, tiny_config(seeds=seeds, **choice), np.array(steps), np.array(values, dtype=float), 12.5)
+
+
+def written(folder: Path, rows: list[dict], **choice) -> RunFolder:
+    """Make a run folder whose metrics are these rows."""
+    run = tiny_folder(folder, **choice)
+    run.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return run
+
+
+def test_a_curve_is_read_from_the_rows_that_evaluate(tmp_path):
+    rows = [
+        {"step": 0, "eval/return_greedy": [-9.0, -8.0], "eval/return_stochastic": [-20.0, -21.0]},
+        {"step": 50, "train/return": [-1.0, -1.0], "time/elapsed_s": 1.5},
+        {
+            "step": 100,
+            "eval/return_greedy": [-7.0, None],
+            "eval/return_stochastic": [-19.0, -18.0],
+            "time/elapsed_s": 3.0,
+        },
+        {"step": 150, "train/return": [-1.0, -1.0], "time/elapsed_s": None},
+    ]
+    run = written(tmp_path / "cn", rows)
+    read = read_curve(run.path, None, "greedy")
+    assert (read.label, read.steps.tolist(), read.seconds) == ("cn", [0, 100], 3.0)
+    np.testing.assert_array_equal(read.values, [[-9.0, -8.0], [-7.0, NAN]])
+    named = read_curve(run.path, "plain", "stochastic")
+    assert named.label == "plain"
+    assert named.values.tolist() == [[-20.0, -21.0], [-19.0, -18.0]]
+
+
+def test_a_run_without_an_evaluation_or_with_other_seeds_is_refused(tmp_path):
+    for name, rows, sentence in (
+        ("young", [{"step": 50, "train/return": [1.0, 1.0]}], "no row has the metric 'eval/return_greedy'"),
+        ("other", [{"step": 0, "eval/return_greedy": [1.0]}], "its metrics have 1 seeds, its configuration 2"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            read_curve(written(tmp_path / name, rows).path, None, "greedy")
+
+
+def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there():
+    one = curve([[-9.0], [-7.0], [-5.0]], steps=(0, 800, 1600), seeds=(0,))
+    assert one.config.evaluation.every_steps == 100
+    assert [one.at(step).tolist() for step in (0, 399, 401, 1100, 1600, 1700)] == [
+        [-9.0],
+        [-9.0],
+        [-7.0],
+        [-7.0],
+        [-5.0],
+        [-5.0],
+    ]
+    assert one.at(1701) is None, "more than an evaluation interval past the end"
+
+
+def test_the_fewest_episodes_of_all_runs_are_stated():
+    few, many = curve(PLAIN, "plain"), curve(ESP, "ESP")
+    evaluation = many.config.evaluation.model_copy(update={"episodes": 40})
+    many = replace(many, config=many.config.model_copy(update={"evaluation": evaluation}))
+    assert compare([many, few], [], [])["episodes_per_evaluation"] == 2
+
+
+def test_returns_differences_thresholds_and_areas_by_hand():
+    result = compare([curve(PLAIN, "plain"), curve(ESP, "ESP")], [100, 210], [-5.0, -2.0, 0.0])
+    assert (result["task"], result["task_version"], result["episodes_per_evaluation"]) == ("navigation", 1, 2)
+    plain, esp = result["runs"]
+    assert (plain["label"], plain["seeds"], plain["seconds"]) == ("plain", [0, 1, 2], 12.5)
+    # -6 -7 -8: mean -7, deviations 1 0 -1, variance 1, s.e.m. 1 / sqrt(3)
+    at = plain["returns"]["100"]
+    assert (at["mean"], at["sem"], at["per_seed"]) == (-7.0, pytest.approx(1 / math.sqrt(3)), [-6.0, -7.0, -8.0])
+    assert -8.0 <= at["ci95"][0] < -7.0 < at["ci95"][1] <= -6.0
+    assert plain["returns"]["210"]["mean"] == -5.0
+    # -5 -4 -6 less -6 -7 -8, seed by seed: 1 3 2
+    gap = esp["returns"]["100"]["difference"]
+    assert (gap["mean"], gap["paired"]) == (2.0, True)
+    assert (gap["ci95"][0], gap["ci95"][1]) == (pytest.approx(1.0, abs=0.34), pytest.approx(3.0, abs=0.34))
+    assert esp["returns"]["100"]["probability_of_improvement"] == 1.0
+    # at 200: -3 -1 -5 against -4 -6 -5: a win, a win, a tie
+    assert esp["returns"]["210"]["probability_of_improvement"] == pytest.approx(5 / 6)
+    assert esp["returns"]["210"]["difference"]["mean"] == 2.0
+    # means of plain: -9 -7 -5 -4; of ESP: -9 -5 -3 -2
+    assert plain["steps_to"] == {
+        "-5.0": {"mean": 200, "per_seed": [200, 300, 200]},
+        "-2.0": {"mean": None, "per_seed": [None, None, None]},
+        "0.0": {"mean": None, "per_seed": [None, None, None]},
+    }
+    assert esp["steps_to"]["-5.0"] == {"mean": 100, "per_seed": [100, 100, 200]}
+    assert esp["steps_to"]["-2.0"] == {"mean": 300, "per_seed": [300, 200, None]}
+    # trapezoids of seed 0: (-9 - 6) / 2, (-6 - 4) / 2, (-4 - 3) / 2, over three intervals: -16 / 3
+    assert plain["area_under_curve"]["per_seed"][0] == pytest.approx(-16 / 3)
+    assert json.loads(json.dumps(result, allow_nan=False))["runs"][1]["label"] == "ESP"
+
+
+def test_the_reference_has_no_difference_from_itself():
+    (only,) = compare([curve(PLAIN)], [100], [])["runs"]
+    assert "difference" not in only["returns"]["100"]
+    assert only["steps_to"] == {}
+
+
+def test_the_default_is_the_last_step_that_all_runs_reached():
+    result = compare([curve(PLAIN), curve(ESP[:3], steps=STEPS[:3])], [], [])
+    assert [list(run["returns"]) for run in result["runs"]] == [["200"], ["200"]]
+
+
+def test_runs_of_other_seeds_are_not_paired():
+    other = curve([[x + 1 for x in row] for row in PLAIN], seeds=(3, 4, 5))
+    _, second = compare([curve(PLAIN), other], [100], [])["runs"]
+    assert second["returns"]["100"]["difference"]["paired"] is False
+    assert second["returns"]["100"]["difference"]["mean"] == 1.0
+    # pairs of -5 -6 -7 against -6 -7 -8: 6 wins and 2 ties of 9
+    assert second["returns"]["100"]["probability_of_improvement"] == pytest.approx(7 / 9)
+
+
+def test_a_stopped_seed_is_left_out_and_shown():
+    stopped = [row.copy() for row in ESP]
+    stopped[2][1] = stopped[3][1] = NAN
+    _, second = compare([curve(PLAIN), curve(stopped)], [100, 300], [-3.0])["runs"]
+    at = second["returns"]["300"]
+    # -1 and -3: mean -2, s.e.m. |(-1) - (-3)| / 2
+    assert (at["mean"], at["sem"], at["per_seed"]) == (-2.0, pytest.approx(1.0), [-1.0, None, -3.0])
+    assert "difference" not in at, "other seeds than the reference's"
+    assert second["returns"]["100"]["difference"]["mean"] == 2.0, "before it stopped"
+    assert second["steps_to"]["-3.0"] == {"mean": None, "per_seed": [200, None, 300]}
+    assert second["area_under_curve"]["per_seed"][1] is None
+
+
+def test_a_run_whose_seeds_all_stopped_has_no_numbers():
+    broken = [PLAIN[0], [NAN] * 3]
+    (run,) = compare([curve(broken, steps=(0, 100))], [100], [])["runs"]
+    assert run["returns"]["100"] == {"mean": None, "sem": None, "ci95": None, "per_seed": [None, None, None]}
+
+
+def test_one_seed_leaves_no_error_to_state_and_one_evaluation_no_area():
+    (run,) = compare([curve([[-9.0]], steps=(0,), seeds=(4,))], [], [])["runs"]
+    assert run["returns"]["0"] == {"mean": -9.0, "sem": None, "ci95": None, "per_seed": [-9.0]}
+    assert run["area_under_curve"] is None
+
+
+@pytest.mark.parametrize(
+    "choice", [{"task": "predator-prey"}, {"task__num_agents": 2}, {"task__convention": "pettingzoo"}]
+)
+def test_other_tasks_settings_or_conventions_do_not_compare(choice):
+    with pytest.raises(ValueError, match="different tasks or task settings"):
+        compare([curve(PLAIN), curve(ESP, **choice)], [], [])
+
+
+def test_other_learners_do_compare():
+    result = compare([curve(PLAIN), curve(ESP, prior__kind="none", network__name="gru", mappo__num_envs=3)], [], [])
+    assert [run["config"]["network"]["name"] for run in result["runs"]] == ["mlp", "gru"]
+
+
+def test_a_run_of_a_gpu_is_compared_where_there_is_none():
+    there = curve(PLAIN)
+    there = RunCurve("gpu", there.config.model_copy(update={"device": "cuda"}), there.steps, there.values, 1.0)
+    assert compare([there, curve(ESP)], [100], [])["runs"][1]["returns"]["100"]["difference"]["mean"] == 2.0
+
+
+def test_the_picture_shows_the_curves_and_somebody_elses_number(tmp_path):
+    curves = [curve(PLAIN, "plain"), curve(ESP, "ESP")]
+    png, svg = plot(curves, tmp_path / "curves.png", "by hand", "greedy", {"the paper": -2.5})
+    with Image.open(png) as image:
+        assert image.format == "PNG"
+    text = svg.read_text()
+    assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (by hand)", "navigation"))

@@ -1,0 +1,138 @@
+"""The page of a report: self-contained, escaped, and rendered by a headless Chromium where there is one."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from esp_cli.drawing.films import write_gif
+from esp_cli.reporting.page import Material, write_report
+from esp_cli.reporting.results import collect, read_curve_of
+from tests.studies.small_studies import small_study, write_study
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: .ci/install-chromium, or apt-get")
+HOSTILE = "</script><script>console.error('run')</script>&\"'"
+HOVER = """
+<script>
+const svg = document.querySelector(".chart svg"), box = svg.getBoundingClientRect();
+const at = { bubbles: true, clientX: box.right - 2, clientY: box.top + 50 };
+svg.dispatchEvent(new PointerEvent("pointermove", at));
+document.body.dataset.shown = document.querySelector(".tip").innerText;
+svg.dispatchEvent(new PointerEvent("pointerleave", at));
+document.body.dataset.left = document.querySelector(".tip").hidden;
+</script></body>
+"""
+
+
+def material(path: Path, command: str = "esp reproduce table1") -> Material:
+    study = small_study(command=command)
+    folder = write_study(path / "s", study, {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]})
+    cells = folder.study.cells
+    curves = {cell.name: read_curve_of(folder.run_path(cell), cell, "greedy") for cell in cells}
+    return Material(folder.study, collect(folder), curves, {cell.name: folder.run_path(cell) for cell in cells})
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory) -> Path:
+    """The page of a study with a hostile title and one film."""
+    path = tmp_path_factory.mktemp("report")
+    made = material(path, HOSTILE)
+    frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 255)]
+    write_gif(made.runs[made.study.cells[1].name] / "film.gif", frames, [0.5, 0.5], frames)
+    files = write_report(made, path / "report")
+    assert [file.name for file in files] == ["report.html", "report.md", "curves.png", "results.json", "marl-eval.json"]
+    return files[0]
+
+
+class Loads(HTMLParser):
+    """Collects what a page would load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.scripts = 0
+
+    def handle_starttag(self, tag, attributes):
+        self.scripts += tag == "script"
+        self.found += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "action")]
+
+
+def test_the_page_loads_nothing_and_forbids_it_too(page):
+    text = page.read_text()
+    loads = Loads()
+    loads.feed(text)
+    assert loads.found
+    assert all(source.startswith("data:") for source in loads.found)
+    assert "default-src 'none'" in text
+    assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest", text)
+    assert loads.scripts == 1, "what was handed in is text, not a script"
+
+
+def test_tables_commands_configuration_and_films_are_on_the_page(page):
+    text = page.read_text()
+    for part in (
+        "-150.00 ± 5.77",
+        "navigation, 200",
+        "MAPPO-ESP",
+        "--set",
+        "&#34;num_agents&#34;: 3",
+        "data:image/gif",
+    ):
+        assert part in text, part
+    markdown = page.with_name("report.md").read_text()
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in markdown
+    assert "![curves](curves.png)" in markdown
+
+
+def test_a_study_that_has_not_begun_has_no_report(tmp_path):
+    made = material(tmp_path)
+    with pytest.raises(ValueError, match="no run of this study has an evaluation yet"):
+        write_report(Material(made.study, made.results, {}, {}), tmp_path / "out")
+
+
+def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Open a page without a screen, a network or a past."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    flags += ["--disable-component-update", "--disable-sync", "--no-first-run", f"--user-data-dir={profile}"]
+    flags += ["--enable-logging=stderr", "--window-size=1300,1800", *options, page.as_uri()]
+    return subprocess.run([str(BROWSER), *flags], capture_output=True, text=True, check=True, timeout=240)
+
+
+@needs_browser
+def test_a_browser_renders_it_and_shows_values_on_hovering(page, tmp_path):
+    hovered = page.with_name("hovered.html")
+    text = page.read_text().replace("</body>", HOVER)
+    hovered.write_text(text)
+    done = browse(hovered, tmp_path / "profile", "--dump-dom")
+    assert "CONSOLE" not in done.stderr, done.stderr
+    # the pointer is at the right edge: the last evaluation, of both curves
+    shown = re.search(r'data-shown="([^"]*)"', done.stdout).group(1)
+    assert "200 steps" in shown
+    assert "MAPPO: -150.00 [-160.00, -140.00]" in shown
+    assert "MAPPO-ESP: -130.00 [-140.00, -120.00]" in shown
+    assert 'data-left="true"' in done.stdout
+
+
+@needs_browser
+def test_a_broken_script_is_noticed(page, tmp_path):
+    broken = page.with_name("broken.html")
+    broken.write_text(page.read_text().replace('"use strict";', "nothing.here();"))
+    assert "CONSOLE" in browse(broken, tmp_path / "profile", "--dump-dom").stderr
+
+
+@needs_browser
+def test_a_screenshot_has_the_colours_of_the_curves(page, tmp_path):
+    picture = tmp_path / "page.png"
+    browse(page, tmp_path / "profile", f"--screenshot={picture}")
+    with Image.open(picture) as image:
+        colours = {colour for _, colour in image.convert("RGB").getcolors(2**24)}
+    assert {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)} <= colours

@@ -1,0 +1,193 @@
+"""Results and tables of a study whose runs were written by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from esp_cli.evaluation.statistics import average_improvement, leader
+from esp_cli.reporting.results import aggregates, collect, read_results, verdict
+from esp_cli.reporting.tables import TABLES, all_tables, returns_table
+from esp_cli.studies.paper import reported
+from esp_cli.studies.study import StudyFolder
+from tests.studies.small_studies import small_study, write_study
+
+PLAIN, ESP = [-150.0, -160.0, -140.0], [-130.0, -120.0, -140.0]
+
+
+def column(results, name, heading):
+    """Return one column of a table as texts."""
+    table = TABLES[name](results)
+    return [row[table.headings.index(heading)] for row in table.rows]
+
+
+@pytest.fixture
+def results(tmp_path):
+    return collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+
+
+def test_a_cell_by_hand(results):
+    plain, esp = (verdict(results, entry) for entry in results["cells"])
+    # -150 -160 -140: mean -150, s.e.m. 10 / sqrt(3); anchors -200 and -100 put -150 half way
+    assert (plain["mean"], plain["sem"]) == (-150.0, pytest.approx(10 / math.sqrt(3)))
+    assert plain["normalised"]["mean"] == pytest.approx(0.5)
+    assert (plain["ahead"], "difference" in plain) == (None, False)
+    # seed by seed +20 +40 0: mean 20; two wins and a tie of three
+    assert esp["difference"] == {"mean": 20.0, "ci95": (0.0, 40.0), "paired": True}
+    assert esp["probability_of_improvement"] == pytest.approx(2.5 / 3)
+    assert esp["ahead"] == "level", "the interval begins at 0"
+    # three seeds: none is a quarter, so the middle half is all of them
+    assert plain["iqm"]["value"] == pytest.approx(-150.0)
+    # evaluations at 0, 100, 200 are -40, -20, 0 from the end: mean height -20
+    assert plain["area"]["mean"] == pytest.approx(-170.0)
+
+
+def test_steps_to_where_the_reference_ended(results):
+    plain, esp = results["cells"]
+    # plain's mean curve: -190 -170 -150; that with the prior: -170 -150 -130
+    assert plain["steps_to"] == [{"threshold": -150.0, "of_mean": 200, "per_seed": [200, None, 200]}]
+    assert esp["steps_to"] == [{"threshold": -150.0, "of_mean": 100, "per_seed": [100, 100, 200]}]
+    assert column(results, "statistics", "steps to>") == ["-150.00: 200", "-150.00: 100"]
+
+
+def test_other_thresholds_can_be_asked_for(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
+    plain = collect(folder, thresholds=[-180.0, 0.0])["cells"][0]
+    assert [(passed["threshold"], passed["of_mean"]) for passed in plain["steps_to"]] == [(-180.0, 100), (0.0, None)]
+
+
+def test_ahead_and_behind_are_on_either_side_of_0(tmp_path):
+    better = {"MAPPO": PLAIN, "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN)]}
+    worse = {"MAPPO": PLAIN, "MAPPO-ESP": [x - 5 - k for k, x in enumerate(PLAIN)]}
+    for name, ends, side, word in (("b", better, "ahead", "yes"), ("w", worse, "behind", "no")):
+        found = collect(write_study(tmp_path / name, small_study(), ends))
+        assert verdict(found, found["cells"][1])["ahead"] == side
+        assert column(found, "comparison", "ahead of reference") == ["", word]
+
+
+def test_the_paper_stands_beside_a_cell_and_is_compared_by_the_errors_of_both(tmp_path):
+    ends = {"MAPPO": [-133.0, -132.0, -131.0], "MAPPO-ESP": [-100.0, -101.0, -102.0]}
+    found = collect(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends))
+    assert column(found, "comparison", "paper>") == ["-132.65 ± 2.89", "-122.25 ± 1.62"]
+    assert column(found, "comparison", "ours or paper ahead") == ["not told apart", "ours"]
+    assert found["cells"][0]["paper"] == [-132.65, 2.89]
+
+
+def test_who_leads_by_welch():
+    # difference 4, error sqrt(1 + 1): t = 2.83 with 18 degrees of freedom, p = 0.011
+    assert leader((4.0, 1.0, 10), (0.0, 1.0, 10)) == "first"
+    assert leader((0.0, 1.0, 10), (4.0, 1.0, 10)) == "second"
+    # t = 1.41, p = 0.17
+    assert leader((2.0, 1.0, 10), (0.0, 1.0, 10)) == "neither"
+    assert leader((4.0, None, 1), (0.0, 1.0, 10)) is None
+    assert leader((4.0, 1.0, 10), (0.0, None, 10)) is None
+
+
+def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
+    study = small_study(tasks=("navigation", "predator-prey"))
+    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    over = aggregates(found)
+    assert list(over) == ["MAPPO", "MAPPO-ESP"]
+    assert over["MAPPO"]["mean"].value == pytest.approx(0.5)
+    # 0.7 0.8 0.6 twice; a quarter of six is one at either end: 0.6 0.7 0.7 0.8
+    assert over["MAPPO-ESP"]["iqm"].value == pytest.approx(0.7)
+    assert over["MAPPO-ESP"]["improvement"].value == pytest.approx(2.5 / 3)
+    assert "improvement" not in over["MAPPO"]
+    one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    assert aggregates(one) == {}
+    assert TABLES["aggregates"](one) is None
+
+
+def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
+    ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
+    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends))
+    for cell in found["cells"][2:]:
+        cell["seeds"], cell["returns"] = cell["seeds"][:2], {"greedy": cell["returns"]["greedy"][:2]}
+    assert set(aggregates(found)["MAPPO-ESP"]) == {"iqm", "mean"}
+
+
+def test_the_mean_probability_of_improvement_by_hand():
+    # two wins of two, and one of two: 3 of 4; redrawn within each task, the first always gives 1
+    found = average_improvement({"a": ([1.0, 2.0], [0.0, 0.0]), "b": ([1.0, 0.0], [0.0, 1.0])})
+    assert found.value == 0.75
+    assert found.ci95 == (0.5, 1.0)
+    with pytest.raises(ValueError, match="same number of seeds"):
+        average_improvement({"a": ([1.0], [0.0]), "b": ([1.0, 0.0], [0.0, 1.0])})
+
+
+def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
+    found = collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": [-130.0, None, -140.0]}))
+    esp = verdict(found, found["cells"][1])
+    assert (esp["mean"], esp["per_seed"], "difference" in esp) == (-135.0, [-130.0, None, -140.0], False)
+    assert column(found, "statistics", "seeds>") == ["3", "2"]
+    gone = collect(write_study(tmp_path / "t", small_study(), {"MAPPO": [None] * 3}))
+    assert column(gone, "comparison", "return>")[0] == "every seed stopped"
+
+
+def test_what_is_unfinished_or_not_run_is_said(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
+    folder.judgement_path(folder.study.cells[0]).unlink()
+    found = collect(folder)
+    assert [cell["status"] for cell in found["cells"]] == ["unfinished", "not run"]
+    assert column(found, "comparison", "return>") == ["at 200", "not run"]
+    assert TABLES["statistics"](found).rows == ()
+    fresh = collect(StudyFolder.create(tmp_path / "fresh", small_study()))
+    assert next(table.title for table in all_tables(fresh)) == "Table 1 of the paper"
+
+
+def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
+    study = small_study(steps=((None, 500_000),))
+    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    short, whole = returns_table(found), returns_table(found, whole=True)
+    assert short.rows == (
+        ("navigation, 500k", "ours", "-150.00 ± 5.77", "-130.00 ± 5.77"),
+        ("", "paper", "-132.65 ± 2.89", "-122.25 ± 1.62"),
+    )
+    assert len(whole.rows) == 12
+    assert whole.headings[2:] == ("MADDPG>", "MADDPG-ESP>", "QMIX>", "QMIX-ESP>", "MAPPO>", "MAPPO-ESP>")
+    place = next(k for k, row in enumerate(whole.rows) if row[0] == "navigation, 500k")
+    assert whole.rows[place][2:] == ("not run",) * 4 + ("-150.00 ± 5.77", "-130.00 ± 5.77")
+    number = reported(("table1", "navigation", "500000", "qmix", "esp"))
+    assert whole.rows[place + 1][5] == f"{number.mean:.2f} ± {number.sem:.2f}"
+
+
+def test_a_results_file_holds_configuration_version_and_every_seed(results, tmp_path):
+    file = tmp_path / "results.json"
+    file.write_text(json.dumps(results))
+    again = read_results(file)
+    assert again == json.loads(json.dumps(results))
+    assert again["config"]["task"] == "navigation"
+    assert [cell["config"]["prior.kind"] for cell in again["cells"]] == ["none", "esp"]
+    assert {cell["esp_version"] for cell in again["cells"]} == {"0.0.1"}
+    assert again["cells"][1]["returns"]["greedy"] == ESP
+    assert [table.rows for table in all_tables(again)] == [table.rows for table in all_tables(results)]
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (None, "cannot read"),
+        ("{", "is not JSON"),
+        ("{}", "holds no results"),
+        ('{"format": "esp-results", "version": 99}', "another version"),
+    ],
+)
+def test_what_is_no_results_file_is_told_in_one_sentence(tmp_path, content, sentence):
+    file = tmp_path / "x.json"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(ValueError, match=sentence):
+        read_results(file)
+
+
+def test_an_ablation_has_its_variants_as_rows(tmp_path):
+    study = small_study("ablate-modules")
+    found = collect(write_study(tmp_path / "s", study, {"none": PLAIN, "both": ESP}))
+    assert returns_table(found).rows == (
+        ("none", "-150.00 ± 5.77"),
+        ("loss", "not run"),
+        ("augmentation", "not run"),
+        ("both", "-130.00 ± 5.77"),
+    )

@@ -1,0 +1,158 @@
+"""The studies as lists of runs: what the paper's figures and tables hold, and what a user may change."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.prior import PriorConfig
+from esp_cli.studies.catalogue import KINDS, Request, paper_cells, plan
+from esp_cli.studies.paper import Reported, horizons, reported, tasks
+from esp_cli.symmetry import parse
+from tests.studies.small_studies import request, small_study
+
+
+def test_table_1_has_the_papers_rows_and_columns():
+    study = plan("table1", Request())
+    assert study.panels == ["predator-prey, 500k", "navigation, 500k", "formation, 200k"]
+    assert study.variants == ["MADDPG", "MADDPG-ESP", "QMIX", "QMIX-ESP", "MAPPO", "MAPPO-ESP"]
+    assert {cell.config.seeds for cell in study.cells} == {tuple(range(10))}
+    for cell in study.cells:
+        esp = cell.variant.endswith("-ESP")
+        assert cell.config.prior.kind == ("esp" if esp else "none")
+        assert cell.reference == (cell.name.replace("-esp", "-plain") if esp else None)
+        assert reported(cell.paper) is not None
+    assert len({cell.name for cell in study.cells}) == 18
+
+
+def test_the_papers_numbers_stand_where_the_paper_has_them():
+    # Table 1: navigation, 500k, MAPPO-ESP; formation at 1000k, QMIX. Supplement: two agents, 3000k, MADDPG-ESP.
+    assert reported(("table1", "navigation", "500000", "mappo", "esp")) == Reported(-122.25, 1.62)
+    assert reported(("table1", "formation", "1000000", "qmix", "none")) == Reported(49.44, 18.71)
+    assert reported(("agents", "2", "3000000", "maddpg", "esp")) == Reported(-90.92, 2.54)
+    assert reported(("table1", "navigation", "123", "mappo", "esp")) is None
+    assert reported(None) is None
+    assert tasks() == ("predator-prey", "navigation", "formation")
+    assert (horizons("navigation"), horizons("formation")) == ((500_000, 3_000_000), (200_000, 1_000_000))
+    assert horizons("chess") == ()
+
+
+def test_every_number_of_the_tables_is_a_cell_of_the_papers_table():
+    assert len(list(paper_cells("table1"))) == 3 * 2 * 6
+    assert len(list(paper_cells("agents"))) == 3 * 2 * 6
+    assert all(reported(key) is not None for kind in ("table1", "agents") for _, _, key in paper_cells(kind))
+    assert list(paper_cells("ablate-modules")) == []
+
+
+def test_500k_and_3m_name_the_papers_rows_and_a_task_of_its_own_is_taken_as_it_is():
+    both = plan("table1", Request(steps=((None, 500_000), (None, 3_000_000))))
+    assert both.panels[4:] == ["formation, 200k", "formation, 1M"]
+    own = plan("table1", Request(steps=((None, 500_000), ("formation", 500_000))))
+    assert own.panels == ["predator-prey, 500k", "navigation, 500k", "formation, 500k"]
+    other = plan("table1", Request(tasks=("formation",), steps=((None, 123_456),)))
+    assert other.panels == ["formation, 123456"]
+    assert all(reported(cell.paper) is None for cell in other.cells)
+
+
+def test_qmix_drives_with_discrete_actions_and_still_compares_with_the_paper():
+    cells = {cell.variant: cell for cell in plan("table1", Request(tasks=("formation",))).cells}
+    actions = {name: cell.config.task_settings["actions"] for name, cell in cells.items()}
+    assert actions == {name: "discrete" if "QMIX" in name else "continuous" for name in cells}
+    assert reported(cells["QMIX-ESP"].paper) == Reported(51.23, 14.71)
+
+
+def test_another_reward_does_not_stand_beside_the_papers_number():
+    study = small_study(overrides={"task.convention": "pettingzoo"}, steps=((None, 500_000),))
+    assert [cell.paper for cell in study.cells] == [None, None]
+    assert all(cell.paper for cell in small_study(steps=((None, 500_000),)).cells)
+
+
+def test_teams_of_two_three_and_four():
+    study = plan("agents", Request(algorithms=("mappo",)))
+    shapes = [(c.config.task_settings["num_agents"], c.config.task_settings["num_landmarks"]) for c in study.cells]
+    assert shapes == [(2, None)] * 2 + [(3, None)] * 2 + [(4, None)] * 2 + [(4, 3)] * 2
+    assert [reported(cell.paper).mean for cell in study.cells[::2]] == [-99.12, -132.65, -189.42, -189.42]
+
+
+def test_transforms_vary_number_and_type_with_augmentation_alone():
+    study = plan("ablate-transforms", Request())
+    priors = [cell.config.prior for cell in study.cells]
+    assert [prior.kind for prior in priors] == ["none"] + ["augment"] * 6
+    assert [len(parse.parse_elements(prior.transforms, 3)) for prior in priors[1:]] == [1, 2, 3, 2, 3, 7]
+    assert [prior.copies for prior in priors[1:]] == ["draw", *["all"] * 3, *["draw"] * 2], "one element: no matter"
+    assert {cell.reference for cell in study.cells[1:]} == {study.cells[0].name}
+    assert study.panels == ["navigation, MADDPG, 500k"]
+
+
+def test_the_coefficient_is_that_of_the_loss_alone_at_two_horizons_and_0_is_the_plain_learner():
+    study = plan("ablate-coefficient", Request())
+    assert study.panels == ["navigation, MADDPG, 500k", "navigation, MADDPG, 3M"]
+    first = [cell.config.prior for cell in study.cells[:6]]
+    assert [prior.coefficient for prior in first] == [0, 0.01, 0.05, 0.1, 0.5, 1]
+    assert first[0] == PriorConfig(kind="none")
+    assert {(prior.kind, prior.transforms) for prior in first[1:]} == {("consistency", "rot90")}
+    assert not any(prior.augments for prior in first)
+    assert [reported(cell.paper).mean for cell in study.cells[:3]] == [-145, -138, -135]
+
+
+def test_modules_are_none_loss_augmentation_and_both():
+    study = plan("ablate-modules", Request(algorithms=("maddpg", "mappo")))
+    kinds = [cell.config.prior.kind for cell in study.cells]
+    assert kinds == ["none", "consistency", "augment", "esp"] * 2
+    assert {c.config.prior.transforms for c in study.cells if c.config.prior.kind != "none"} == {"rot90"}
+    assert {c.config.prior.coefficient for c in study.cells} == {0.0, 0.5}
+
+
+def test_a_setting_reaches_the_runs_that_it_concerns():
+    study = plan(
+        "table1",
+        Request(
+            tasks=("navigation", "predator-prey"),
+            overrides={
+                "mappo.gamma": 0.9,
+                "predator-prey.prey": "fleeing",
+                "prior.transforms": "c4",
+                "network.hidden": [8],
+            },
+        ),
+    )
+    for cell in study.cells:
+        config = cell.config
+        assert config.algorithm_settings["gamma"] == (0.9 if config.algorithm == "mappo" else 0.99)
+        assert config.task_settings.get("prey") == ("fleeing" if config.task == "predator-prey" else None)
+        assert config.network.hidden == (8,)
+        assert config.prior.transforms == ("c4" if config.prior.kind == "esp" else PriorConfig().transforms)
+
+
+@pytest.mark.parametrize(
+    ("kind", "choice", "sentence"),
+    [
+        ("table1", {"overrides": {"prior.kind": "augment"}}, "prior.kind is what this study varies by itself"),
+        ("ablate-transforms", {"overrides": {"prior.copies": "all"}}, "prior.copies is what this study varies"),
+        ("table1", {"overrides": {"qmix.gamma": 0.9}}, "--set qmix.gamma concerns no run of this study"),
+        ("table1", {"overrides": {"formation.physics": "pymunk"}}, "concerns no run"),
+        ("table1", {"tasks": ("navigation",) * 2}, "task navigation is named twice"),
+        ("table1", {"algorithms": ("mappo",) * 2}, "algorithm mappo is named twice"),
+        ("table1", {"steps": (("formation", 100),)}, "--steps formation=100 concerns no run"),
+        (
+            "table1",
+            {"steps": (("navigation", 100),), "tasks": ("navigation", "predator-prey")},
+            "nothing about predator",
+        ),
+        ("agents", {"tasks": ("formation",)}, "on navigation alone"),
+        ("table1", {"tasks": ("chess",)}, "unknown task 'chess'"),
+        ("table1", {"algorithms": ("magic",)}, "unknown algorithm 'magic'"),
+        ("table1", {"preset": "best"}, "has no preset 'best'"),
+        ("table1", {"overrides": {"mappo.speed": 1}}, "unknown setting 'mappo.speed'"),
+    ],
+)
+def test_what_cannot_be_planned_is_told_in_one_sentence(kind, choice, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        plan(kind, request(**({"tasks": ("navigation",), "overrides": {}} | choice)))
+
+
+def test_every_study_has_a_title_and_cells_of_its_own_names():
+    for kind in KINDS:
+        study = plan(kind, Request())
+        assert study.title
+        assert len({cell.name for cell in study.cells}) == len(study.cells)
+        assert all(cell.reference is None or study.cell(cell.reference) for cell in study.cells)

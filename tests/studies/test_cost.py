@@ -1,0 +1,51 @@
+"""What a study costs: measured by a probe that leaves nothing behind."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from esp_cli.studies import cost
+from esp_cli.training.config import resolve_config
+from esp_cli.training.trainer import build_learner
+from tests.training.runs import tiny_config
+
+SMALL = {"network.hidden": [8], "evaluation.episodes": 2, "maddpg.num_envs": 2, "maddpg.replay_episodes": 40}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(cost, "PROBE_SECONDS", 0.0)
+
+
+def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeypatch):
+    # a clock that ticks once at every look: an iteration and an evaluation cost the same in both
+    ticks = iter(range(10**6))
+    monkeypatch.setattr(cost.time, "monotonic", lambda: float(next(ticks)))
+    one, two = cost.probe(tiny_config(steps=1000), 4), cost.probe(tiny_config(steps=2000), 4)
+    # 20 and 40 iterations; 11 and 21 evaluations of 2 x 2 episodes; an episode takes half a tick
+    iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
+    assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
+    # greedy, drawn, random, and the two heuristics of navigation, four episodes each
+    assert one.judgement_s == two.judgement_s == 5 * 4 * 0.5
+
+
+def test_the_replay_is_counted_as_full_as_it_will_be():
+    config = resolve_config("navigation", "maddpg", steps=25 * 30, overrides=SMALL)
+    learner = build_learner(config)
+    whole = learner.replay.num_bytes
+    assert cost._replay_to_come(config, learner) == whole * 30 // 40
+    longer = config.model_copy(update={"steps": 25 * 300})
+    assert cost._replay_to_come(longer, learner) == whole, "it keeps the last 40"
+    learner.iterate(0.0)
+    assert cost._replay_to_come(longer, learner) == whole * 38 // 40
+    found = cost.probe(config, 4)
+    assert found.peak_bytes - found.disk_bytes > 3 * (whole * 30 // 40)
+
+
+def test_an_on_policy_run_has_no_replay_and_threads_are_as_before():
+    before = torch.get_num_threads()
+    config = tiny_config(steps=100)
+    assert cost._replay_to_come(config, build_learner(config)) == 0
+    assert cost.probe(config, 4).disk_bytes > 0
+    assert torch.get_num_threads() == before

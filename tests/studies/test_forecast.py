@@ -1,0 +1,53 @@
+"""What is left of a study: only what is not finished is measured, and sums are those of the runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from esp_cli.studies import forecast as module
+from esp_cli.studies.cost import Cost
+from esp_cli.studies.forecast import forecast
+from esp_cli.studies.study import StudyFolder
+from tests.studies.small_studies import small_study, write_run
+
+
+@pytest.fixture
+def probed(monkeypatch) -> list[str]:
+    """Let every probe say the same, and return the algorithms of the runs that were probed."""
+    seen: list[str] = []
+
+    def probe(config, episodes):
+        seen.append(config.prior.kind)
+        return Cost(training_s=100.0, judgement_s=4.0, disk_bytes=50, peak_bytes=70)
+
+    monkeypatch.setattr(module, "probe", probe)
+    return seen
+
+
+def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed: list[str]) -> None:
+    folder, told = StudyFolder(tmp_path / "s", small_study()), []
+    both = forecast(folder, [], 2, told.append)
+    assert (both.seconds, both.core_seconds, both.disk_bytes, both.disk_peak_bytes) == (104.0, 208.0, 100, 140)
+    one = forecast(folder, [], 1, told.append)
+    assert (one.seconds, one.core_seconds, one.disk_bytes, one.disk_peak_bytes) == (208.0, 208.0, 100, 120)
+    assert told == [1, 2, 1, 2]
+    assert probed == ["none", "esp"] * 2
+    assert not folder.path.exists()
+
+
+def test_a_finished_run_is_not_measured_and_takes_the_place_that_it_takes(tmp_path: Path, probed: list[str]) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    plain = folder.study.cells[0]
+    write_run(folder, plain, [[-1.0] * 3], [-1.0] * 3)
+    size = sum(file.stat().st_size for file in folder.run_path(plain).iterdir() if file.is_file())
+    found = forecast(folder, [], 2, lambda done: None)
+    assert [run.status for run in found.runs] == ["finished", "waiting"]
+    assert (found.seconds, found.core_seconds) == (104.0, 104.0)
+    assert (found.disk_bytes, found.disk_peak_bytes) == (size + 50, size + 70)
+    # a study that takes it over sees the same
+    other = StudyFolder(tmp_path / "t", small_study())
+    reused = forecast(other, [folder], 2, lambda done: None)
+    assert (reused.seconds, reused.disk_bytes) == (104.0, size + 50)
+    assert probed == ["esp", "esp"]

@@ -1,0 +1,194 @@
+"""The scheduler, over a stand-in that does to run folders what training does."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from esp_cli.studies.engine_local import Worker
+from esp_cli.studies.scheduler import Scheduler, likeness, makespan
+from esp_cli.studies.study import StudyFolder
+from tests.studies.small_studies import small_study, stand_in, write_study
+
+FOUR = ("navigation", "predator-prey")
+
+
+def trace(folder: StudyFolder) -> list[str]:
+    file = folder.path / "trace.txt"
+    return file.read_text().splitlines() if file.exists() else []
+
+
+def run(folder: StudyFolder, jobs: int = 2, program=None, listener=lambda snapshot: True) -> Scheduler:
+    scheduler = Scheduler(folder, folder.study.cells, jobs, program or stand_in())
+    scheduler.complete = scheduler.run(listener, 0.01)
+    return scheduler
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return StudyFolder.create(tmp_path / "s", small_study(tasks=FOUR))
+
+
+def statuses(scheduler: Scheduler) -> list[str]:
+    return [run.status for run in scheduler.runs]
+
+
+def test_every_run_is_trained_and_judged_once_and_no_more_than_jobs_at_once(folder):
+    seen = []
+    scheduler = run(folder, 2, listener=lambda s: seen.append(s.count("training", "judging", "elsewhere")) or True)
+    assert scheduler.complete
+    assert statuses(scheduler) == ["finished"] * 4
+    names = [cell.name for cell in folder.study.cells]
+    assert sorted(trace(folder)) == sorted([f"{what} {name}" for what in ("eval", "train") for name in names])
+    assert max(seen) == 2
+    assert all("$ esp" in folder.log_path(cell).read_text() for cell in folder.study.cells)
+
+
+def test_what_is_finished_is_skipped_and_what_is_trained_is_only_judged(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(tasks=FOUR), {"MAPPO": [-1.0, -2.0, -3.0]})
+    cells = folder.study.cells
+    folder.judgement_path(cells[0]).unlink()
+    assert statuses(run(folder, 1)) == ["finished"] * 4
+    assert trace(folder) == [
+        f"eval {cells[0].name}",
+        f"train {cells[1].name}",
+        f"eval {cells[1].name}",
+        f"train {cells[3].name}",
+        f"eval {cells[3].name}",
+    ]
+
+
+def test_a_failed_run_is_reported_and_the_others_go_on_and_the_next_time_it_is_tried_again(folder):
+    bad = folder.study.cells[1]
+    (folder.path / f"fail-{bad.name}").touch()
+    scheduler = run(folder)
+    assert scheduler.complete
+    assert statuses(scheduler) == ["finished", "failed", "finished", "finished"]
+    assert scheduler.runs[1].message == "the disk is on fire"
+    (folder.path / f"fail-{bad.name}").unlink()
+    before = len(trace(folder))
+    assert statuses(run(folder)) == ["finished"] * 4
+    assert trace(folder)[before:] == [f"train {bad.name}", f"eval {bad.name}"]
+
+
+def test_a_run_that_is_something_else_fails_alone(folder):
+    path = folder.run_path(folder.study.cells[0])
+    path.mkdir(parents=True)
+    (path / "thesis.tex").touch()
+    scheduler = run(folder)
+    assert statuses(scheduler) == ["failed"] + ["finished"] * 3
+    assert "is not empty and no run folder" in scheduler.runs[0].message
+
+
+def test_a_killed_process_is_told_by_its_signal(folder):
+    def killer(snapshot):
+        first = snapshot.runs[0]
+        if first.worker is not None and first.step:
+            os.kill(first.worker.pid, signal.SIGKILL)
+        return True
+
+    scheduler = run(folder, 1, stand_in(0.05), killer)
+    assert scheduler.runs[0].message == "ended by SIGKILL"
+    assert statuses(scheduler) == ["failed"] + ["finished"] * 3
+    assert statuses(run(folder)) == ["finished"] * 4
+
+
+def test_a_stop_lets_the_running_ones_end_and_starts_no_other(folder):
+    scheduler = run(folder, 1, stand_in(0.05), lambda snapshot: snapshot.runs[0].step < 100)
+    assert not scheduler.complete
+    assert statuses(scheduler) == ["stopped"] * 4
+    assert trace(folder) == [f"train {folder.study.cells[0].name}"]
+    resumed = run(folder)
+    assert resumed.runs[0].resumed_at >= 100
+    assert statuses(resumed) == ["finished"] * 4
+    steps = (folder.run_path(folder.study.cells[0]) / "metrics.jsonl").read_text().splitlines()
+    assert len(steps) == len(set(steps)) == 4
+
+
+def test_after_an_interrupt_nothing_is_left_running(folder):
+    started = []
+
+    def impatient(snapshot):
+        workers = [run.worker for run in snapshot.runs if run.worker is not None]
+        if workers:
+            started.extend(workers)
+            raise KeyboardInterrupt
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, 2, stand_in(5.0), impatient)
+    assert [worker.poll() for worker in started] == [-signal.SIGKILL] * 2
+
+
+def test_a_run_that_a_killed_study_left_behind_is_waited_for_and_not_run_twice(folder):
+    cell = folder.study.cells[0]
+    orphan = folder.prepare(cell)
+    seen = set()
+    with subprocess.Popen([*stand_in(0.1), "train", "--resume", str(orphan.path)]):
+        while not trace(folder) or not (orphan.path / "metrics.jsonl").stat().st_size:
+            time.sleep(0.01)
+        scheduler = run(folder, 1, listener=lambda snapshot: seen.add(snapshot.runs[0].status) or True)
+    assert "elsewhere" in seen
+    assert statuses(scheduler) == ["finished"] * 4
+    assert trace(folder).count(f"train {cell.name}") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent ended")
+def test_a_worker_ends_with_the_process_that_started_it(tmp_path):
+    waiter = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); import time; time.sleep(60)"
+    parent = (
+        "import os, signal, sys, pathlib, time\n"
+        "from esp_cli.studies.engine_local import Worker\n"
+        f"worker = Worker([sys.executable, '-c', {waiter!r}], [], pathlib.Path({str(tmp_path / 'log')!r}))\n"
+        "print(worker.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True) as process:
+        child = int(process.stdout.readline())
+        process.kill()
+    for _ in range(500):
+        status = Path(f"/proc/{child}/status")
+        if not status.exists() or "State:\tZ" in status.read_text():
+            return
+        time.sleep(0.05)
+    pytest.fail(f"process {child} outlived its parent")
+
+
+def test_the_last_words_of_a_worker_are_its_error_or_its_last_line(tmp_path):
+    def words(code: str) -> str:
+        worker = Worker([sys.executable, "-S", "-c", code], [], tmp_path / "log")
+        while worker.poll() is None:
+            time.sleep(0.01)
+        return worker.last_words()
+
+    assert words("print('a'); print('error: no disk'); print('b')") == "no disk"
+    (tmp_path / "log").unlink()
+    assert words("raise ZeroDivisionError('by hand')") == "ZeroDivisionError: by hand"
+
+
+def test_when_the_last_job_ends():
+    assert makespan([], [], 2) == 0
+    assert makespan([], [5, 3, 4], 1) == 12
+    # places: 5 | 3, then the third goes behind the 3: 5 | 7
+    assert makespan([], [5, 3, 4], 2) == 7
+    # two run with 1 and 10 left; 4 and 4 go behind the 1: 9, then 10 is last
+    assert makespan([1, 10], [4, 4], 2) == 10
+
+
+def test_time_left_is_that_of_the_runs_most_alike(folder):
+    scheduler = Scheduler(folder, folder.study.cells, 1, ())
+    assert scheduler.left_s() is None
+    plain, esp, hunt, hunt_esp = scheduler.runs
+    plain.step, plain.trained_s = 100, 10.0  # of 200 steps, 0.1 s a step
+    assert scheduler.left_s() == pytest.approx(0.1 * 700)
+    hunt.step, hunt.trained_s = 200, 40.0
+    hunt.status = "finished"
+    # plain 100 steps and esp 200 of 0.1 s; the hunt with the prior like the hunt, 0.2 s
+    assert scheduler.left_s() == pytest.approx(10 + 20 + 40)
+    assert likeness(hunt_esp.cell, hunt.cell) > likeness(hunt_esp.cell, esp.cell)

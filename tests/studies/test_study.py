@@ -1,0 +1,129 @@
+"""Study folders: plain files, gone on with, extended, and never written over."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from esp_cli.studies.study import StudyFolder, read_judgement
+from esp_cli.training.locking import LockError, is_held
+from tests.studies.small_studies import small_study, write_study
+
+ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
+
+
+def test_a_study_is_read_as_it_was_written_and_going_on_changes_nothing(tmp_path):
+    study = small_study()
+    folder = StudyFolder.create(tmp_path / "a" / "study", study)
+    before = (folder.path / "study.json").read_bytes()
+    assert StudyFolder.open(folder.path).study == folder.study
+    assert StudyFolder.create(folder.path, study).study == folder.study
+    assert (folder.path / "study.json").read_bytes() == before
+
+
+def test_a_study_grows_by_cells_and_keeps_the_others(tmp_path):
+    first = StudyFolder.create(tmp_path / "s", small_study(command="esp a")).study
+    more = StudyFolder.create(tmp_path / "s", small_study(tasks=("predator-prey",), command="esp b")).study
+    assert more.command == "esp a\nesp b"
+    assert [cell.config.task for cell in more.cells] == ["predator-prey"] * 2 + ["navigation"] * 2
+    assert more.cells[2:] == first.cells
+    assert StudyFolder.open(tmp_path / "s").study == more
+
+
+@pytest.mark.parametrize(
+    ("kind", "choice"),
+    [("table1", {"seeds": (0,)}), ("table1", {"overrides": {}}), ("table1", {"episodes": 5}), ("agents", {})],
+)
+def test_another_study_in_the_same_place_is_refused(tmp_path, kind, choice):
+    StudyFolder.create(tmp_path / "s", small_study())
+    with pytest.raises(ValueError, match=r"holds another study.*; go on with it by 'esp reproduce table1 --steps 200'"):
+        StudyFolder.create(tmp_path / "s", small_study(kind, **choice))
+
+
+def test_something_foreign_is_never_written_into(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(ValueError, match=r"not empty and no study \(it has 'thesis.tex'\)"):
+        StudyFolder.create(tmp_path, small_study())
+    with pytest.raises(ValueError, match="is a file"):
+        StudyFolder.create(tmp_path / "thesis.tex", small_study())
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"", "is not JSON"),
+        (b'{"format": "other"}', "is foreign"),
+        (b'{"format": "esp-study", "version": 99}', "newer esp"),
+        (b'{"format": "esp-study", "version": 1}', "the setting 'study.kind' is missing"),
+    ],
+)
+def test_a_damaged_study_is_told_in_one_sentence(tmp_path, content, sentence):
+    (tmp_path / "study.json").write_bytes(content)
+    with pytest.raises(ValueError, match=sentence):
+        StudyFolder.open(tmp_path)
+
+
+def test_one_process_holds_a_study(tmp_path):
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    with folder.lock():
+        with pytest.raises(LockError, match="is in use by process"), folder.lock():
+            pass
+        assert is_held(folder.path / "study.lock")
+    assert not is_held(folder.path / "study.lock")
+    assert not is_held(folder.path / "no such file")
+
+
+def test_finished_is_trained_and_judged(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), ENDS)
+    plain, esp = folder.study.cells
+    assert (folder.is_finished(plain), folder.is_finished(esp)) == (True, False)
+    folder.judgement_path(plain).write_text('{"task": ')  # half of one, as after a power cut
+    assert folder.is_trained(plain)
+    assert not folder.is_finished(plain)
+    assert read_judgement(folder.run_path(esp)) is None
+
+
+def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), ENDS)
+    file = folder.run_path(folder.study.cells[0]) / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"steps": 7}))
+    with pytest.raises(ValueError, match="holds a run of another configuration"):
+        folder.prepare(folder.study.cells[0])
+
+
+def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_study(tmp_path):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    plain, esp = folder.study.cells
+    twin = folder.find_twin(plain, [other])
+    assert twin == other.run_path(plain)
+    assert folder.find_twin(esp, [other]) is None, "not finished there"
+    folder.adopt(plain, twin)
+    assert folder.is_finished(plain)
+    assert read_judgement(folder.run_path(plain)) == read_judgement(twin)
+    assert folder.log_path(plain).read_text().endswith(f"taken over from {twin}\n")
+    assert folder.find_twin(plain, [other]) is None, "it is there now"
+    assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
+
+
+@pytest.mark.parametrize("choice", [{"seeds": (0, 1)}, {"steps": ((None, 300),)}, {"episodes": 8}])
+def test_a_run_of_other_seeds_or_steps_or_judged_otherwise_is_no_twin(tmp_path, choice):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    folder = StudyFolder.create(tmp_path / "s", small_study(**choice))
+    assert folder.find_twin(folder.study.cells[0], [other]) is None
+
+
+def test_ablations_share_their_runs_with_each_other_and_with_table_1():
+    """The plain learner, which c = 0 is too, and the loss alone and augmentation alone with a quarter turn."""
+    configs = {
+        kind: {cell.variant: cell.config for cell in small_study(kind).cells}
+        for kind in ("table1", "ablate-modules", "ablate-transforms", "ablate-coefficient")
+    }
+    plain = configs["table1"]["MAPPO"]
+    modules = configs["ablate-modules"]
+    assert plain == modules["none"] == configs["ablate-transforms"]["none"] == configs["ablate-coefficient"]["c = 0"]
+    assert modules["augmentation"] == configs["ablate-transforms"]["rot90"]
+    assert modules["loss"] == configs["ablate-coefficient"]["c = 0.5"]
+    assert len({config.model_dump_json() for config in modules.values()}) == 4
