@@ -1,12 +1,12 @@
 """The `esp` application: finds commands by name, imports them when asked for, and turns failures into exit codes.
 
-Exit codes: 0 done; 1 the machine failed (disk full) or a bug (with its traceback); 2 the user can mend it: one
-sentence on standard error, no traceback; 130 interrupted. Set ESP_TRACEBACK=1 to see where a sentence came from.
+Exit codes: 0 done; 1 the machine failed (a full or read-only disk), or a bug (with its traceback); 2 the user can
+correct it: one sentence on standard error, no traceback; 130 interrupted. ESP_TRACEBACK=1 shows the traceback of a
+sentence too.
 """
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -18,14 +18,12 @@ from typer.core import TyperGroup
 
 from esp_cli import __version__, console, machine
 from esp_cli.commands import COMMANDS
+from esp_cli.files import failures
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
 EXIT_MACHINE, EXIT_USER, EXIT_INTERRUPTED = 1, 2, 130
-
-_DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
-_USER_CAN_MEND = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
 class LazyGroup(TyperGroup):
@@ -93,13 +91,9 @@ def report(failure: Exception) -> int | None:
     if isinstance(failure, ValueError):
         console.error(_sentence(failure))
         return EXIT_USER
-    if isinstance(failure, OSError) and failure.errno in _DISK_FULL:
-        console.error(f"no space is left on the disk{_place(failure)}; free some and run the command again")
-        return EXIT_MACHINE
-    if isinstance(failure, _USER_CAN_MEND):
-        reason = (failure.strerror or str(failure) or type(failure).__name__).lower()
-        console.error(f"{reason}{_place(failure)}; check the path and its permissions")
-        return EXIT_USER
+    if isinstance(failure, OSError) and failure.errno is not None:
+        console.error(failures.sentence(failure))
+        return EXIT_USER if failures.is_correctable(failure) else EXIT_MACHINE
     return None
 
 
@@ -109,10 +103,6 @@ def _report_usage(failure: typer.TyperException) -> int:
     if message:  # empty where no argument was given at all: typer has shown the help already
         console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
     return failure.exit_code
-
-
-def _place(failure: OSError) -> str:
-    return f": {failure.filename}" if failure.filename else ""
 
 
 def _sentence(failure: ValueError) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -22,6 +21,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from esp_cli.files.writing import write_file
 from esp_cli.formatting import format_count as format_count  # noqa: PLC0414 # also console's
 from esp_cli.formatting import format_duration as format_duration  # noqa: PLC0414 # also console's
 from esp_cli.formatting import format_interval as format_interval  # noqa: PLC0414 # also console's
@@ -86,8 +86,7 @@ def table(
 def write_json(path: str | Path, value: object) -> None:
     """Write a value as JSON, to standard output where `path` is "-".
 
-    A file is written beside its place and then moved there, so that nobody reads half of it. Numbers that JSON
-    does not know (NaN, infinities) become null.
+    Numbers that JSON does not know (NaN, infinities) become null. See `write_file` for links and devices.
 
     Args:
         path: a file (missing folders are created) or "-".
@@ -101,20 +100,7 @@ def write_json(path: str | Path, value: object) -> None:
         sys.stdout.write(text)
         sys.stdout.flush()
         return
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=target.parent, prefix=f".{target.name}.", delete=False
-    ) as file:
-        temporary = Path(file.name)
-        try:
-            file.write(text)
-            file.close()
-            temporary.chmod(0o644)
-            temporary.replace(target)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
+    write_file(path, text.encode())
 
 
 def _plain(value: object) -> object:

@@ -18,6 +18,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 RANKS = {
+    "files": 0,
     "machine": 0,
     "formatting": 0,
     "symmetry": 1,
@@ -84,7 +85,7 @@ def forbidden(module: str, imported: str) -> str | None:
     if top != "esp_cli" or imported.startswith("esp_cli.console"):
         return None
     if part == "console":
-        known = f"{imported}.".startswith("esp_cli.formatting.")
+        known = f"{imported}.".startswith(("esp_cli.formatting.", "esp_cli.files."))
         return None if known else "the console knows nothing of the application"
     wanted = imported.split(".")[1] if "." in imported else ""
     if wanted == part or wanted.startswith("__"):

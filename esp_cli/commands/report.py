@@ -191,7 +191,7 @@ def _write(material: Material, out: Path | None, films: bool, small: Path | None
 
 
 def _fill(page: Path) -> None:
-    from esp_cli.drawing.films import write_file
+    from esp_cli.files.writing import write_file
     from esp_cli.reporting.pages import filled
 
     write_file(page, filled(page).encode())

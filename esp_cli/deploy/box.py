@@ -9,19 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.training.checkpoint import CheckpointError, parse_json_object
-from esp_cli.training.config import RunConfig, one_sentence, shortened
+from esp_cli.files.documents import DocumentFormat, shortened
+from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import TrainedPolicy, load_policy
-from esp_cli.training.run_folder import write_json_atomic
 from esp_envs.registry import task_names
 
-BOX_FORMAT, BOX_VERSION = "esp-checkpoints", 1
+BOX_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
 MANIFEST = "manifest.json"
 _FOLDER = "checkpoints"
-_MAX_MANIFEST_BYTES = 4 * 2**20
 _NAME = r"[a-z0-9]+(-[a-z0-9]+)*"
 _PRIORS = ("esp", "none", "augment", "consistency")
 """In the order in which a task's policies are preferred; algorithms are in that of their registry."""
@@ -66,6 +64,14 @@ class Entry(BaseModel):
         return self.name == standard_name(self.task, self.algorithm, self.prior)
 
 
+class Manifest(BaseModel):
+    """What the manifest of a box lists."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    policies: tuple[Entry, ...]
+
+
 def standard_name(task: str, algorithm: str, prior: str) -> str:
     """Return the name under which a policy goes into the box."""
     return f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
@@ -90,24 +96,7 @@ def read_box(folder: Path | None = None) -> tuple[Entry, ...]:
     file = (folder or box_folder()) / MANIFEST
     if not file.is_file():
         return ()
-    if file.stat().st_size > _MAX_MANIFEST_BYTES:
-        raise ValueError(f"{file} is foreign: it is larger than any manifest")
-    try:
-        manifest = parse_json_object(file.read_bytes(), "text")
-    except CheckpointError as error:
-        raise ValueError(f"{file} {error}") from None
-    version = manifest.get("version")
-    if manifest.get("format") != BOX_FORMAT or type(version) is not int:
-        raise ValueError(f"{file} is foreign: it is no manifest of policies of esp")
-    if version > BOX_VERSION:
-        raise ValueError(f"{file} was written by a newer esp; update esp to use these policies")
-    listed = manifest.get("policies")
-    if not isinstance(listed, list):
-        raise ValueError(f"{file} is damaged: it lists no policies")
-    try:
-        entries = tuple(Entry.model_validate(item) for item in listed)
-    except ValidationError as error:
-        raise ValueError(f"{file} is damaged: {one_sentence(error, Entry, 'policy')}") from None
+    entries = BOX_FORMAT.parse(file, Manifest).policies
     if len({entry.name for entry in entries}) < len(entries):
         raise ValueError(f"{file} is damaged: it names a policy twice")
     return entries
@@ -116,7 +105,7 @@ def read_box(folder: Path | None = None) -> tuple[Entry, ...]:
 def write_box(folder: Path, entries: tuple[Entry, ...]) -> None:
     """Write the manifest of a box, sorted by name."""
     listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
-    write_json_atomic(folder / MANIFEST, {"format": BOX_FORMAT, "version": BOX_VERSION, "policies": listed})
+    BOX_FORMAT.write(folder / MANIFEST, {"policies": listed})
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None, folder: Path | None = None) -> Entry:

@@ -20,7 +20,7 @@ from esp_cli.deploy.onnx_file import onnx_model
 from esp_cli.deploy.program import Program
 from esp_cli.deploy.torch_file import torch_archive
 from esp_cli.deploy.translate import program_of
-from esp_cli.training.checkpoint import write_bytes_atomic
+from esp_cli.files.writing import replace_file
 from esp_cli.training.loading import TrainedPolicy
 
 STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
@@ -176,7 +176,7 @@ def _write(files: Files, folder: Path, force: bool) -> None:
         raise ValueError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
-        write_bytes_atomic(folder / name, content)
+        replace_file(folder / name, content)
 
 
 def _checked(name: str, files: Files, job: _Job) -> Export:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from esp_cli.training.checkpoint import write_bytes_atomic
+from esp_cli.files.writing import write_file
 
 Frame = NDArray[np.uint8]
 
@@ -144,9 +144,3 @@ def write_png(path: Path, picture: Frame) -> None:
     content = BytesIO()
     Image.fromarray(picture).save(content, "PNG")
     write_file(path, content.getvalue())
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file into a folder that may have to be made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes_atomic(path, content)

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
-from esp_cli.drawing.films import Frame, write_file, write_gif, write_mp4, write_png
+from esp_cli.drawing.films import Frame, write_gif, write_mp4, write_png
+from esp_cli.files.writing import write_file
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators

@@ -12,8 +12,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader
 
 from esp_cli import __version__
-from esp_cli.drawing.films import write_file
 from esp_cli.drawing.rendering import default_episodes, open_painter, record, shots, stride, write_film
+from esp_cli.files.documents import encode
+from esp_cli.files.writing import replace_file
 from esp_cli.reporting.charts import chart
 from esp_cli.reporting.curves import RunCurve
 from esp_cli.reporting.marl_eval import marl_eval
@@ -24,7 +25,6 @@ from esp_cli.reporting.results import returns_of
 from esp_cli.reporting.tables import all_tables
 from esp_cli.studies.study import Cell, Study
 from esp_cli.training.loading import load_policy
-from esp_cli.training.run_folder import write_json_atomic
 from esp_cli.training.trainer import build_environment
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
@@ -69,8 +69,9 @@ def write_report(material: Material, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     panels = _panels(material)
     pictures = _pictures(material, panels, out)
-    write_json_atomic(out / RESULTS, material.results)
-    write_json_atomic(out / MARL_EVAL, marl_eval(material.study, material.curves, material.results))
+    scores = marl_eval(material.study, material.curves, material.results)
+    for path, content in ((out / RESULTS, material.results), (out / MARL_EVAL, scores)):
+        replace_file(path, encode(content, path))
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -87,8 +88,8 @@ def write_report(material: Material, out: Path) -> list[Path]:
         "runs": [_run(cell) for cell in material.study.cells],
     }
     page, markdown = out / PAGE, out / MARKDOWN
-    write_file(page, environment.get_template("report.html").render(content).encode())
-    write_file(markdown, _markdown(material, pictures).encode())
+    replace_file(page, environment.get_template("report.html").render(content).encode())
+    replace_file(markdown, _markdown(material, pictures).encode())
     return [page, markdown, *(png for png, _ in pictures), out / RESULTS, out / MARL_EVAL]
 
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import esp_envs
+from esp_cli.files.opening import open_own
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
@@ -39,7 +40,7 @@ class Worker:
             "PYTHONUNBUFFERED": "1",
             _PARENT: str(os.getpid()),
         }
-        with log.open("ab") as file:
+        with os.fdopen(open_own(log, os.O_WRONLY | os.O_APPEND), "ab") as file:
             file.write(f"$ esp {' '.join(arguments)}\n".encode())
             file.flush()
             self._process = subprocess.Popen(

@@ -19,20 +19,24 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli import __version__
-from esp_cli.training.config import RunConfig, one_sentence
+from esp_cli.files.documents import DocumentFormat
+from esp_cli.files.faults import reach
+from esp_cli.files.opening import open_own
+from esp_cli.training.config import RunConfig
 from esp_cli.training.locking import acquire
-from esp_cli.training.run_folder import RunFolder, write_json_atomic
+from esp_cli.training.run_folder import RunFolder
 
-STUDY_FORMAT = "esp-study"
-STUDY_VERSION = 1
 _STUDY, _RUNS, _LOCK, _JUDGEMENT, _LOG = "study.json", "runs", "study.lock", "judgement.json", "log.txt"
 
 
 class StudyError(ValueError):
     """A study folder cannot be made, opened or used; the text is one sentence for the user."""
+
+
+STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
 
 
 class Cell(BaseModel):
@@ -150,27 +154,14 @@ class StudyFolder:
         Raises:
             StudyError: it is missing, damaged, foreign, or of a newer version.
         """
-        file = path / _STUDY
-        try:
-            data = json.loads(file.read_bytes())
-        except OSError as error:
-            raise StudyError(f"{path} is no study: cannot read {file} ({error.strerror or error})") from None
-        except (ValueError, RecursionError):
-            raise StudyError(f"{file} is damaged: it is not JSON") from None
-        if not isinstance(data, dict) or data.pop("format", None) != STUDY_FORMAT:
-            raise StudyError(f"{file} is foreign: it is not a study of esp")
-        version = data.pop("version", None)
-        if type(version) is not int or version > STUDY_VERSION:
-            raise StudyError(f"{file} was written by a newer esp; update esp to use this study")
-        try:
-            return cls(path, Study.model_validate(data))
-        except ValidationError as error:
-            raise StudyError(f"{file}: {one_sentence(error, Study, 'study')}") from None
+        if not path.is_dir():
+            raise StudyError(f"{path} is no study: there is no such folder")
+        return cls(path, STUDY_FORMAT.parse(path / _STUDY, Study))
 
     @classmethod
     def _written(cls, path: Path, study: Study) -> StudyFolder:
-        content = {"format": STUDY_FORMAT, "version": STUDY_VERSION, **study.model_dump(mode="json")}
-        write_json_atomic(path / _STUDY, content)
+        reach("study")
+        STUDY_FORMAT.write(path / _STUDY, study.model_dump(mode="json"))
         return cls(path, study)
 
     @contextlib.contextmanager
@@ -233,7 +224,7 @@ class StudyFolder:
         part = self.path / _RUNS / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part)
-        with (part / _LOG).open("a", encoding="utf-8") as log:
+        with os.fdopen(open_own(part / _LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:
             log.write(f"taken over from {twin}\n")
         part.rename(self.run_path(cell))
 

@@ -10,12 +10,10 @@ Layout: the safetensors metadata has the key ``esp``, whose text is a JSON objec
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
 import os
-import secrets
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,11 +24,12 @@ from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 from torch import Tensor
 
+from esp_cli.files.documents import DocumentError, parse_object, shortened
+from esp_cli.files.failures import attempting
+from esp_cli.files.writing import replace_file
+
 CHECKPOINT_FORMAT = "esp-checkpoint"
 CHECKPOINT_VERSION = 1
-TEMPORARY_PREFIX = ".esp-tmp-"
-"""Names of half-written files begin so; what a killed process left under such a name may be removed."""
-
 _METADATA_KEY = "esp"
 _RESERVED = ("format", "version", "sha256")
 # parsed JSON takes some 20 times the space of its text, so this bounds the memory that a hostile header can ask for
@@ -55,46 +54,6 @@ _DTYPES = {
 
 class CheckpointError(ValueError):
     """A checkpoint or policy file cannot be written or read; the text is one sentence for the user."""
-
-
-def write_bytes_atomic(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace a file as a whole: whoever reads it, even after a kill or a power cut, sees the old or the new content.
-
-    The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
-    the folder's own entry is flushed.
-
-    Args:
-        path: file to write; its folder exists.
-        content: every byte of the file.
-
-    Raises:
-        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
-    """
-    path = Path(path)
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{path.name[:64]}-{secrets.token_hex(8)}")
-    try:
-        # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        # some network file systems cannot flush a folder; the rename itself has succeeded by now
-        with contextlib.suppress(OSError):
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def save_checkpoint(
@@ -130,10 +89,8 @@ def save_checkpoint(
     content = safetensors_torch.save(stored, metadata={_METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
         raise CheckpointError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
-    try:
-        write_bytes_atomic(path, content)
-    except OSError as error:
-        raise CheckpointError(f"cannot write {path}: {error.strerror or error}") from None
+    with attempting("write", path, CheckpointError):
+        replace_file(path, content)
 
 
 def load_checkpoint(
@@ -161,7 +118,7 @@ def load_checkpoint(
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
             raise CheckpointError("is not the file that its manifest names: their SHA-256 differ; get both anew")
         return _decode(content, format_name, version)
-    except CheckpointError as error:
+    except (CheckpointError, DocumentError) as error:
         raise CheckpointError(f"{path} {error}") from None
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from None
@@ -224,13 +181,13 @@ def _read(path: Path) -> bytes:
 def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Return tensors and description; the text of a CheckpointError goes on where the name of the file ends."""
     (header_bytes,) = struct.unpack_from("<Q", content)
-    header = parse_json_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
+    header = parse_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
     description = _description(header, format_name, version)
     _check_tensors(header, len(content) - _LENGTH_BYTES - header_bytes)
     try:
         tensors = safetensors_torch.load(content)
     except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
-        raise CheckpointError(f"is damaged: {_short(error)}") from None
+        raise CheckpointError(f"is damaged: {shortened(str(error))}") from None
     _check_bools(tensors)
     expected = description.pop("sha256")
     if _digest(tensors, description) != expected:
@@ -241,40 +198,6 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
     return aligned, {key: value for key, value in description.items() if key not in _RESERVED}
 
 
-def parse_json_object(text: bytes | str, what: str) -> dict[str, Any]:
-    """Parse strict JSON (no NaN, no infinity, no key twice) that has to be an object.
-
-    Args:
-        text: UTF-8 bytes or text; the caller bounds its length.
-        what: what the text is, for the message.
-
-    Raises:
-        CheckpointError: it is not; the message goes on where the name of the file ends.
-    """
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        result = dict(pairs)
-        if len(result) != len(pairs):
-            raise ValueError("a key stands twice")
-        return result
-
-    def finite(number: str) -> float:
-        # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
-        value = float(number)
-        if not math.isfinite(value):
-            raise ValueError(f"{number} is no finite number")
-        return value
-
-    try:
-        decoded = text.decode("utf-8") if isinstance(text, bytes) else text
-        value = json.loads(decoded, object_pairs_hook=unique, parse_constant=finite, parse_float=finite)
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"is damaged or foreign: its {what} is not valid JSON ({_short(error)})") from None
-    if not isinstance(value, dict):
-        raise CheckpointError(f"is damaged or foreign: its {what} is no JSON object")
-    return value
-
-
 def _description(header: Mapping[str, Any], format_name: str, version: int) -> dict[str, Any]:
     """Return the JSON object under the key ``esp`` of a file of the wanted format."""
     metadata = header.get("__metadata__")
@@ -282,15 +205,15 @@ def _description(header: Mapping[str, Any], format_name: str, version: int) -> d
         raise CheckpointError("was not written by esp: it has no metadata")
     if _METADATA_KEY not in metadata:
         raise CheckpointError(f"was not written by esp: its metadata has no '{_METADATA_KEY}'")
-    description = parse_json_object(metadata[_METADATA_KEY], "description")
+    description = parse_object(metadata[_METADATA_KEY], "description")
     if description.get("format") != format_name:
-        found = _short(repr(description.get("format")))
+        found = shortened(repr(description.get("format")))
         raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed")
     number = description.get("version")
     if not _is_count(number) or not isinstance(description.get("sha256"), str):
         raise CheckpointError("is damaged or foreign: it lacks a format version or a checksum")
     if number > version:
-        raise CheckpointError(f"has version {_short(number)} of '{format_name}', newer than {version}; update esp")
+        raise CheckpointError(f"has version {number} of '{format_name}', newer than {version}; update esp")
     return description
 
 
@@ -302,7 +225,7 @@ def _check_tensors(header: Mapping[str, Any], data_bytes: int) -> None:
             continue
         span = _span(entry)
         if span is None:
-            raise CheckpointError(f"is damaged: its tensor {_short(repr(name))} has no valid dtype, shape or place")
+            raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has no valid dtype, shape or place")
         spans.append(span)
     end = 0
     for begin, stop in sorted(spans):
@@ -310,7 +233,7 @@ def _check_tensors(header: Mapping[str, Any], data_bytes: int) -> None:
             raise CheckpointError("is damaged: its tensors overlap or leave a gap")
         end = stop
     if end != data_bytes:
-        raise CheckpointError(f"is truncated or damaged: its tensors need {_short(end)} bytes, it has {data_bytes}")
+        raise CheckpointError(f"is truncated or damaged: its tensors need {end} bytes, it has {data_bytes}")
 
 
 def _span(entry: Any) -> tuple[int, int] | None:
@@ -341,10 +264,4 @@ def _check_bools(tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
         if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
-            raise CheckpointError(f"is damaged: its tensor {_short(repr(name))} has truth values other than 0 and 1")
-
-
-def _short(value: object) -> str:
-    """Return the first line of a text, cut to a length that fits into a sentence."""
-    text = next(iter(str(value).splitlines()), type(value).__name__)
-    return text if len(text) <= 80 else text[:77] + "..."
+            raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has truth values other than 0 and 1")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -11,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from esp_cli.algorithms.presets import PRESETS, TUNED
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.files.documents import one_sentence, parse_value
 from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class
@@ -119,7 +119,7 @@ def _read(value: object) -> object:
     if not isinstance(value, str):
         return value
     try:
-        return json.loads(value)
+        return parse_value(value)
     except ValueError:
         return value
 
@@ -130,20 +130,3 @@ def _validated(model: type[BaseModel], values: Mapping[str, object], section: st
         return model(**values)
     except ValidationError as error:
         raise ValueError(one_sentence(error, model, section)) from None
-
-
-def one_sentence(error: ValidationError, model: type[BaseModel], section: str) -> str:
-    """Say what is wrong with the first bad setting, and what could stand there."""
-    first = error.errors()[0]
-    name = shortened(".".join([section, *(str(part) for part in first["loc"])]))
-    if first["type"] == "extra_forbidden":
-        return f"unknown setting '{name}'; {section} has {', '.join(model.model_fields)}"
-    if first["type"] == "missing":
-        return f"the setting '{name}' is missing"
-    message = first["msg"].removeprefix("Value error, ")
-    return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
-
-
-def shortened(text: str, length: int = 80) -> str:
-    """Return a text that fits into a sentence, whatever a file or a command line put into it."""
-    return text if len(text) <= length else f"{text[: length - 3]}..."

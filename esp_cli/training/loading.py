@@ -14,9 +14,10 @@ from torch import Tensor
 
 from esp_cli import __version__
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.files.documents import one_sentence
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
-from esp_cli.training.config import RunConfig, one_sentence, resolve_task_settings
+from esp_cli.training.config import RunConfig, resolve_task_settings
 from esp_cli.training.run_folder import POLICY_FORMAT, CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment

@@ -8,6 +8,9 @@ import os
 import socket
 from pathlib import Path
 
+from esp_cli.files.failures import attempting
+from esp_cli.files.opening import open_own
+
 
 class LockError(ValueError):
     """A lock is held by somebody else, or cannot be taken; the text is one sentence for the user."""
@@ -19,25 +22,24 @@ def acquire(file: Path) -> int:
     The file stays when the lock is let go: removing it would let two processes hold two files of one name.
 
     Raises:
-        LockError: another process, or this one, holds it already, or the file system cannot lock.
+        LockError: another process, or this one, holds it already, or something else than a regular file is there.
+        OSError: the file system cannot lock.
     """
-    try:
-        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise LockError(f"cannot lock {file.parent}: {error.strerror or error}") from None
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-        # In this order, so that whoever is refused meanwhile finds a name and not an empty file.
-        os.pwrite(descriptor, owner.encode(), 0)
-        os.ftruncate(descriptor, len(owner.encode()))
-    except BlockingIOError:
-        holder = _holder(os.pread(descriptor, 4096, 0))
-        os.close(descriptor)
-        raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
-    except OSError as error:
-        os.close(descriptor)
-        raise LockError(f"cannot lock {file.parent}: {error.strerror or error}") from None
+    with attempting("lock", file, LockError):
+        descriptor = open_own(file, os.O_RDWR)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+            # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
+            os.pwrite(descriptor, owner.encode(), 0)
+            os.ftruncate(descriptor, len(owner.encode()))
+        except BlockingIOError:
+            holder = _holder(os.pread(descriptor, 4096, 0))
+            os.close(descriptor)
+            raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
+        except OSError:
+            os.close(descriptor)
+            raise
     return descriptor
 
 

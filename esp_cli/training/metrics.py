@@ -20,7 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from esp_cli.training.checkpoint import write_bytes_atomic
+from esp_cli.files.failures import attempting
+from esp_cli.files.faults import reach
+from esp_cli.files.opening import open_own
+from esp_cli.files.writing import replace_file
 
 Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
@@ -64,12 +67,10 @@ class MetricsWriter:
         self._boards: dict[str, _Board] = {}
         if tensorboard is not None:
             self._board("mean")
-        try:
+        with attempting("write", self._path, MetricsError):
             _remove_torn_line(self._path)
             # closed by close(), which __exit__ calls
-            self._file = self._path.open("ab", buffering=0)
-        except OSError as error:
-            raise MetricsError(f"cannot write {self._path}: {error.strerror or error}") from None
+            self._file = os.fdopen(open_own(self._path, os.O_WRONLY | os.O_APPEND), "ab", buffering=0)
 
     def __enter__(self) -> MetricsWriter:
         return self
@@ -87,7 +88,8 @@ class MetricsWriter:
             values: by name (``train/...``, ``eval/...``, ``time/...``), a number or one number per seed [S].
 
         Raises:
-            MetricsError: a value is no number or list of numbers, or the disk is full.
+            MetricsError: a value is no number or list of numbers.
+            OSError: the disk is full.
         """
         row: dict[str, Any] = {"step": int(step)}
         for name, value in values.items():
@@ -95,12 +97,11 @@ class MetricsWriter:
                 raise MetricsError("'step' is the row's own column; give the metric another name")
             row[name] = _plain(name, value)
         line = json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n"
-        try:
+        with attempting("write", self._path, MetricsError):
+            reach("metrics")
             # a disk about to be full takes a part only; writing the rest then says so
             while line:
                 line = line[self._file.write(line) :]
-        except OSError as error:
-            raise MetricsError(f"cannot write {self._path}: {error.strerror or error}") from None
         if self._folder is not None:
             self._write_boards(row)
 
@@ -174,10 +175,8 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
     path = Path(path)
     rows = _rows(path)
     kept = [line for line, row in rows if row["step"] <= last_step]
-    try:
-        write_bytes_atomic(path, b"".join(line + b"\n" for line in kept))
-    except OSError as error:
-        raise MetricsError(f"cannot write {path}: {error.strerror or error}") from None
+    with attempting("write", path, MetricsError):
+        replace_file(path, b"".join(line + b"\n" for line in kept))
     return len(rows) - len(kept)
 
 
@@ -232,10 +231,8 @@ def _rows(path: Path) -> list[tuple[bytes, dict[str, Any]]]:
     """Return each row with the line that it stands on."""
     if not path.is_file():
         raise MetricsError(f"{path} does not exist or is no plain file; check the path")
-    try:
+    with attempting("read", path, MetricsError):
         lines = path.read_bytes().split(b"\n")
-    except OSError as error:
-        raise MetricsError(f"cannot read {path}: {error.strerror or error}") from None
     rows = []
     for number, line in enumerate(lines, start=1):
         row = _parse(line)
@@ -266,6 +263,6 @@ def _remove_torn_line(path: Path) -> None:
         return
     whole, _, last = content.rpartition(b"\n")
     if _parse(last) is not None:
-        write_bytes_atomic(path, content + b"\n")
+        replace_file(path, content + b"\n")
     else:
-        write_bytes_atomic(path, whole + b"\n" if whole else b"")
+        replace_file(path, whole + b"\n" if whole else b"")

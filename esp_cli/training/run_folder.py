@@ -25,19 +25,15 @@ from typing import Any
 
 from torch import Tensor
 
-from esp_cli.training.checkpoint import (
-    TEMPORARY_PREFIX,
-    CheckpointError,
-    load_checkpoint,
-    parse_json_object,
-    save_checkpoint,
-    write_bytes_atomic,
-)
+from esp_cli.files.documents import DocumentFormat
+from esp_cli.files.failures import attempting
+from esp_cli.files.faults import reach
+from esp_cli.files.opening import open_own
+from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
+from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
 
-RUN_FORMAT = "esp-run"
-RUN_VERSION = 1
 POLICY_FORMAT = "esp-policy"
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
@@ -50,7 +46,6 @@ _CONFIG, _METRICS, _CHECKPOINTS, _POLICY, _LOCK = (
     "run.lock",
 )
 _CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
-_MAX_CONFIG_BYTES = 4 * 2**20
 
 
 class RunFolderError(ValueError):
@@ -61,19 +56,7 @@ class CheckpointWarning(UserWarning):
     """A damaged checkpoint was passed over for an older one; the text is one sentence for the user."""
 
 
-def write_json_atomic(path: str | os.PathLike[str], value: Any) -> None:
-    """Write a value as indented JSON, as a whole or not at all.
-
-    Raises:
-        ValueError: the value is not JSON (NaN and infinity are not).
-        OSError: the file cannot be written; what was there is as it was.
-    """
-    try:
-        text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False)
-        content = (text + "\n").encode()
-    except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"cannot write {path}: its content is not JSON ({error})") from None
-    write_bytes_atomic(path, content)
+RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolderError)
 
 
 class RunFolder:
@@ -127,7 +110,7 @@ class RunFolder:
             resolved = json.loads(json.dumps(dict(config), allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
             raise RunFolderError(f"the configuration of {path} is not JSON ({error})") from None
-        with _told(f"cannot make the run folder {path}"):
+        with attempting("make the run folder", path, RunFolderError):
             if path.exists() and not path.is_dir():
                 raise RunFolderError(f"{path} is a file; choose another --out")
             path.mkdir(parents=True, exist_ok=True)
@@ -137,10 +120,10 @@ class RunFolder:
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path, force)
                 for file in (folder.policy_path, *folder.checkpoints(), folder.metrics_path):
-                    file.unlink(missing_ok=True)
+                    remove_file(file)
                 (path / _CHECKPOINTS).mkdir(exist_ok=True)
-                folder.metrics_path.touch()
-                write_json_atomic(path / _CONFIG, {"format": RUN_FORMAT, "version": RUN_VERSION, **resolved})
+                os.close(open_own(folder.metrics_path, os.O_WRONLY))
+                RUN_FORMAT.write(path / _CONFIG, resolved)
         return folder
 
     @classmethod
@@ -159,20 +142,7 @@ class RunFolder:
             raise RunFolderError(
                 f"{path} is no run folder: it has no {_CONFIG}; give the folder that esp train --out made"
             )
-        with _told(f"cannot read {file}"):
-            if file.stat().st_size > _MAX_CONFIG_BYTES:
-                raise RunFolderError(f"{file} is foreign: it is larger than any run's configuration")
-            text = file.read_bytes()
-        try:
-            config = parse_json_object(text, "text")
-        except CheckpointError as error:
-            raise RunFolderError(f"{file} {error}") from None
-        version = config.pop("version", None)
-        if config.pop("format", None) != RUN_FORMAT or type(version) is not int:
-            raise RunFolderError(f"{file} is foreign: it is not the configuration of a run of esp")
-        if version > RUN_VERSION:
-            raise RunFolderError(f"{file} was written by a newer esp; update esp to use this run")
-        return cls(path, config)
+        return cls(path, RUN_FORMAT.read(file))
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -189,7 +159,7 @@ class RunFolder:
         except LockError as error:
             raise RunFolderError(str(error)) from None
         try:
-            with _told(f"cannot tidy up {self.path}"):
+            with attempting("tidy up", self.path, RunFolderError):
                 self._remove_half_written()
             yield
         finally:
@@ -228,19 +198,19 @@ class RunFolder:
             RunFolderError: the file cannot be written (CheckpointError where the content cannot be stored).
         """
         path = self.checkpoint_path(step, final)
-        with _told(f"cannot write {path}"):
+        with attempting("write", path, RunFolderError):
             path.parent.mkdir(exist_ok=True)
             if self.metrics_path.exists():
                 with self.metrics_path.open("rb+") as metrics:
                     os.fsync(metrics.fileno())
         save_checkpoint(path, tensors, {**meta, "step": step})
-        with _told(f"cannot remove old checkpoints beside {path}"):
+        with attempting("remove old checkpoints beside", path, RunFolderError):
             files = self.checkpoints()
             past = [file for file in files if _step(file) > step]
             regular = [file for file in files if file not in past and not _is_final(file)]
             finals = [file for file in files if file not in past and _is_final(file)]
             for file in (*past, *regular[:-KEPT_CHECKPOINTS], *finals[:-1]):
-                file.unlink()
+                remove_file(file)
         return path
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> Path:
@@ -255,13 +225,14 @@ class RunFolder:
             RunFolderError: a checkpoint cannot be removed (CheckpointError where the content cannot be stored, or the
                 file cannot be written).
         """
+        reach("policy")
         save_checkpoint(self.policy_path, tensors, meta, format_name=POLICY_FORMAT)
         files = self.checkpoints()
         if any(map(_is_final, files)):
-            with _told(f"cannot remove old checkpoints in {self.path / _CHECKPOINTS}"):
+            with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):
                 for file in files:
                     if not _is_final(file):
-                        file.unlink()
+                        remove_file(file)
         return self.policy_path
 
     def latest_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -301,22 +272,13 @@ class RunFolder:
             MetricsError: the file is damaged elsewhere than at its end.
         """
         if not self.metrics_path.exists():
-            self.metrics_path.touch()
+            os.close(open_own(self.metrics_path, os.O_WRONLY))
         return truncate_metrics(self.metrics_path, after_step)
 
     def _remove_half_written(self) -> None:
         for folder in (self.path, self.path / _CHECKPOINTS):
             for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
                 file.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _told(attempt: str) -> Iterator[None]:
-    """Turn errors of the file system into one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise RunFolderError(f"{attempt}: {error.strerror or error}") from None
 
 
 def _refuse_taken(path: Path, force: bool) -> None:

@@ -53,10 +53,10 @@ def test_something_foreign_is_never_written_into(tmp_path):
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
-        (b"", "is not JSON"),
+        (b"", "is not valid JSON"),
         (b'{"format": "other"}', "is foreign"),
         (b'{"format": "esp-study", "version": 99}', "newer esp"),
-        (b'{"format": "esp-study", "version": 1}', "the setting 'study.kind' is missing"),
+        (b'{"format": "esp-study", "version": 1}', "the setting 'kind' is missing"),
     ],
 )
 def test_a_damaged_study_is_told_in_one_sentence(tmp_path, content, sentence):

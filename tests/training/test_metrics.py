@@ -67,10 +67,20 @@ def test_step_is_no_metric(tmp_path):
         writer.write(1, {"step": 2.0})
 
 
-def test_a_full_disk_is_one_sentence():
-    writer = MetricsWriter("/dev/full")
-    with pytest.raises(MetricsError, match="cannot write /dev/full: No space left on device"):
+def test_a_full_disk_names_the_file(tmp_path, full_disk):
+    writer = MetricsWriter(tmp_path / "m.jsonl")
+    with full_disk(), pytest.raises(OSError, match="File too large") as caught:
         writer.write(1, {"train/loss": [1.0]})
+    assert caught.value.filename == str(tmp_path / "m.jsonl")
+
+
+def test_a_planted_link_is_not_written_to(tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine\n")
+    (tmp_path / "m.jsonl").symlink_to(mine)
+    with pytest.raises(MetricsError, match="no regular file is there; remove it"):
+        MetricsWriter(tmp_path / "m.jsonl").write(1, {"train/loss": [1.0]})
+    assert mine.read_text() == "mine\n"
 
 
 def test_column_is_steps_and_values_per_seed(path):

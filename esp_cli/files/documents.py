@@ -1,0 +1,196 @@
+"""Versioned JSON documents: strict parsing with bounds, one format and version, validation, atomic writing."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from esp_cli.files.failures import attempting
+from esp_cli.files.opening import read_regular
+from esp_cli.files.writing import replace_file
+
+Model = TypeVar("Model", bound=BaseModel)
+
+MAX_DOCUMENT_BYTES = 16 * 2**20
+"""Parsed JSON takes some 20 times the space of its text."""
+MAX_NESTING = 64
+_MAX_INTEGER = 2**63
+
+
+class DocumentError(ValueError):
+    """A JSON document cannot be read or written; the text is one sentence for the user."""
+
+
+@dataclass(frozen=True)
+class DocumentFormat:
+    """A kind of JSON document: an object with the keys ``format`` and ``version`` beside its content.
+
+    Attributes:
+        name: value of ``format``.
+        version: newest value of ``version`` that this program reads.
+        noun: what it is for people, such as "the configuration of a run".
+        error: kind of exception for what the user can correct.
+    """
+
+    name: str
+    version: int
+    noun: str
+    error: type[ValueError] = DocumentError
+
+    def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Read a document.
+
+        Returns:
+            Its content, without ``format`` and ``version``.
+
+        Raises:
+            ValueError: of the kind `error`; it is missing, too large, damaged, foreign or of a newer version.
+            OSError: the machine failed.
+        """
+        with attempting("read", path, self.error):
+            text = read_regular(path, MAX_DOCUMENT_BYTES)
+        if text is None:
+            raise self.error(f"{path} is foreign: it is larger than {self.noun} can be")
+        try:
+            document = parse_object(text, "text")
+        except DocumentError as error:
+            raise self.error(f"{path} {error}") from None
+        version = document.pop("version", None)
+        if document.pop("format", None) != self.name or type(version) is not int:
+            raise self.error(f"{path} is foreign: it is not {self.noun} of esp")
+        if version > self.version:
+            raise self.error(f"{path} was written by a newer esp; update esp to use it")
+        return document
+
+    def parse(self, path: str | os.PathLike[str], model: type[Model]) -> Model:
+        """Read a document and validate its content.
+
+        Raises:
+            ValueError: as `read`, or the content is not what the model asks for.
+            OSError: the machine failed.
+        """
+        content = self.read(path)
+        try:
+            return model.model_validate(content)
+        except ValidationError as error:
+            raise self.error(f"{path} is damaged: {one_sentence(error, model)}") from None
+
+    def write(self, path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+        """Write a document as a whole or not at all.
+
+        Raises:
+            ValueError: of the kind `error`; the content is not JSON (NaN and infinity are not), or its keys are taken.
+            OSError: the file cannot be written; what was there is as it was.
+        """
+        if "format" in content or "version" in content:
+            raise self.error(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
+        replace_file(path, encode({"format": self.name, "version": self.version, **content}, path, self.error))
+
+
+def encode(value: object, path: str | os.PathLike[str], error: type[ValueError] = DocumentError) -> bytes:
+    """Return a value as indented JSON.
+
+    Raises:
+        ValueError: of the kind `error`; it is not JSON (NaN and infinity are not).
+    """
+    try:
+        return (json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode()
+    except (TypeError, ValueError, RecursionError) as failure:
+        raise error(f"cannot write {path}: its content is not JSON ({failure})") from None
+
+
+def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
+    """Parse strict JSON that is an object.
+
+    Args:
+        text: UTF-8 bytes or text; the caller bounds its length.
+        noun: what the text is, for the message.
+
+    Raises:
+        DocumentError: it is not; the message goes on where the name of the file ends.
+    """
+    try:
+        value = parse_value(text.decode("utf-8") if isinstance(text, bytes) else text)
+    except ValueError as error:
+        raise DocumentError(f"is damaged or foreign: its {noun} is not valid JSON ({shortened(str(error))})") from None
+    if not isinstance(value, dict):
+        raise DocumentError(f"is damaged or foreign: its {noun} is no JSON object")
+    return value
+
+
+def parse_value(text: str) -> Any:
+    """Parse strict JSON: no NaN, no infinity, no key twice, integers of 64 bits, nesting of at most `MAX_NESTING`.
+
+    Raises:
+        ValueError: it is not.
+    """
+    try:
+        value = json.loads(
+            text, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite, parse_int=_bounded
+        )
+    except RecursionError:
+        raise ValueError(f"brackets are nested more than {MAX_NESTING} deep") from None
+    level = [value]
+    for _ in range(MAX_NESTING):
+        level = [item for outer in level for item in _inside(outer)]
+        if not level:
+            return value
+    raise ValueError(f"brackets are nested more than {MAX_NESTING} deep")
+
+
+def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "") -> str:
+    """Say what is wrong with the first bad setting, and what could stand there.
+
+    Args:
+        error: of the validation.
+        model: that was asked for.
+        section: name that stands before that of the setting.
+    """
+    first = error.errors(include_url=False)[0]
+    name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
+    if first["type"] == "extra_forbidden":
+        return f"unknown setting '{name}'; {section or 'it'} has {', '.join(model.model_fields)}"
+    if first["type"] == "missing":
+        return f"the setting '{name}' is missing"
+    message = first["msg"].removeprefix("Value error, ")
+    return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
+
+
+def shortened(text: str, length: int = 80) -> str:
+    """Return a text that fits into a sentence, whatever a file or a command line put into it."""
+    line = next(iter(text.splitlines()), "")
+    return line if len(line) <= length else f"{line[: length - 3]}..."
+
+
+def _inside(value: object) -> list[Any]:
+    """Return the lists and objects directly inside one."""
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [item for item in items if isinstance(item, dict | list)]
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise ValueError("a key stands twice")
+    return result
+
+
+def _finite(number: str) -> float:
+    # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"{shortened(number)} is no finite number")
+    return value
+
+
+def _bounded(number: str) -> int:
+    value = int(number) if len(number) <= 20 else _MAX_INTEGER
+    if abs(value) >= _MAX_INTEGER:
+        raise ValueError("an integer has more than 64 bits")
+    return value

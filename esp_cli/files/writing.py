@@ -1,0 +1,100 @@
+"""Writing of whole files: a reader sees the old content or the new one, after a kill or a power cut too.
+
+A path that the user names may be a link, which is followed, or a device, which is written through. A name that the
+program chose inside a folder is its own: whatever link stands there is replaced and never followed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import stat
+from pathlib import Path
+
+from esp_cli.files.faults import reach
+
+TEMPORARY_PREFIX = ".esp-tmp-"
+"""Names of half-written files begin so; what a killed process left under such a name may be removed."""
+
+
+def write_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file that the user named; missing folders are made.
+
+    A link is followed and its target replaced as a whole. A device, a pipe or a socket is written through.
+
+    Raises:
+        OSError: it cannot be written; a regular file is as it was before.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:  # new, or a link whose target is missing
+        mode = stat.S_IFREG
+    if stat.S_ISREG(mode):
+        replace_file(os.path.realpath(path), content)
+        return
+    with path.open("wb", buffering=0) as file:
+        _write_all(file.fileno(), content)
+
+
+def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Replace a file as a whole.
+
+    The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
+    the folder's own entry is flushed. A link at ``path`` is replaced, not followed.
+
+    Args:
+        path: file to write; its folder exists.
+        content: every byte of the file.
+
+    Raises:
+        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
+    """
+    path = Path(path)
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    try:
+        # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        try:
+            _write_all(descriptor, content)
+            reach("fsync")
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        reach("rename")
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    reach("renamed")
+    # some network file systems cannot flush a folder; the rename itself has succeeded by now
+    with contextlib.suppress(OSError):
+        _sync_folder(path.parent)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file if it is there."""
+    reach("unlink")
+    path.unlink(missing_ok=True)
+
+
+def _write_all(descriptor: int, content: bytes) -> None:
+    """Write everything; a kill on purpose comes in the middle of it."""
+    rest = memoryview(content)
+    half = len(rest) // 2
+    while rest:
+        rest = rest[os.write(descriptor, rest[: max(half, 1)] if half else rest) :]
+        if half:
+            reach("write")
+            half = 0
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
