@@ -10,12 +10,16 @@ from pydantic import BaseModel
 
 from esp_cli.algorithms.presets import PRESETS, TUNED
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 
 DOCS = Path(__file__).parents[1] / "docs"
-SHARED: dict[str, type[BaseModel]] = {"network": NetworkConfig, "prior": PriorConfig, "evaluation": EvaluationConfig}
+SHARED: dict[str, tuple[type[BaseModel], ...]] = {
+    "network": tuple(NETWORKS.values()),
+    "prior": (PriorConfig,),
+    "evaluation": (EvaluationConfig,),
+}
 TUNED_ROW = re.compile(r"^\| ([\w-]+) \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
 ROW = re.compile(r"\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \|")
 
@@ -34,9 +38,11 @@ def written(value: object) -> str:
 def expected(algorithm: str) -> dict[str, tuple[str, ...]]:
     """Return default and paper value of every setting."""
     table = {}
-    for section, model in ({algorithm: ALGORITHMS[algorithm].config_class} | SHARED).items():
+    for section, models in ({algorithm: (ALGORITHMS[algorithm].config_class,)} | SHARED).items():
         presets = [PRESETS[algorithm][preset].get(section, {}) for preset in ("default", "paper")]
-        for name, field in model.model_fields.items():
+        # the first network stands for all: a field of two networks has one default
+        fields = {name: field for model in reversed(models) for name, field in model.model_fields.items()}
+        for name, field in fields.items():
             table[f"{section}.{name}"] = tuple(written(preset.get(name, field.default)) for preset in presets)
     return table
 

@@ -11,7 +11,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators

@@ -17,9 +17,11 @@ from torch import Tensor
 from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
-from esp_cli.networks.bodies import MLP, NetworkConfig
+from esp_cli.networks.build import perceptron
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
-from esp_cli.networks.joint import OneValueEach
+from esp_cli.networks.joint_q import OneValueEach
+from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import policy_consistency_loss
 from esp_cli.symmetry import Transform
@@ -62,8 +64,7 @@ class Maddpg(OffPolicyLearner):
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
         if not spec.shared_reward:
             self.joint = OneValueEach(spec, config.critic_input)
-        plain = {"name": "mlp", "activation": config.critic_activation, "symmetrise": None}
-        shape = network.model_copy(update=plain)
+        shape = perceptron(network, config.critic_activation)
         width = self.critic_width + spec.num_agents * self.head.action_width
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)

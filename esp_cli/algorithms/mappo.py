@@ -26,7 +26,7 @@ from esp_cli.algorithms.losses import (
 )
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Collector, Rollout
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic, CriticInput
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import policy_consistency_loss, value_consistency_loss
@@ -85,7 +85,7 @@ class Mappo(Learner):
         """Make all that the learner consists of; see `Learner.build`."""
         config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
         self.policy = self.build_policy(spec, network, generators).to(device)
-        critic_network = network.model_copy(update={"activation": config.critic_activation})
+        critic_network = network.with_activation(config.critic_activation)
         self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)
         self.num_values = self.critic.num_values
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)

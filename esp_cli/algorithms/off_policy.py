@@ -15,8 +15,8 @@ from esp_cli.algorithms.learner import Learner, LearnerConfig, below
 from esp_cli.algorithms.losses import clip_gradients_per_seed, masked_mean, td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
-from esp_cli.networks.bodies import NetworkConfig
-from esp_cli.networks.joint import OneValue
+from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.joint_q import OneValue
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import value_consistency_loss
 from esp_cli.symmetry import Transform

@@ -18,7 +18,7 @@ from torch import Tensor
 from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
 from esp_cli.networks.mixer import MonotonicMixer

@@ -55,8 +55,12 @@ def train(
     ] = None,
     physics: PhysicsOption = None,
     network: Annotated[
-        Literal["mlp", "gru", "mpn", "empn", "equivariant"] | None,
-        typer.Option("--network", help="Perceptron, recurrent, message passing (plain, equivariant), equivariant."),
+        str | None,
+        typer.Option(
+            "--network",
+            help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn) or equivariant.",
+            metavar="NETWORK",
+        ),
     ] = None,
     steps: StepsOption = DEFAULT_STEPS,
     seeds: SeedsOption = (0,),

@@ -18,13 +18,13 @@ from esp_cli.deploy.program import (
     Program,
     Recurrent,
 )
-from esp_cli.networks.bodies import GRU, MLP
 from esp_cli.networks.constrained import ConstrainedLinear, Equivariant
 from esp_cli.networks.contract import Network
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import BoundedGaussian, Categorical
 from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
+from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
 from esp_cli.networks.separate import Separate
 

@@ -144,18 +144,19 @@ def parse_value(text: str) -> Any:
     raise ValueError(f"brackets are nested more than {MAX_NESTING} deep")
 
 
-def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "") -> str:
+def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
     """Say what is wrong with the first bad setting, and what could stand there.
 
     Args:
         error: of the validation.
         model: that was asked for.
         section: name that stands before that of the setting.
+        owner: of the settings; by default the section.
     """
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
     if first["type"] == "extra_forbidden":
-        return f"unknown setting '{name}'; {section or 'it'} has {', '.join(model.model_fields)}"
+        return f"unknown setting '{name}'; {owner or section or 'it'} has {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"the setting '{name}' is missing"
     message = first["msg"].removeprefix("Value error, ")

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import Network, NetworkConfig
+from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, affine, orthogonal
-from esp_cli.networks.ports import Ports
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
 
@@ -103,7 +105,21 @@ class ConstrainedLinear(nn.Module):
         return affine(self.bias(), x, self.weight())
 
 
-class Equivariant(Network):
+class EquivariantConfig(NetworkConfig):
+    """The settings of an equivariant perceptron."""
+
+    name: Literal["equivariant"] = "equivariant"
+    activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
+    group: str = Field("c4", description="the layers commute with this group")
+
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build an equivariant perceptron; see `NetworkConfig.build`."""
+        return Equivariant(generators, self.io_or_refuse(io), self, output_gain)
+
+
+class Equivariant(Memoryless):
     """A perceptron of regular features over a row of scalars, planar vectors and the like: equivariant in every layer.
 
     Hidden widths are those of a plain perceptron with about as many weights. A value is invariant, an action's numbers
@@ -111,16 +127,16 @@ class Equivariant(Network):
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], ports: Ports, config: NetworkConfig, output_gain: float
+        self, generators: Sequence[torch.Generator], io: IoSpec, config: EquivariantConfig, output_gain: float
     ) -> None:
         super().__init__()
-        if any(field.pixels is not None for field in ports.layout.fields):
+        if any(field.pixels is not None for field in io.layout.fields):
             raise ValueError(
-                f"the network 'equivariant' reads numbers, but {ports.spec.name} shows pictures; use empn or mlp"
+                f"the network 'equivariant' reads numbers, but {io.spec.name} shows pictures; use empn or mlp"
             )
-        self.group = ports.group(config.group)
+        self.group = io.group(config.group)
         hidden = [[regular(self.group, copies_for(width, self.group))] for width in config.hidden]
-        blocks = [ports.inputs(self.group), *hidden, ports.outputs(self.group)]
+        blocks = [io.inputs(self.group), *hidden, io.outputs(self.group)]
         gains = [GAINS[config.activation]] * len(hidden) + [output_gain]
         self.layers = nn.ModuleList(
             ConstrainedLinear(generators, a, b, gain) for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
@@ -133,11 +149,3 @@ class Equivariant(Network):
         for layer in hidden:
             x = torch.relu(layer(x)) if self.activation == "relu" else torch.tanh(layer(x))
         return last(x)
-
-    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the network to one step."""
-        return self(x), memory
-
-    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once."""
-        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])

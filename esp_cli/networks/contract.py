@@ -1,63 +1,73 @@
-"""What every network is to policies and critics, and what a user may choose of it."""
+"""What every network offers to policies and critics, and the settings that every network has."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
+from esp_cli.networks.io_spec import IoSpec
 
-class NetworkConfig(BaseModel):
-    """The shape of actor and critic alike."""
+ActivationName = Literal["relu", "tanh"]
+
+
+class NetworkConfig(BaseModel, ABC):
+    """The settings of one kind of network; a subclass has the fields of its kind and builds it.
+
+    Attributes:
+        recurrent: whether the network carries memory from step to step.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: Literal["mlp", "gru", "mpn", "empn", "equivariant"] = "mlp"
+    recurrent: ClassVar[bool] = False
+
+    name: str
     hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(
         (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
     )
-    activation: Literal["relu", "tanh"] = Field("tanh", description="of the actor; MAPPO paper: relu")
-    precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
-    layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
-    group: str = Field("c4", description="of empn and equivariant: what their layers commute with")
     symmetrise: str | None = Field(
-        None, description="a group: the network's answers to all images of what it sees are averaged"
+        None, description="a group: the outputs for all images of the input are pulled back and averaged"
     )
 
-    separate_parts: bool = Field(
-        False, description="discrete wheel pairs: one output per speed of each wheel, a pair's being their sum"
-    )
+    @abstractmethod
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build the network, without the average that `symmetrise` asks for; arguments as of `build_network`.
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """The precision as torch names it."""
-        return getattr(torch, self.precision)
+        Raises:
+            ValueError: the network does not fit `io`, or needs it and there is none.
+        """
 
-    @model_validator(mode="after")
-    def _fits(self) -> NetworkConfig:
-        if self.name not in ("mlp", "gru") and (self.layer_norm or self.precision != "float32"):
-            raise ValueError(
-                f"layer_norm and precision are for mlp and gru, not for {self.name}; leave them as they are"
-            )
-        if self.separate_parts and (self.name not in ("mlp", "gru") or self.symmetrise):
-            raise ValueError("separate_parts is for mlp and gru without symmetrise; leave it off")
-        return self
+    def io_or_refuse(self, io: IoSpec | None) -> IoSpec:
+        """Return `io` where it is given.
+
+        Raises:
+            ValueError: it is None, though the network needs it.
+        """
+        if io is None:
+            raise ValueError(f"the network {self.name} needs the meaning of its inputs, which this place does not give")
+        return io
+
+    def with_activation(self, activation: ActivationName) -> NetworkConfig:
+        """Return these settings with another activation, where the network has a choice of it."""
+        chosen = {"activation": activation} if "activation" in type(self).model_fields else {}
+        return self.model_copy(update=chosen)
 
     def least_parameters(self, inputs: int) -> int:
-        """Return a number of weights that a network of this shape has at least, to tell a damaged shape by.
+        """Return a lower bound of the number of weights; a file with fewer is damaged.
 
         Args:
-            inputs: width of a row.
+            inputs: width of an input row.
         """
-        # relative positions and pictures enter by few weights, and a constrained layer rounds its number of features
-        plain = self.name in ("mlp", "gru")
-        widths = (inputs, *self.hidden) if plain else (1, *self.hidden)
-        count = sum(a * b for a, b in pairwise(widths))
-        return count if plain else count // 4
+        # A constrained layer rounds its number of features, and pictures enter by few weights.
+        return sum(a * b for a, b in pairwise((1, *self.hidden))) // 4
 
 
 class Network(nn.Module, ABC):
@@ -86,3 +96,15 @@ class Network(nn.Module, ABC):
         Returns:
             y: [S, B, T, out].
         """
+
+
+class Memoryless(Network):
+    """A network that maps each row by itself: a subclass defines `forward`, [S, B, in] -> [S, B, out]."""
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Apply the network to one step."""
+        return self(x), memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps at once."""
+        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])

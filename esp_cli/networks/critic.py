@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import build_network
+from esp_cli.networks.build import build_network
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.networks.ports import Ports, Reads
+from esp_cli.networks.io_spec import IoSpec, Reads
 from esp_envs.spec import TaskSpec
 
 CriticInput = Reads
@@ -39,7 +39,7 @@ class Critic(nn.Module):
         observed = spec.observation.width
         width = {"state": spec.state.width, "observations": spec.num_agents * observed, "own": observed}[reads]
         outputs = 1 if own else self.num_values
-        self.network = build_network(generators, width, outputs, network, 1.0, Ports(spec, reads, outputs))
+        self.network = build_network(generators, width, outputs, network, 1.0, IoSpec(spec, reads, outputs))
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""

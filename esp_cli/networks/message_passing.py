@@ -10,15 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
+from pydantic import Field as Setting
 from torch import Tensor, nn
 from torch.autograd import Function
 
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
-from esp_cli.networks.contract import Network, NetworkConfig
+from esp_cli.networks.contract import Memoryless, Network, NetworkConfig
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, affine
-from esp_cli.networks.ports import Ports
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
 from esp_envs.spec import Field, Items, Kind, Layout
@@ -26,10 +28,10 @@ from esp_envs.spec import Field, Items, Kind, Layout
 CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
 """Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
 REACH_SQUARED = 18.0
-"""Drones nearer than its root, 3 sqrt 2 cells, exchange messages; van der Pol's code. Squares of cells are integers, so
-whether two that are just so far apart hear each other (they do not) depends on no rounding."""
+"""Square of the communication range in cells, 3 sqrt(2) cells; van der Pol's code. Drones at exactly this range do not
+hear each other. Squared distances are integers, so the comparison is exact."""
 _LOT = 16
-"""Different pictures are encoded in multiples of this, so that few lengths of products occur."""
+"""The number of encoded pictures is a multiple of this, so that few shapes of matrix products occur."""
 
 
 class PictureEncoder(nn.Module):
@@ -157,7 +159,32 @@ def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
     return which, place
 
 
-class MessagePassing(Network):
+class MpnConfig(NetworkConfig):
+    """The settings of the plain message passing network."""
+
+    name: Literal["mpn"] = "mpn"
+
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build a message passing network; see `NetworkConfig.build`."""
+        return MessagePassing(generators, self.io_or_refuse(io), self, "c1", output_gain)
+
+
+class EmpnConfig(NetworkConfig):
+    """The settings of the equivariant message passing network."""
+
+    name: Literal["empn"] = "empn"
+    group: str = Setting("c4", description="the layers commute with this group")
+
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build an equivariant message passing network; see `NetworkConfig.build`."""
+        return MessagePassing(generators, self.io_or_refuse(io), self, self.group, output_gain)
+
+
+class MessagePassing(Memoryless):
     """Encoder, message passing layers, head; see the module.
 
     A layer maps [own features, mean of (relative position, features) over the near], where the mean counts the drone
@@ -168,17 +195,22 @@ class MessagePassing(Network):
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], ports: Ports, config: NetworkConfig, output_gain: float
+        self,
+        generators: Sequence[torch.Generator],
+        io: IoSpec,
+        config: NetworkConfig,
+        group: str,
+        output_gain: float,
     ) -> None:
         super().__init__()
-        if ports.reads != "own":
+        if io.reads != "own":
             raise ValueError(
                 f"{config.name} passes messages between drones, each with what it sees: set mappo.critic_input=own"
             )
-        picture, others = _fields(ports)
-        self.group = ports.group("c1" if config.name == "mpn" else config.group)
-        self.team = ports.spec.num_agents
-        self.picture, self.others = (ports.layout.slices()[field.name] for field in (picture, others))
+        picture, others = _fields(io)
+        self.group = io.group(group)
+        self.team = io.spec.num_agents
+        self.picture, self.others = (io.layout.slices()[field.name] for field in (picture, others))
         self.encoder = PictureEncoder(generators, picture, self.group)
         (vector,) = layout_blocks(Layout((Field("way", Kind.VECTOR),)), self.group)
         block: Block = self.encoder.output
@@ -188,7 +220,7 @@ class MessagePassing(Network):
             layers.append(ConstrainedLinear(generators, [block, vector, block], [following], GAINS["relu"]))
             block = following
         self.layers = nn.ModuleList(layers)
-        self.head = ConstrainedLinear(generators, [block], ports.outputs(self.group), output_gain)
+        self.head = ConstrainedLinear(generators, [block], io.outputs(self.group), output_gain)
         index = [[j for j in range(self.team) if j != i] for i in range(self.team)]
         self.index: Tensor
         self.register_buffer("index", torch.tensor(index), False)
@@ -206,11 +238,11 @@ class MessagePassing(Network):
         features = [self.encoder(x[..., self.picture])]
         for layer in self.layers:
             own = features[-1]
-            heard = self._hear(own, share)
+            heard = self._aggregate(own, share)
             features.append(torch.relu(layer(torch.cat([own, mean_way, heard], -1))))
         return features
 
-    def _hear(self, own: Tensor, share: Tensor) -> Tensor:
+    def _aggregate(self, own: Tensor, share: Tensor) -> Tensor:
         """Return for each drone the sum of the others' features by their shares: [S, W * N, C]."""
         worlds = own.unflatten(1, (-1, self.team))
         shares = share.unflatten(1, (-1, self.team)).unsqueeze(-1)
@@ -219,10 +251,6 @@ class MessagePassing(Network):
             heard = torch.addcmul(heard, shares[:, :, :, k], worlds[:, :, self.index[:, k]])
         return heard.flatten(1, 2)
 
-    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the network to one step."""
-        return self(x), memory
-
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""
         worlds = x.unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
@@ -230,14 +258,14 @@ class MessagePassing(Network):
         return outputs.transpose(2, 3).flatten(1, 2)
 
 
-def _fields(ports: Ports) -> tuple[Field, Field]:
+def _fields(io: IoSpec) -> tuple[Field, Field]:
     """Return the field of pictures and that of relative positions."""
-    fields = ports.layout.fields
+    fields = io.layout.fields
     pictures = [f for f in fields if f.kind is Kind.PICTURE]
     others = [f for f in fields if f.kind is Kind.VECTOR and f.items is Items.OTHERS]
-    if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != ports.spec.num_agents - 1:
+    if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != io.spec.num_agents - 1:
         raise ValueError(
-            f"message passing needs a picture and the way to each other agent, but {ports.spec.name} does not show "
+            f"message passing needs a picture and the way to each other agent, but {io.spec.name} does not show "
             "them; use mlp, gru or equivariant"
         )
     return pictures[0], others[0]

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import Network, NetworkConfig, build_network
+from esp_cli.networks.build import Network, NetworkConfig, build_network
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head
-from esp_cli.networks.ports import Ports
+from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.separate import Separate, action_parts
 from esp_envs.spec import TaskSpec
 
@@ -46,12 +47,12 @@ class Policy(nn.Module):
         self.num_agents = spec.num_agents
         self.head = head
         inputs = spec.observation.width + num_extra
-        if network.separate_parts:
+        if isinstance(network, PlainConfig) and network.separate_parts:
             parts = action_parts(spec.action)
             self.actor: Network = Separate(build_network(generators, inputs, len(parts), network, output_gain), parts)
         else:
-            ports = None if num_extra else Ports(spec, "own")
-            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, ports)
+            io = None if num_extra else IoSpec(spec, "own")
+            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, io)
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""
@@ -101,7 +102,7 @@ class HistoryPolicy(Policy):
         head: ExploringHead,
         output_gain: float,
     ) -> None:
-        extra = head.action_width if network.name == "gru" else 0
+        extra = head.action_width if network.recurrent else 0
         super().__init__(spec, network, generators, head, output_gain, extra)
         self.recurrent = self.actor.memory_width > 0
 

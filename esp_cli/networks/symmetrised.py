@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import Network
-from esp_cli.networks.ports import Ports
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.symmetry.intertwiners import planar_matrices
 from esp_cli.symmetry.representation import layout_matrix, rows_permutation
 
@@ -18,32 +18,32 @@ class Symmetrised(Network):
 
     Args:
         network: f.
-        ports: what it reads and writes.
+        io: what it reads and writes.
         group: name of the group.
 
     Raises:
-        ValueError: see `Ports.group`.
+        ValueError: see `IoSpec.group`.
     """
 
-    def __init__(self, network: Network, ports: Ports, group: str) -> None:
+    def __init__(self, network: Network, io: IoSpec, group: str) -> None:
         super().__init__()
         self.network = network
-        self.group = ports.group(group)
+        self.group = io.group(group)
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
         planar = planar_matrices(self.group)
-        self.pictured = any(field.pixels is not None for field in ports.layout.fields)
+        self.pictured = any(field.pixels is not None for field in io.layout.fields)
         self.push: Tensor
         self.sign: Tensor
         self.home: Tensor
         if self.pictured:
-            source, sign = rows_permutation(ports.layout, planar, None)
+            source, sign = rows_permutation(io.layout, planar, None)
             self.register_buffer("push", torch.as_tensor(source), False)
             self.register_buffer("sign", torch.as_tensor(sign, dtype=torch.float32), False)
         else:
-            matrix = torch.as_tensor(layout_matrix(ports.layout, planar), dtype=torch.float32)
+            matrix = torch.as_tensor(layout_matrix(io.layout, planar), dtype=torch.float32)
             self.register_buffer("push", matrix.transpose(1, 2).contiguous(), False)
-        blocks = ports.outputs(self.group)
+        blocks = io.outputs(self.group)
         home = [
             torch.block_diag(
                 *(torch.as_tensor(b.matrices[g], dtype=torch.float32) for b in blocks for _ in range(b.copies))

@@ -26,6 +26,7 @@ from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.training.config import RunConfig
+from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
@@ -199,7 +200,7 @@ class StudyFolder:
         if not (path / "config.json").exists():
             return RunFolder.create(path, wanted)
         folder = RunFolder.open(path)
-        if folder.config != wanted:
+        if parse_config(folder.config, path) != cell.config:
             raise StudyError(f"{path} holds a run of another configuration; move it away, or choose another --out")
         return folder
 

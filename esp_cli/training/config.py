@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from esp_cli.algorithms.presets import PRESETS, TUNED
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence, parse_value
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.build import AnyNetworkConfig, network_class
+from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class
 
@@ -37,7 +38,7 @@ class RunConfig(BaseModel):
     seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=1000, description="as many as --seeds takes")
     task_settings: dict[str, Any] = Field(default_factory=dict)
     algorithm_settings: dict[str, Any] = Field(default_factory=dict)
-    network: NetworkConfig = NetworkConfig()
+    network: AnyNetworkConfig = MlpConfig()
     prior: PriorConfig = PriorConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     device: Literal["cpu", "cuda"] = "cpu"
@@ -87,6 +88,12 @@ def resolve_config(
         if isinstance(read, float) and not math.isfinite(read):
             raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
 
+    network_name = sections["network"].get("name", "mlp")
+    network = network_class(network_name)
+    for name in set(sections["network"]) - set(network.model_fields):
+        if f"network.{name}" not in (overrides or {}):  # of a preset, for a network that the user did not choose
+            del sections["network"][name]
+
     task_settings = resolve_task_settings(task, sections["task"])
     algorithm_settings = _validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
     values = {
@@ -97,7 +104,7 @@ def resolve_config(
         "seeds": tuple(seeds),
         "task_settings": task_settings,
         "algorithm_settings": algorithm_settings.model_dump(),
-        "network": _validated(NetworkConfig, sections["network"], "network"),
+        "network": _validated(network, sections["network"], "network", f"the network {network_name}"),
         "prior": _validated(PriorConfig, sections["prior"], "prior"),
         "evaluation": _validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
@@ -124,9 +131,9 @@ def _read(value: object) -> object:
         return value
 
 
-def _validated(model: type[BaseModel], values: Mapping[str, object], section: str) -> Any:
+def _validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
     """Build `model`, turning pydantic's report into one sentence."""
     try:
         return model(**values)
     except ValidationError as error:
-        raise ValueError(one_sentence(error, model, section)) from None
+        raise ValueError(one_sentence(error, model, section, owner)) from None

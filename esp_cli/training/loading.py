@@ -15,6 +15,7 @@ from torch import Tensor
 from esp_cli import __version__
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence
+from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import RunConfig, resolve_task_settings
@@ -133,7 +134,9 @@ def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
     seeds = trained.config.seeds
     if seed not in seeds:
         raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-    network = trained.config.network.model_copy(update={"precision": "float32"})
+    network = trained.config.network
+    if isinstance(network, PlainConfig):
+        network = network.model_copy(update={"precision": "float32"})
     config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
     policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
     index = seeds.index(seed)

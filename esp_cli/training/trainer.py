@@ -262,7 +262,7 @@ def policy_description(config: RunConfig, spec: TaskSpec, step: int, returns: Se
         "task": config.task,
         "task_version": spec.version,
         "network": config.network.name,
-        "activation": config.network.activation,
+        "activation": getattr(config.network, "activation", None),
         "step": step,
         "greedy_returns": [None if math.isnan(x) else x for x in returns],
         "config": config.model_dump(mode="json"),

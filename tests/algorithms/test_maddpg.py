@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from esp_cli.networks.bodies import MLP
 from esp_cli.networks.layers import SeedMLP
+from esp_cli.networks.plain import MLP
 from tests.algorithms.off_policy import learner, turn
 
 

@@ -92,7 +92,7 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper"),
         (["--prior", "some"], "'some' is not one of 'esp', 'augment', 'consistency', 'none'"),
-        (["--network", "cnn"], "'cnn' is not one of 'mlp', 'gru'"),
+        (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
         (["--consistency-coef", "-1"], "--consistency-coef"),
         (["--consistency-coef", "nan"], "--consistency-coef"),

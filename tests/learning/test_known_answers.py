@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.mappo import Mappo, MappoConfig
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import transform_set
 from esp_cli.training.play import HeuristicController, PolicyController, RandomController
@@ -23,7 +23,7 @@ def learn(task: type[Pointing], **prior: object) -> list[Tensor]:
         task(32, stream_seeds(SEEDS, "training worlds")),
         # gamma 0: the next target does not depend on the action
         MappoConfig(num_steps=2 * HORIZON, num_epochs=6, learning_rate=5e-3, gamma=0.0),
-        NetworkConfig(hidden=(32,)),
+        MlpConfig(hidden=(32,)),
         PriorConfig.model_validate(prior),
         generators(SEEDS, "learner"),
         generators(SEEDS, "prior"),

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators, stream_seeds
@@ -26,7 +26,7 @@ def learn(algorithm: str, task: type[Pointing], rounds: int = ROUNDS, **prior: o
     learner = cls(
         task(8, stream_seeds(SEEDS, "training worlds")),
         cls.config_class.model_validate(SETTINGS | extra),
-        NetworkConfig(hidden=(32,), activation="relu"),
+        MlpConfig(hidden=(32,), activation="relu"),
         PriorConfig.model_validate(prior),
         generators(SEEDS, "learner"),
         generators(SEEDS, "prior"),

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.build import NETWORKS, NetworkConfig, build_network
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
-from esp_cli.networks.ports import Ports
 from esp_cli.networks.symmetrised import Symmetrised
 from esp_cli.symmetry import (
     cyclic,
@@ -56,8 +56,8 @@ def turned(block: Block, g: int, x: Tensor) -> Tensor:
 
 
 def message_passing(spec: TaskSpec, name: str, group: str = "c4") -> MessagePassing:
-    config = NetworkConfig(name=name, hidden=(16, 16), activation="relu", group=group)
-    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+    config = NETWORKS[name](hidden=(16, 16), **({"group": group} if name == "empn" else {}))
+    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
     assert isinstance(network, MessagePassing)
     stir(network)
     return network
@@ -92,10 +92,10 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
 @torch.no_grad()
 def errors(spec: TaskSpec, config: NetworkConfig, obs: Tensor, state: Tensor, group: str, reads="own") -> float:
     """The largest equivariance error of a policy and a critic with random weights, over a group."""
-    width = Ports(spec, reads).layout.width
-    outputs = Ports(spec, "own").outputs(cyclic(1))[0].width if hasattr(spec.action, "count") else spec.action.width
-    actor = build_network(generators(0, 1), spec.observation.width, outputs, config, 1.0, Ports(spec, "own"))
-    critic = build_network(generators(0, 1), width, 1, config, 1.0, Ports(spec, reads, 1))
+    width = IoSpec(spec, reads).layout.width
+    outputs = IoSpec(spec, "own").outputs(cyclic(1))[0].width if hasattr(spec.action, "count") else spec.action.width
+    actor = build_network(generators(0, 1), spec.observation.width, outputs, config, 1.0, IoSpec(spec, "own"))
+    critic = build_network(generators(0, 1), width, 1, config, 1.0, IoSpec(spec, reads, 1))
     stir(actor), stir(critic)
 
     def policy(x: Tensor) -> Tensor:
@@ -120,9 +120,9 @@ def errors(spec: TaskSpec, config: NetworkConfig, obs: Tensor, state: Tensor, gr
 @pytest.mark.parametrize("group", ["c4", "d4"])
 def test_the_equivariant_message_passing_network_is_exact_and_the_standard_one_is_not(group) -> None:
     spec, obs, state = scene(num_agents=4, convention="corrected")
-    equivariant = NetworkConfig(name="empn", hidden=(16, 16), activation="relu", group=group)
+    equivariant = NETWORKS["empn"](hidden=(16, 16), group=group)
     assert errors(spec, equivariant, obs, state, group) < EXACT
-    standard = NetworkConfig(name="mpn", hidden=(16, 16), activation="relu")
+    standard = NETWORKS["mpn"](hidden=(16, 16))
     assert errors(spec, standard, obs, state, group) > 1e-2
     ensemble = standard.model_copy(update={"symmetrise": group})
     assert errors(spec, ensemble, obs, state, group) < EXACT
@@ -130,7 +130,7 @@ def test_the_equivariant_message_passing_network_is_exact_and_the_standard_one_i
 
 def test_c4_is_not_enough_for_mirrors() -> None:
     spec, obs, state = scene()
-    assert errors(spec, NetworkConfig(name="empn", hidden=(16,), group="c4"), obs, state, "d4") > 1e-2
+    assert errors(spec, NETWORKS["empn"](hidden=(16,), group="c4"), obs, state, "d4") > 1e-2
 
 
 @pytest.mark.parametrize("reads", ["own", "observations", "state"])
@@ -146,9 +146,9 @@ def test_c4_is_not_enough_for_mirrors() -> None:
 )
 def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(task, settings, group, reads) -> None:
     spec, obs, state = scene(task, **settings)
-    exact = NetworkConfig(name="equivariant", hidden=(16, 16), group=group)
+    exact = NETWORKS["equivariant"](hidden=(16, 16), group=group)
     assert errors(spec, exact, obs, state, group, reads) < EXACT
-    plain = NetworkConfig(name="mlp", hidden=(16, 16))
+    plain = NETWORKS["mlp"](hidden=(16, 16))
     assert errors(spec, plain, obs, state, group, reads) > 1e-2
     assert errors(spec, plain.model_copy(update={"symmetrise": group}), obs, state, group, reads) < EXACT
 
@@ -178,8 +178,8 @@ def test_equivariance_survives_training(task, network) -> None:
 
 def test_a_recurrent_ensemble_keeps_the_memories_of_its_images_apart() -> None:
     spec, obs, _ = scene("navigation")
-    config = NetworkConfig(name="gru", hidden=(8,), symmetrise="c4")
-    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+    config = NETWORKS["gru"](hidden=(8,), symmetrise="c4")
+    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
     assert isinstance(network, Symmetrised)
     assert network.memory_width == 4 * 8
     rows = torch.stack([obs.flatten(1, 2), 0.5 * obs.flatten(1, 2), -obs.flatten(1, 2)], 2)
@@ -199,8 +199,8 @@ def test_the_group_of_one_element_gives_plain_layers() -> None:
     layer = ConstrainedLinear(generators(3), [trivial(one, 4), regular(one, 3)], [regular(one, 5)], 1.5)
     torch.testing.assert_close(layer.weight(), orthogonal(generators(3), 7, 5, 1.5))
     spec, obs, _ = scene("navigation")
-    config = NetworkConfig(name="equivariant", hidden=(8, 8), group="c1")
-    ours = build_network(generators(0, 1), 14, 5, config, 0.1, Ports(spec, "own"))
+    config = NETWORKS["equivariant"](hidden=(8, 8), group="c1")
+    ours = build_network(generators(0, 1), 14, 5, config, 0.1, IoSpec(spec, "own"))
     theirs = SeedMLP(generators(0, 1), (14, 8, 8, 5), "tanh", 0.1)
     torch.testing.assert_close(ours.unroll(obs), theirs(obs.flatten(1, 2)).unflatten(1, obs.shape[1:3]))
 
@@ -218,8 +218,8 @@ def test_parameter_counts_are_alike() -> None:
     spec, _, _ = scene()
     for name, hidden in (("empn", (64, 64)), ("mpn", (64, 64))):
         assert copies_for(64, parse_group("c4", 3)) == 32
-        config = NetworkConfig(name=name, hidden=hidden)
-        network = build_network(generators(0), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+        config = NETWORKS[name](hidden=hidden)
+        network = build_network(generators(0), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
         count = sum(parameter.numel() for parameter in network.parameters())
         assert count == pytest.approx(26_500, rel=0.05)
 
@@ -272,9 +272,9 @@ def test_pictures_that_all_differ_are_all_encoded() -> None:
 @pytest.mark.parametrize("name", ["mpn", "empn"])
 def test_a_seed_alone_equals_itself_among_others(name) -> None:
     spec, obs, _ = scene()
-    config = NetworkConfig(name=name, hidden=(16,))
+    config = NETWORKS[name](hidden=(16,))
     both, alone = (
-        build_network(generators(*seeds), spec.observation.width, 5, config, 1.0, Ports(spec, "own"))
+        build_network(generators(*seeds), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
         for seeds in ((0, 1), (1,))
     )
     rows = obs.flatten(1, 2)
@@ -307,7 +307,7 @@ def test_drones_out_of_reach_are_not_heard() -> None:
         ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "choose a finite group of the plane"),
         ("navigation", {"network.name": "equivariant", "network.group": "c8"}, "no action"),
         ("navigation", {"network.symmetrise": "agents"}, "choose a finite group of the plane"),
-        ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "are for mlp and gru"),
+        ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "the network equivariant has name"),
     ],
 )
 def test_what_does_not_fit_is_refused(task, overrides, message) -> None:

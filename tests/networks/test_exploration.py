@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.symmetry import transform_set
@@ -109,7 +109,7 @@ def test_squash_noise_and_bounds_turn_with_the_world():
 def policy(name, continuous):
     spec = PLANAR if continuous else DISCRETE
     head = BoundedPoint(spec.action, 2) if continuous else EpsilonGreedy(spec.action, 2)
-    return spec, HistoryPolicy(spec, NetworkConfig(name=name, hidden=(8,)), generators(SEEDS, "policy"), head, 1.0)
+    return spec, HistoryPolicy(spec, NETWORKS[name](hidden=(8,)), generators(SEEDS, "policy"), head, 1.0)
 
 
 @pytest.mark.parametrize("continuous", [False, True], ids=["discrete", "continuous"])

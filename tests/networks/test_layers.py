@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.bodies import NetworkConfig, build_network
+from esp_cli.networks.build import NETWORKS, build_network
 from esp_cli.networks.layers import SeedGRU, SeedMLP, orthogonal
 from tests.networks.gradients import assert_same_gradients
 
@@ -68,7 +68,7 @@ def test_weights_are_orthogonal_and_a_seed_draws_the_same_alone_and_among_others
 
 @pytest.mark.parametrize("name", ["mlp", "gru"])
 def test_a_seed_neither_sees_nor_moves_another(name):
-    network = build_network(generators(0, 1), 6, 3, NetworkConfig(name=name, hidden=(8,), layer_norm=True), 1.0)
+    network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8,), layer_norm=True), 1.0)
     x = torch.randn(2, 4, 5, 6)
     before = network.unroll(x)
     x[1] += torch.randn(4, 5, 6)
@@ -91,7 +91,7 @@ def test_gru_by_hand():
 
 @pytest.mark.parametrize("name", ["mlp", "gru"])
 def test_unrolling_an_episode_equals_stepping_through_it(name):
-    network = build_network(generators(0, 1), 6, 3, NetworkConfig(name=name, hidden=(8, 8)), 1.0)
+    network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8, 8)), 1.0)
     x = torch.randn(2, 4, 5, 6)
     memory = network.initial_memory(2, 4, x)
     steps = []
@@ -102,7 +102,7 @@ def test_unrolling_an_episode_equals_stepping_through_it(name):
 
 
 def test_truncation_cuts_gradients_but_not_values():
-    network = build_network(generators(0), 2, 1, NetworkConfig(name="gru", hidden=(4,)), 1.0)
+    network = build_network(generators(0), 2, 1, NETWORKS["gru"](hidden=(4,)), 1.0)
     x = torch.randn(1, 1, 6, 2, requires_grad=True)
     full, cut = network.unroll(x), network.unroll(x, truncation=3)
     torch.testing.assert_close(full, cut)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from esp_cli.networks.bodies import NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
+from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import HistoryPolicy, StochasticPolicy
 from esp_cli.networks.separate import action_parts
 from esp_cli.symmetry.elements import mirror
@@ -31,7 +31,7 @@ def test_parts_by_hand():
 
 def test_a_pair_is_worth_the_sum_of_its_wheels():
     spec = formation()
-    config = NetworkConfig(hidden=(8,), separate_parts=True)
+    config = MlpConfig(hidden=(8,), separate_parts=True)
     policy = HistoryPolicy(spec, config, generators(), EpsilonGreedy(spec.action, 2), 1.0)
     assert policy.actor.network.layers[-1].weight.shape == (2, 8, 22), "eleven speeds of each wheel"
     obs = torch.randn(2, 3, 2, spec.observation.width)
@@ -44,7 +44,7 @@ def test_a_pair_is_worth_the_sum_of_its_wheels():
 
 def test_a_distribution_is_one_for_each_wheel():
     spec = formation()
-    policy = StochasticPolicy(spec, NetworkConfig(hidden=(8,), separate_parts=True), generators())
+    policy = StochasticPolicy(spec, MlpConfig(hidden=(8,), separate_parts=True), generators())
     policy.actor.network.layers[-1].weight.data.mul_(100.0)
     obs = torch.randn(2, 3, 2, spec.observation.width)
     joint = policy.step(obs, policy.initial_memory(3, obs))[0].exp().unflatten(-1, (11, 11))
@@ -69,5 +69,5 @@ def test_actions_without_parts_are_refused():
     continuous = make("formation", 2, [0]).spec
     with pytest.raises(ValueError, match="separate_parts is for discrete actions"):
         action_parts(continuous.action)
-    with pytest.raises(ValueError, match="separate_parts is for mlp and gru"):
-        NetworkConfig(name="empn", separate_parts=True)
+    with pytest.raises(ValueError, match="separate_parts and symmetrise exclude each other"):
+        MlpConfig(separate_parts=True, symmetrise="c4")

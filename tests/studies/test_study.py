@@ -127,3 +127,12 @@ def test_ablations_share_their_runs_with_each_other_and_with_table_1():
     assert modules["augmentation"] == configs["ablate-transforms"]["rot90"]
     assert modules["loss"] == configs["ablate-coefficient"]["c = 0.5"]
     assert len({config.model_dump_json() for config in modules.values()}) == 4
+
+
+def test_a_run_of_version_0_1_0_whose_network_has_the_fields_of_all_is_gone_on_with(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), ENDS)
+    cell = folder.study.cells[0]
+    file = folder.run_path(cell) / "config.json"
+    stored = json.loads(file.read_text())
+    file.write_text(json.dumps(stored | {"network": stored["network"] | {"group": "c4"}}))
+    assert folder.prepare(cell).path == folder.run_path(cell)

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from esp_cli.algorithms.mappo import MappoConfig
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.constrained import EquivariantConfig
+from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
+from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig, RunConfig, resolve_config
 from esp_cli.training.loading import parse_config
@@ -16,7 +18,7 @@ from esp_cli.training.loading import parse_config
 def test_without_a_choice_every_default_is_the_models_own():
     config = resolve_config("navigation")
     assert config.algorithm_settings == MappoConfig().model_dump()
-    assert (config.network, config.prior, config.evaluation) == (NetworkConfig(), PriorConfig(), EvaluationConfig())
+    assert (config.network, config.prior, config.evaluation) == (MlpConfig(), PriorConfig(), EvaluationConfig())
     assert (config.preset, config.device, config.seeds) == ("default", "cpu", (0,))
     assert config.task_settings["num_agents"] == 3
 
@@ -44,6 +46,59 @@ def test_an_override_has_the_last_word_over_a_preset_which_has_it_over_a_default
     assert config.algorithm_settings["learning_rate"] == 1e-4, "not the preset's 7e-4"
     assert config.algorithm_settings["num_envs"] == 128, "not the default's 32"
     assert (config.network.name, config.network.layer_norm) == ("mlp", True)
+
+
+def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_not_have_it():
+    config = resolve_config("wildlife", "maddpg", "paper", overrides={"network.name": "empn"})
+    assert config.network == EmpnConfig(hidden=(64, 64)), "without the layer_norm of the preset's recurrent network"
+
+
+FLAT = {
+    "hidden": [32],
+    "activation": "relu",
+    "precision": "float32",
+    "layer_norm": False,
+    "group": "d4",
+    "symmetrise": None,
+    "separate_parts": False,
+}
+"""Stored by version 0.1.0 for every network."""
+
+
+@pytest.mark.parametrize(
+    ("name", "network"),
+    [
+        ("mlp", MlpConfig(hidden=(32,), activation="relu")),
+        ("gru", GruConfig(hidden=(32,), activation="relu")),
+        ("mpn", MpnConfig(hidden=(32,))),
+        ("empn", EmpnConfig(hidden=(32,), group="d4")),
+        ("equivariant", EquivariantConfig(hidden=(32,), activation="relu", group="d4")),
+    ],
+)
+def test_a_stored_network_with_the_fields_of_all_networks_is_read_as_its_own(name, network):
+    stored = resolve_config("navigation").model_dump(mode="json") | {"network": {"name": name, **FLAT}}
+    config = parse_config(stored, Path("run"))
+    assert config.network == network
+    again = json.loads(config.model_dump_json())
+    assert set(again["network"]) == set(type(network).model_fields), "what is stored anew are its own fields alone"
+    assert parse_config(again, Path("run")) == config
+
+
+@pytest.mark.parametrize(
+    ("network", "sentence"),
+    [
+        ({"name": "mlp", "depth": 3}, "unknown setting 'config.network.depth'"),
+        ({"name": "mlp", "hidden": ["wide"]}, "bad value 'wide' for 'config.network.hidden.0'"),
+        ({"name": "cnn"}, "unknown network 'cnn'"),
+        ({"name": ["mlp"]}, "unknown network"),
+        ("mlp", "bad value 'mlp' for 'config.network'"),
+    ],
+)
+def test_a_stored_network_that_is_damaged_is_one_sentence(network, sentence):
+    stored = resolve_config("navigation").model_dump(mode="json") | {"network": network}
+    with pytest.raises(ValueError, match=re.escape(sentence)) as caught:
+        parse_config(stored, Path("run"))
+    assert "\n" not in str(caught.value)
 
 
 def test_overrides_may_be_text_as_on_the_command_line():
@@ -87,7 +142,16 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
         ),
         ({"overrides": {"qmix.tau": 1}}, "cannot set 'qmix.tau': a setting is SECTION.NAME"),
         ({"overrides": {"prior.force": 1}}, "unknown setting 'prior.force'; prior has kind, transforms, copies"),
-        ({"overrides": {"network.width": 1}}, "unknown setting 'network.width'; network has name, hidden, activation"),
+        (
+            {"overrides": {"network.width": 1}},
+            "unknown setting 'network.width'; the network mlp has name, hidden, symmetrise, activation",
+        ),
+        (
+            {"overrides": {"network.name": "mpn", "network.group": "d4"}},
+            "unknown setting 'network.group'; the network mpn has name, hidden, symmetrise",
+        ),
+        ({"overrides": {"network.name": "cnn"}}, "unknown network 'cnn'; the networks are mlp, gru, mpn"),
+        ({"overrides": {"network.name": [1]}}, "unknown network '[1]'; the networks are mlp"),
         (
             {"overrides": {"evaluation.often": 1}},
             "unknown setting 'evaluation.often'; evaluation has every_steps, episodes",

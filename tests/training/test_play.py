@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.bodies import NetworkConfig
+from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.play import HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
@@ -104,7 +104,7 @@ def test_the_random_anchor_draws_from_the_worlds_own_generators():
 
 
 def policy_for(env, name="mlp"):
-    return StochasticPolicy(env.spec, NetworkConfig(name=name, hidden=(4,)), generators(SEEDS, "policy"))
+    return StochasticPolicy(env.spec, NETWORKS[name](hidden=(4,)), generators(SEEDS, "policy"))
 
 
 def test_a_greedy_policy_takes_its_most_probable_action():

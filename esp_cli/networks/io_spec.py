@@ -1,4 +1,4 @@
-"""What a network reads and writes, and how both transform: all that an equivariant network has to know of its place."""
+"""What a network reads and writes, and how both transform under a group."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Reads = Literal["state", "observations", "own"]
 
 
 @dataclass(frozen=True)
-class Ports:
-    """The place of a network in a task.
+class IoSpec:
+    """The input and output of a network in a task.
 
     Attributes:
         spec: the task.
-        reads: the global state, all agents' observations in a row, or one agent's own, of which rows come with the
-            agents of a world side by side.
-        num_values: invariant values that it writes, or None where it writes one number per action (discrete) or the
-            numbers of an action (continuous).
+        reads: the global state, all agents' observations in a row, or one agent's own observation; rows of own
+            observations hold the agents of a world side by side.
+        num_values: number of invariant outputs; None for an actor, whose outputs are one number per discrete action,
+            or the numbers of a continuous action.
     """
 
     spec: TaskSpec

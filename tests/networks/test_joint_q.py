@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.exchange import _one_by_one, in_a_circle, with_one_exchanged
+from esp_cli.networks.joint_q import _one_by_one, in_a_circle, with_one_exchanged
 from esp_cli.networks.layers import SeedMLP
 from tests.networks.gradients import assert_same_gradients
 

@@ -1,0 +1,95 @@
+"""The networks by name, and how a network is built from its settings.
+
+Adding a network is one file, with its class and its `NetworkConfig`, and one line in `NETWORKS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import torch
+from pydantic import BeforeValidator, SerializeAsAny
+
+from esp_cli.networks.constrained import EquivariantConfig
+from esp_cli.networks.contract import ActivationName, Network, NetworkConfig
+from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
+from esp_cli.networks.plain import GruConfig, MlpConfig, PlainConfig
+from esp_cli.networks.symmetrised import Symmetrised
+
+__all__ = ["NETWORKS", "AnyNetworkConfig", "Network", "NetworkConfig", "build_network", "network_class", "perceptron"]
+
+NETWORKS: dict[str, type[NetworkConfig]] = {
+    "mlp": MlpConfig,
+    "gru": GruConfig,
+    "mpn": MpnConfig,
+    "empn": EmpnConfig,
+    "equivariant": EquivariantConfig,
+}
+"""The settings of every network, by its name."""
+
+_FLAT_FIELDS = {"activation", "precision", "layer_norm", "group", "separate_parts"}
+"""Stored configurations of version 0.1.0 hold these fields for every network, also for one that does not read them."""
+
+
+def network_class(name: object) -> type[NetworkConfig]:
+    """Return the settings class of a network.
+
+    Raises:
+        ValueError: there is no such network.
+    """
+    if not isinstance(name, str) or name not in NETWORKS:
+        raise ValueError(f"unknown network '{str(name)[:40]}'; the networks are {', '.join(NETWORKS)}")
+    return NETWORKS[name]
+
+
+def _stored(data: object) -> object:
+    """Read stored settings by the class of the network that they name; ignore what version 0.1.0 stored in excess."""
+    if not isinstance(data, Mapping):
+        return data
+    cls = network_class(data.get("name", "mlp"))
+    excess = _FLAT_FIELDS - set(cls.model_fields)
+    return cls.model_validate({name: value for name, value in data.items() if name not in excess})
+
+
+AnyNetworkConfig = Annotated[SerializeAsAny[NetworkConfig], BeforeValidator(_stored)]
+"""A field of a pydantic model that holds the settings of any registered network."""
+
+
+def perceptron(config: NetworkConfig, activation: ActivationName) -> MlpConfig:
+    """Return the settings of a perceptron with the widths of another network, and its precision if it is plain."""
+    shared = {"precision", "layer_norm"} if isinstance(config, PlainConfig) else set()
+    return MlpConfig(activation=activation, **config.model_dump(include={"hidden"} | shared))
+
+
+def build_network(
+    generators: Sequence[torch.Generator],
+    inputs: int,
+    outputs: int,
+    config: NetworkConfig,
+    output_gain: float,
+    io: IoSpec | None = None,
+) -> Network:
+    """Build the network of the settings.
+
+    Args:
+        generators: one CPU generator per seed, which draw the initial weights.
+        inputs: width of an input row.
+        outputs: width of an output row.
+        config: shape.
+        output_gain: orthogonal gain of the last layer.
+        io: what the rows mean; networks with symmetry, and the average over a group, need it.
+
+    Raises:
+        ValueError: the network does not fit what is read and written there.
+    """
+    network = config.build(generators, inputs, outputs, output_gain, io)
+    if config.symmetrise is None:
+        return network
+    if io is None:
+        raise ValueError(
+            f"network.symmetrise averages over images of the observation alone, but this {config.name} reads more; "
+            "leave it off, or choose a network without memory"
+        )
+    return Symmetrised(network, io, config.symmetrise)

@@ -1,0 +1,118 @@
+"""Networks that know the widths of their rows alone: a perceptron and a recurrent network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor, nn
+
+from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
+from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.layers import GAINS, SeedGRU, SeedLayerNorm, SeedLinear, SeedMLP
+
+
+class PlainConfig(NetworkConfig):
+    """The settings of both plain networks."""
+
+    activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
+    precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
+    layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
+    separate_parts: bool = Field(
+        False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
+    )
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision as torch names it."""
+        return getattr(torch, self.precision)
+
+    @model_validator(mode="after")
+    def _fits(self) -> PlainConfig:
+        if self.separate_parts and self.symmetrise:
+            raise ValueError("separate_parts and symmetrise exclude each other; leave one of them off")
+        return self
+
+    def least_parameters(self, inputs: int) -> int:
+        """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
+        return sum(a * b for a, b in pairwise((inputs, *self.hidden)))
+
+
+class MlpConfig(PlainConfig):
+    """The settings of a perceptron."""
+
+    name: Literal["mlp"] = "mlp"
+
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build a perceptron; see `NetworkConfig.build`."""
+        return MLP(generators, inputs, outputs, self, output_gain)
+
+
+class GruConfig(PlainConfig):
+    """The settings of a recurrent network."""
+
+    recurrent: ClassVar[bool] = True
+
+    name: Literal["gru"] = "gru"
+
+    def build(
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        """Build a recurrent network; see `NetworkConfig.build`."""
+        return GRU(generators, inputs, outputs, self, output_gain)
+
+
+class MLP(SeedMLP, Memoryless):
+    """A perceptron."""
+
+    def __init__(
+        self,
+        generators: Sequence[torch.Generator],
+        inputs: int,
+        outputs: int,
+        config: PlainConfig,
+        output_gain: float,
+    ) -> None:
+        sizes = (inputs, *config.hidden, outputs)
+        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
+
+
+class GRU(Network):
+    """Hidden layers, a gated recurrent unit, a linear head: the recurrent network of the MAPPO paper."""
+
+    def __init__(
+        self,
+        generators: Sequence[torch.Generator],
+        inputs: int,
+        outputs: int,
+        config: PlainConfig,
+        output_gain: float,
+    ) -> None:
+        super().__init__()
+        width = config.hidden[-1]
+        gain = GAINS[config.activation]
+        sizes = (inputs, *config.hidden)
+        self.memory_width = width
+        self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, config.dtype)
+        self.gru = SeedGRU(generators, width, width)
+        self.norm = SeedLayerNorm(len(generators), width) if config.layer_norm else nn.Identity()
+        self.head = SeedLinear(generators, width, outputs, output_gain)
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Advance one step."""
+        memory = self.gru(self.body(x), memory)
+        return self.head(self.norm(memory)), memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
+        batch, num_steps = x.shape[1:3]
+        in_time_order = x.transpose(1, 2).flatten(1, 2)
+        projected = self.gru.input(self.body(in_time_order)).unflatten(1, (num_steps, batch))
+        memories = self.gru.unroll(projected.transpose(0, 1).contiguous(), truncation)
+        rows = memories.transpose(0, 1).flatten(1, 2)
+        return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
