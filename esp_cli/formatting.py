@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 
+NOTHING = "-"
 
-def format_mean(mean: float, sem: float | None = None, digits: int = 2) -> str:
-    """Return "mean ± standard error", or the mean alone where one sample leaves no error to state."""
+
+def format_mean(mean: float | None, sem: float | None = None, digits: int = 2) -> str:
+    """Return "mean ± standard error", the mean alone where one sample leaves no error to state, a dash for no mean."""
+    if mean is None:
+        return NOTHING
     if sem is None or not math.isfinite(sem):
         return f"{mean:.{digits}f}"
     return f"{mean:.{digits}f} ± {sem:.{digits}f}"
 
 
-def format_interval(interval: Sequence[float], digits: int = 2) -> str:
-    """Return an interval (low, high) as "[low, high]"."""
+def format_interval(interval: Sequence[float] | None, digits: int = 2) -> str:
+    """Return an interval (low, high) as "[low, high]", and a dash for none."""
+    if interval is None:
+        return NOTHING
     low, high = interval
     return f"[{low:.{digits}f}, {high:.{digits}f}]"
 

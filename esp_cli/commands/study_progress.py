@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 LINE_INTERVAL_S = 60.0
 """Seconds between two plain lines where standard error is no terminal."""
-_SAID = {"training": "training", "judging": "judging", "elsewhere": "waiting for", "finished": "finished"}
+_SAID = {"training": "training", "evaluating": "evaluating", "elsewhere": "waiting for", "finished": "finished"}
 
 
 class StudyProgress:
@@ -56,7 +56,7 @@ class StudyProgress:
         elif (now := self._clock()) - self._last_line_s >= LINE_INTERVAL_S:
             self._last_line_s = now
             for run in snapshot.runs:
-                if run.status in ("training", "judging", "elsewhere"):
+                if run.status in ("training", "evaluating", "elsewhere"):
                     console.note(f"  {run.cell.name}  {run_status(run)}")
             console.note(whole_status(snapshot))
 
@@ -77,7 +77,7 @@ class StudyProgress:
 
     def _draw(self, live: Progress, snapshot: Snapshot) -> None:
         for run in snapshot.runs:
-            name, active = run.cell.name, run.status in ("training", "judging", "elsewhere")
+            name, active = run.cell.name, run.status in ("training", "evaluating", "elsewhere")
             if active and name not in self._bars:
                 self._bars[name] = live.add_task(name, total=run.cell.config.steps, status="")
             if name in self._bars:
@@ -97,8 +97,8 @@ def share(snapshot: Snapshot) -> float:
 
 def run_status(run: Run) -> str:
     """Return steps, rate and time left of a run in one line."""
-    if run.status == "judging":
-        return "playing its judgement"
+    if run.status == "evaluating":
+        return "playing its final evaluation"
     steps = f"{console.format_count(run.step)}/{console.format_count(run.cell.config.steps)}"
     rate = run.rate
     if rate is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from esp_cli.studies.scheduler import Snapshot
     from esp_cli.studies.study import StudyFolder
 
-_BOOT = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); from esp_cli.app import main; main()"
-"""The application as a child process: it stops cleanly when the study that started it ends."""
 _MEBIBYTE = 2**20
 
 
@@ -38,6 +35,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
     from esp_cli.studies.catalogue import plan
+    from esp_cli.studies.engine_local import LocalEngine
     from esp_cli.studies.scheduler import Scheduler, available_cores
     from esp_cli.studies.study import StudyFolder
     from esp_cli.training.trainer import build_learner
@@ -61,7 +59,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
             if twin is not None:
                 folder.adopt(cell, twin)
                 console.note(f"taking over {twin} as {cell.name}")
-        scheduler = Scheduler(folder, cells, min(jobs, len(cells)), (sys.executable, "-c", _BOOT))
+        scheduler = Scheduler(folder, cells, min(jobs, len(cells)), LocalEngine())
         finished = sum(run.status == "finished" for run in scheduler.runs)
         console.note(
             f"{study.title}: {len(cells)} runs, {finished} of them finished, "

@@ -26,7 +26,7 @@ _OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
 
 
 def best_seed(trained: TrainedPolicy, episodes: int) -> int:
-    """Return the seed with the largest mean greedy return over episodes that no verdict uses."""
+    """Return the seed with the largest mean greedy return over episodes that no evaluation uses."""
     if len(trained.config.seeds) == 1:
         return trained.config.seeds[0]
     returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns

@@ -1,14 +1,15 @@
-"""The verdict on a trained policy: greedy and stochastic returns with intervals, beside the task's anchors."""
+"""The final evaluation of a trained policy: greedy and stochastic returns, beside reference policies of the task."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from esp_cli import __version__
-from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.evaluation.statistics import SeedSummary, summarise
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import (
     Controller,
@@ -22,57 +23,98 @@ from esp_cli.training.streams import generators
 from esp_cli.training.trainer import build_environment
 from esp_envs.registry import task_class
 
+Mode = Literal["greedy", "stochastic"]
+"""How a policy acts: by its most probable action, or by actions that it draws."""
 MAX_WORLDS = 4096
 """Worlds played at once, over all seeds; more episodes are played one batch after the other."""
+_STREAM = "judgement"
+"""Names the worlds. The word decides the numbers of every final evaluation, so it stays as it is."""
+Metrics = dict[str, float | None]
 
 
-def judge(trained: TrainedPolicy, episodes: int) -> dict[str, Any]:
-    """Play `episodes` episodes per seed with each controller.
+class FinalEvaluation(BaseModel):
+    """What a trained policy reaches on episodes of their own; files of older versions have fewer fields.
 
-    Returns:
-        A JSON-able dict: esp_version, task, task_version, convention, episodes, greedy and stochastic (each mean, sem,
-        ci95 over seeds, per_seed), anchors (random, heuristic, and the task's other heuristics; one number each),
-        heuristics (their names, the one called "heuristic" first), metrics (of the greedy policy) and metrics_per_seed,
-        anchor_metrics (the same of each anchor), task_settings.
+    Attributes:
+        esp_version: of the program that played.
+        task: its name.
+        task_version: of its rules.
+        convention: of its returns.
+        task_settings: under which it was played.
+        source: where the policy was found.
+        step: environment steps per seed behind the policy.
+        seeds: of the run.
+        episodes: per seed, of each policy.
+        greedy: returns of the policy.
+        stochastic: returns of the policy with drawn actions.
+        anchors: mean return of the reference policies: "random", "heuristic", and other heuristics by name.
+        heuristics: names of the task's heuristics; the first is the one called "heuristic".
+        metrics: the task's measures of the greedy policy.
+        metrics_per_seed: the same by seed.
+        anchor_metrics: the same of each reference policy.
     """
+
+    model_config = ConfigDict(frozen=True)
+
+    esp_version: str | None = None
+    task: str
+    task_version: int
+    convention: str
+    task_settings: dict[str, Any] = {}
+    source: str = ""
+    step: int
+    seeds: tuple[int, ...]
+    episodes: int
+    greedy: SeedSummary
+    stochastic: SeedSummary
+    anchors: dict[str, float]
+    heuristics: tuple[str, ...] = ()
+    metrics: Metrics
+    metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
+    anchor_metrics: dict[str, Metrics] = {}
+
+    def returns(self, mode: Mode) -> SeedSummary:
+        """Return the returns of the policy that acts in this way."""
+        return self.greedy if mode == "greedy" else self.stochastic
+
+
+def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
+    """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy."""
     seeds = trained.config.seeds
     greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
-    drawn = PolicyController(trained.policy, generators(seeds, "judgement", "noise"))
+    drawn = PolicyController(trained.policy, generators(seeds, _STREAM, "noise"))
     stochastic = play_batches(trained, drawn, "stochastic", episodes)
     names = task_class(trained.config.task).heuristics
     anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
         anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
-    return {
-        "esp_version": __version__,
-        "task": trained.config.task,
-        "task_version": trained.spec.version,
-        "convention": trained.spec.convention,
-        "task_settings": trained.config.task_settings,
-        "source": str(trained.source),
-        "step": trained.step,
-        "seeds": list(seeds),
-        "episodes": episodes,
-        "greedy": summary(greedy.returns),
-        "stochastic": summary(stochastic.returns),
-        "anchors": {name: float(played.returns.mean()) for name, played in anchors.items()},
-        "heuristics": list(names),
-        "metrics": _means(greedy),
-        "metrics_per_seed": {name: value.mean(1).tolist() for name, value in greedy.metrics.items()},
-        "anchor_metrics": {name: _means(played) for name, played in anchors.items()},
-    }
+    return FinalEvaluation(
+        esp_version=__version__,
+        task=trained.config.task,
+        task_version=trained.spec.version,
+        convention=trained.spec.convention,
+        task_settings=trained.config.task_settings,
+        source=str(trained.source),
+        step=trained.step,
+        seeds=seeds,
+        episodes=episodes,
+        greedy=summarise_returns(greedy.returns),
+        stochastic=summarise_returns(stochastic.returns),
+        anchors={name: float(played.returns.mean()) for name, played in anchors.items()},
+        heuristics=names,
+        metrics=_means(greedy),
+        metrics_per_seed={name: tuple(value.mean(1).tolist()) for name, value in greedy.metrics.items()},
+        anchor_metrics={name: _means(played) for name, played in anchors.items()},
+    )
 
 
-def summary(returns: Tensor) -> dict[str, Any]:
-    """Return mean, s.e.m. and 95 % bootstrap interval over seeds of returns [S, episodes], and the seeds' means."""
-    per_seed = returns.mean(1).double().cpu().numpy()
-    mean, sem = mean_and_sem(per_seed)
-    interval = bootstrap_interval(per_seed)
-    return {"mean": mean, "sem": sem, "ci95": interval, "per_seed": per_seed.tolist()}
+def summarise_returns(returns: Tensor) -> SeedSummary:
+    """Summarise returns [S, episodes] by the mean of each seed."""
+    return summarise(returns.mean(1).double().cpu().numpy())
 
 
-def _means(episodes: Episodes) -> dict[str, float]:
+def _means(episodes: Episodes) -> Metrics:
     return {name: float(value.mean()) for name, value in episodes.metrics.items()}
 
 
@@ -88,7 +130,7 @@ def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, ep
     parts = []
     batch = max(1, min(episodes, MAX_WORLDS // len(trained.config.seeds)))
     for begin in range(0, episodes, batch):
-        env = build_environment(trained.config, min(batch, episodes - begin), "judgement", stream, begin)
+        env = build_environment(trained.config, min(batch, episodes - begin), _STREAM, stream, begin)
         parts.append(play(env, controller))
     return Episodes(
         torch.cat([p.returns for p in parts], 1),

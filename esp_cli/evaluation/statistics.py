@@ -1,4 +1,4 @@
-"""Statistics over seeds: means with intervals, comparisons of two groups of seeds, numbers read off learning curves.
+"""Statistics over seeds: means with intervals, comparisons of two groups of seeds.
 
 A sample is one number per seed, never one per episode: episodes of one seed share its policy and say nothing about how
 another seed would turn out. Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so
@@ -19,16 +19,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
-from scipy.integrate import trapezoid
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-_CURVE_RESAMPLES = 2_000
 _GENERATOR_SEED = 0
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
-Band = Literal["ci95", "sem"]
 
 
 @dataclass(frozen=True)
@@ -45,16 +42,29 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class StepsToThreshold:
-    """Env steps per seed at which a threshold is reached first.
+class SeedSummary:
+    """One number per seed, and what they say together; the numbers of seeds that stopped are left out.
 
     Attributes:
-        of_mean: by the mean over seeds, or None where it never is.
-        per_seed: by each seed, likewise.
+        mean: over seeds; None where every seed stopped.
+        sem: standard error of the mean; None for one seed.
+        ci95: 95 % bootstrap interval of the mean, or None where the bootstrap cannot tell.
+        per_seed: the numbers [S]; None where a seed stopped.
     """
 
-    of_mean: int | None
-    per_seed: tuple[int | None, ...]
+    mean: float | None
+    sem: float | None
+    ci95: Interval | None
+    per_seed: tuple[float | None, ...]
+
+
+def summarise(values: ArrayLike) -> SeedSummary:
+    """Summarise one number per seed [S], NaN where a seed stopped."""
+    numbers = np.asarray(values, dtype=np.float64)
+    good = numbers[np.isfinite(numbers)]
+    per_seed = tuple(float(x) if np.isfinite(x) else None for x in numbers)
+    mean, sem = mean_and_sem(good) if good.size else (None, None)
+    return SeedSummary(mean, sem, bootstrap_interval(good) if good.size else None, per_seed)
 
 
 def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
@@ -192,45 +202,6 @@ def leader(
     return "first" if mean > other_mean else "second"
 
 
-def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> StepsToThreshold:
-    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
-
-    A value that is not finite, as of a seed that was stopped, reaches nothing.
-
-    Args:
-        steps: env steps per seed, ascending [K].
-        values: [K, S]; higher is better.
-        threshold: e.g. a return.
-
-    Raises:
-        ValueError: shapes that do not fit, or steps that do not ascend.
-    """
-    at, curves = _curves(steps, values)
-    curves = np.where(np.isfinite(curves), curves, np.nan)
-
-    def first(reached: NDArray[np.bool_]) -> int | None:
-        return int(at[np.argmax(reached)]) if reached.any() else None
-
-    per_seed = tuple(first(curve >= threshold) for curve in curves.T)
-    return StepsToThreshold(first(curves.mean(axis=1) >= threshold), per_seed)
-
-
-def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
-    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S].
-
-    Args:
-        steps: env steps per seed, ascending [K], K > 1.
-        values: [K, S]; NaN gives that seed NaN.
-
-    Raises:
-        ValueError: shapes that do not fit, steps that do not ascend, or fewer than two of them.
-    """
-    at, curves = _curves(steps, values)
-    if at.size < 2:
-        raise ValueError("the area under a curve needs two evaluations or more")
-    return np.asarray(trapezoid(curves, at, axis=0) / (at[-1] - at[0]), dtype=np.float64)
-
-
 def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
     """Return (value - random) / (heuristic - random): 0 is the random policy, 1 the heuristic one.
 
@@ -249,46 +220,17 @@ def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
     return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
 
 
-def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, Floats]:
-    """Return mean, lower and upper edge of a learning curve over seeds, each [K].
-
-    The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
-    is not finite all three are NaN, so that a stopped seed leaves a gap instead of a mean over the survivors.
-
-    Args:
-        values: [K, S].
-        band: 95 % bootstrap interval, or mean -+ one standard error.
-
-    Raises:
-        ValueError: values that are no [K, S].
-    """
-    curves = np.asarray(values, dtype=np.float64)
-    if curves.ndim != 2 or curves.shape[1] == 0:
-        raise ValueError(f"learning curves are evaluations by seeds [K, S], not of shape {list(curves.shape)}")
-    whole = np.isfinite(curves).all(axis=1)
-    mean = np.full(len(curves), np.nan)
-    mean[whole] = curves[whole].mean(axis=1)
-    low, high = mean.copy(), mean.copy()
-    if curves.shape[1] > 1 and whole.any():
-        if band == "sem":
-            sem = stats.sem(curves[whole], axis=1)
-            low[whole], high[whole] = mean[whole] - sem, mean[whole] + sem
-        else:
-            interval = _bootstrap((curves[whole],), np.mean, _CURVE_RESAMPLES)
-            low[whole], high[whole] = interval.low, interval.high
-    return mean, low, high
-
-
 def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Interval | None:
     """Return the percentile bootstrap interval of a statistic of independent samples, or None where it cannot tell."""
     if any(sample.size < 2 for sample in samples):
         return None
-    interval = _bootstrap(samples, statistic, RESAMPLES)
+    interval = bootstrap(samples, statistic)
     low, high = float(interval.low), float(interval.high)
     return (low, high) if low < high else None
 
 
-def _bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamples: int) -> Any:
+def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamples: int = RESAMPLES) -> Any:
+    """Return scipy's percentile interval of a statistic of independent samples, with this module's generator."""
     return stats.bootstrap(
         samples,
         statistic,
@@ -337,14 +279,3 @@ def _pair(x: ArrayLike, y: ArrayLike, paired: bool) -> tuple[Floats, Floats]:
     if paired and first.size != second.size:
         raise ValueError(f"paired groups have to have the same seeds, not {first.size} and {second.size} of them")
     return first, second
-
-
-def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
-    at, curves = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
-    if at.ndim != 1 or curves.ndim != 2 or curves.shape[0] != at.size or curves.size == 0:
-        raise ValueError(
-            f"a learning curve is steps [K] and values [K, S], not {list(at.shape)} and {list(curves.shape)}"
-        )
-    if not (np.diff(at) > 0).all():
-        raise ValueError("the steps of a learning curve have to ascend")
-    return at, curves

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from esp_cli.evaluation.statistics import curve_band
+from esp_cli.evaluation.curve_statistics import curve_band
 from esp_cli.formatting import format_count
 from esp_cli.reporting.panels import Panel
 from esp_cli.reporting.plots import appearance

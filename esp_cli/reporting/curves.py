@@ -11,14 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_cli.evaluation.statistics import (
-    area_under_curve,
-    bootstrap_interval,
-    difference,
-    mean_and_sem,
-    probability_of_improvement,
-    steps_to_threshold,
-)
+from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
+from esp_cli.evaluation.statistics import bootstrap_interval, difference, mean_and_sem, probability_of_improvement
 from esp_cli.reporting.plots import Curve, learning_curves
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config

@@ -2,7 +2,7 @@
 
 The form is that of the tool's public README. It wants the same number of evaluations of every task of an environment,
 so the runs of one number of steps are an environment of their own. Each list holds one number, the mean over the
-evaluation's episodes; `absolute_metrics` are those of the judgement of the trained policy.
+evaluation's episodes; `absolute_metrics` are those of the final evaluation of the trained policy.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.statistics import Band, bootstrap_interval, mean_and_sem
+from esp_cli.evaluation.curve_statistics import Band
+from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.reporting.plots import Curve, appearance, draw_curve, written_figure
 
 _PANEL_INCHES = (4.0, 3.2)

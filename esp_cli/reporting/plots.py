@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.statistics import Band, bootstrap_interval, curve_band, mean_and_sem
+from esp_cli.evaluation.curve_statistics import Band, curve_band
+from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito, "Color Universal Design", 2008, without the yellow, which is too light for lines on white."""

@@ -15,19 +15,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
+from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.statistics import (
     Estimate,
     aggregate,
-    area_under_curve,
     average_improvement,
     interquartile_mean,
     leader,
     normalise,
-    steps_to_threshold,
 )
 from esp_cli.reporting.curves import Mode, RunCurve, read_curve, summarise, versus
 from esp_cli.studies.paper import NUM_SEEDS, reported
-from esp_cli.studies.study import Cell, Study, StudyFolder, read_judgement
+from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
 from esp_cli.training.metrics import MetricsError, read_last_row
 
 RESULTS_FORMAT = "esp-results"
@@ -49,7 +49,7 @@ def collect(folder: StudyFolder, mode: Mode = "greedy", thresholds: Sequence[flo
     """
     study = folder.study
     curves = {cell.name: read_curve_of(folder.run_path(cell), cell, mode) for cell in study.cells}
-    judged = {cell.name: read_judgement(folder.run_path(cell)) for cell in study.cells if folder.is_finished(cell)}
+    judged = {cell.name: read_evaluation(folder.run_path(cell)) for cell in study.cells if folder.is_finished(cell)}
     steps = {
         cell.name: int(read_last_row(folder.run_path(cell) / "metrics.jsonl").get("step", 0)) for cell in study.cells
     }
@@ -116,7 +116,7 @@ def read_curve_of(run: Path, cell: Cell, mode: Mode) -> RunCurve | None:
 def _results(
     study: Study,
     curves: Mapping[str, RunCurve | None],
-    judged: Mapping[str, dict[str, Any] | None],
+    judged: Mapping[str, FinalEvaluation | None],
     steps: Mapping[str, int],
     mode: Mode,
     thresholds: Sequence[float],
@@ -166,15 +166,15 @@ def _results(
     return results
 
 
-def _judged(verdicts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a judgement says, small enough to be kept."""
+def _judged(found: FinalEvaluation) -> dict[str, Any]:
+    """Return what a final evaluation says, small enough to be kept."""
     return {
-        "esp_version": verdicts.get("esp_version"),
-        "task_version": verdicts["task_version"],
-        "convention": verdicts["convention"],
-        "returns": {mode: _rounded(verdicts[mode]["per_seed"]) for mode in ("greedy", "stochastic")},
-        "anchors": {name: round(value, _DIGITS) for name, value in verdicts["anchors"].items()},
-        "metrics": {name: round(value, _DIGITS) for name, value in verdicts["metrics"].items()},
+        "esp_version": found.esp_version,
+        "task_version": found.task_version,
+        "convention": found.convention,
+        "returns": {"greedy": _rounded(found.greedy.per_seed), "stochastic": _rounded(found.stochastic.per_seed)},
+        "anchors": {name: round(value, _DIGITS) for name, value in found.anchors.items()},
+        "metrics": dict(zip(found.metrics, _rounded(found.metrics.values()), strict=True)),
     }
 
 

@@ -56,7 +56,7 @@ class Request:
         preset: of every run.
         overrides: dotted names to values; those of an algorithm or a task concern its runs alone.
         device: "cpu" or "cuda".
-        episodes: per seed, of the judgement of a trained policy.
+        episodes: per seed, of the final evaluation of a trained policy.
         command: the command line behind it.
     """
 

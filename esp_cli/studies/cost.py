@@ -24,8 +24,8 @@ _PROBED_EPISODES = 8
 """Of an evaluation, at most; longer ones take their share more."""
 _CHECKPOINTS = 3
 """Two are kept while a third is written."""
-_JUDGED = 3
-"""A judgement plays greedily, with drawn actions, at random, and with each heuristic of the task."""
+_POLICIES = 3
+"""A final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Cost:
 
     Attributes:
         training_s: for all of its steps, evaluations included.
-        judgement_s: for its judgement.
+        evaluation_s: for its final evaluation.
         disk_bytes: of what stays when it is done.
         peak_bytes: of what lies on the disk at most while it trains.
     """
 
     training_s: float
-    judgement_s: float
+    evaluation_s: float
     disk_bytes: int
     peak_bytes: int
 
@@ -50,7 +50,7 @@ def probe(config: RunConfig, episodes: int) -> Cost:
 
     Args:
         config: of the run.
-        episodes: per seed, of its judgement.
+        episodes: per seed, of its final evaluation.
 
     Raises:
         ValueError: its parts do not go together.
@@ -82,7 +82,7 @@ def _probe(config: RunConfig, episodes: int) -> Cost:
     kept = weights + _bytes(learner, complete=True) + iterations * row
     return Cost(
         training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
-        judgement_s=(_JUDGED + len(task_class(config.task).heuristics)) * episodes * per_episode,
+        evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * episodes * per_episode,
         disk_bytes=kept,
         peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + _replay_to_come(config, learner)),
     )

@@ -1,9 +1,10 @@
-"""Child processes that train and judge the runs of a study, none outliving the process that started it."""
+"""The engine of this machine: a child process for each job, none of which outlives the process that started it."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,40 +18,52 @@ _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 _PARENT = "ESP_PARENT_PROCESS"
 _TAIL_BYTES = 8192
+_BOOT = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); from esp_cli.app import main; main()"
+APPLICATION = (sys.executable, "-c", _BOOT)
+"""The application as a child process: it stops cleanly when the study that started it ends."""
 
 
-class Worker:
-    """One command line in a process of its own; what it says is appended to a file.
+class LocalEngine:
+    """Starts every job in a process of its own on this machine.
 
     Args:
-        program: what is started; it has to call `follow_parent` first.
-        arguments: of the program.
-        log: file that takes what it prints.
-        threads: of its matrix products.
+        program: the application as a command line; it has to call `follow_parent` first.
+        threads: of each job's matrix products.
     """
 
-    def __init__(self, program: Sequence[str], arguments: Sequence[str], log: Path, threads: int = 1) -> None:
-        self.log = log
+    def __init__(self, program: Sequence[str] = APPLICATION, threads: int = 1) -> None:
+        self.program, self.threads = tuple(program), threads
+
+    def start(self, arguments: Sequence[str], log: Path) -> LocalJob:
+        """Start the application with these arguments; what it prints is appended to the log."""
         roots = [str(Path(__file__).parents[2]), str(Path(esp_envs.__path__[0]).parent)]
         path = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = os.environ | {
-            "OMP_NUM_THREADS": str(threads),
+            "OMP_NUM_THREADS": str(self.threads),
             "PYTHONPATH": path,
             "PYTHONSAFEPATH": "1",  # a file called random.py in the user's folder is not imported
             "PYTHONUNBUFFERED": "1",
             _PARENT: str(os.getpid()),
         }
         with os.fdopen(open_own(log, os.O_WRONLY | os.O_APPEND), "ab") as file:
-            file.write(f"$ esp {' '.join(arguments)}\n".encode())
+            file.write(f"$ {shlex.join(['esp', *arguments])}\n".encode())
             file.flush()
-            self._process = subprocess.Popen(
-                [*program, *arguments],
+            process = subprocess.Popen(
+                [*self.program, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=file,
                 env=environment,
-                start_new_session=True,  # Ctrl-C reaches the study alone, which then asks its workers to stop
+                start_new_session=True,  # Ctrl-C reaches the study alone, which then asks its jobs to stop
             )
+        return LocalJob(process, log)
+
+
+class LocalJob:
+    """A process of this machine that runs one command line."""
+
+    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
+        self._process, self.log = process, log
 
     @property
     def pid(self) -> int:
@@ -58,22 +71,22 @@ class Worker:
         return self._process.pid
 
     def poll(self) -> int | None:
-        """Return the exit code, negative for a signal, or None while it runs."""
+        """Return the exit code, negative for a signal, or None while the job runs."""
         return self._process.poll()
 
     def ask_to_stop(self) -> None:
-        """Ask it to end after its iteration, with a checkpoint."""
+        """Ask the job to end after its iteration, with a checkpoint."""
         if self.poll() is None:
             self._process.terminate()
 
     def kill(self) -> None:
-        """End it at once and wait until it is gone."""
+        """End the job at once and wait until it is gone."""
         if self.poll() is None:
             self._process.kill()
         self._process.wait()
 
     def last_words(self) -> str:
-        """Return why it failed: its last error message, or its last line."""
+        """Return why the job failed: its last error message, or its last line."""
         code = self.poll()
         if code is not None and code < 0:
             return f"ended by {signal.Signals(-code).name}"
@@ -86,7 +99,7 @@ class Worker:
 
 
 def follow_parent() -> None:
-    """Let this process stop cleanly when the one that started it ends; for whoever a Worker starts.
+    """Let this process stop cleanly when the one that started it ends; for the jobs of a LocalEngine.
 
     Where the operating system does not tell of a parent's end (it does on Linux), the process goes on to its own end; a
     study that is started again meanwhile finds the run in use and waits for it.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from esp_cli.studies.cost import probe
-from esp_cli.studies.scheduler import Run, Scheduler, Status, makespan
+from esp_cli.studies.scheduler import Run, Status, makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.config import RunConfig
 
@@ -96,8 +96,9 @@ def forecast(
     """
     study = folder.study
     found = []
-    for run in Scheduler(folder, study.cells, jobs, ()).runs:
-        twin = folder.run_path(run.cell) if run.status == "finished" else folder.find_twin(run.cell, others)
+    for cell in study.cells:
+        run = Run.found(folder, cell)
+        twin = folder.run_path(cell) if run.status == "finished" else folder.find_twin(cell, others)
         found.append(_finished(run, twin) if twin is not None else _measured(run, study.episodes))
         listener(len(found))
     return Forecast(study.kind, study.title, folder.path, jobs, tuple(found))
@@ -120,13 +121,13 @@ def _finished(run: Run, path: Path) -> RunForecast:
 def _measured(run: Run, episodes: int) -> RunForecast:
     config = run.cell.config
     cost = probe(config, episodes)
-    left = cost.training_s * (1 - run.step / config.steps) + cost.judgement_s
+    left = cost.training_s * (1 - run.step / config.steps) + cost.evaluation_s
     return RunForecast(
         name=run.cell.name,
         status=run.status,
         step=run.step,
         seconds_left=left,
-        seconds=cost.training_s + cost.judgement_s,
+        seconds=cost.training_s + cost.evaluation_s,
         disk_bytes=cost.disk_bytes,
         peak_bytes=cost.peak_bytes,
         config=config,

@@ -12,14 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from esp_cli.studies.engine_local import Worker
+from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.study import Cell, StudyFolder
 from esp_cli.training.locking import is_held
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
-Status = Literal["waiting", "training", "judging", "elsewhere", "finished", "failed", "stopped"]
-ACTIVE: tuple[Status, ...] = ("training", "judging", "elsewhere")
+Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
+ACTIVE: tuple[Status, ...] = ("training", "evaluating", "elsewhere")
 POLL_S = 0.5
 """Seconds between two looks at the running processes."""
 
@@ -43,7 +43,23 @@ class Run:
     trained_s: float = 0.0
     resumed_at: int = 0
     message: str = ""
-    worker: Worker | None = field(default=None, repr=False)
+    job: Job | None = field(default=None, repr=False)
+
+    @classmethod
+    def found(cls, folder: StudyFolder, cell: Cell) -> Run:
+        """Return where a cell stands by its folder alone."""
+        run = cls(cell, "finished" if folder.is_finished(cell) else "waiting")
+        run.look(folder)
+        run.resumed_at = run.step
+        return run
+
+    def look(self, folder: StudyFolder) -> None:
+        """Read from its folder how far the run is; rows past its last checkpoint may go when it is resumed."""
+        row = read_last_row(folder.run_path(self.cell) / "metrics.jsonl")
+        self.step = min(int(row.get("step", 0)), self.cell.config.steps)
+        elapsed = row.get("time/elapsed_s")
+        if isinstance(elapsed, int | float):
+            self.trained_s = float(elapsed)
 
     @property
     def rate(self) -> float | None:
@@ -73,22 +89,18 @@ Listener = Callable[[Snapshot], bool]
 
 
 class Scheduler:
-    """Runs the cells of a study side by side, each trained, then judged, in processes of one thread each.
+    """Runs the cells of a study side by side; an engine trains each of them, then evaluates it.
 
     Args:
         folder: of the study, held by the caller's lock.
         cells: those of its cells that are wanted, in order.
-        jobs: processes at once.
-        program: the application as a command line to which arguments are added.
+        jobs: at once.
+        engine: starts them.
     """
 
-    def __init__(self, folder: StudyFolder, cells: Sequence[Cell], jobs: int, program: Sequence[str]) -> None:
-        self.folder, self.jobs, self.program = folder, jobs, tuple(program)
-        self.runs = [Run(cell) for cell in cells]
-        for run in self.runs:
-            self._look(run)
-            run.resumed_at = run.step
-            run.status = "finished" if folder.is_finished(run.cell) else "waiting"
+    def __init__(self, folder: StudyFolder, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
+        self.folder, self.jobs, self.engine = folder, jobs, engine
+        self.runs = [Run.found(folder, cell) for cell in cells]
 
     def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
         """Run everything that is not finished.
@@ -118,8 +130,8 @@ class Scheduler:
                     self._follow(run, going)
         finally:
             for run in self.runs:  # after a second Ctrl-C, or a bug
-                if run.worker is not None:
-                    run.worker.kill()
+                if run.job is not None:
+                    run.job.kill()
 
     def left_s(self) -> float | None:
         """Return the seconds until the last run is trained, from what the runs so far took; None where none tells."""
@@ -154,7 +166,7 @@ class Scheduler:
     def _start(self, run: Run) -> None:
         """Start the next process of a run, if anything is left to do."""
         cell, folder = run.cell, self.folder
-        run.worker = None
+        run.job = None
         if folder.is_finished(cell):
             run.status = "finished"
             return
@@ -168,20 +180,20 @@ class Scheduler:
             return
         path = str(run_folder.path)
         if folder.is_trained(cell):
-            run.status = "judging"
+            run.status = "evaluating"
             arguments = ["eval", path, "--episodes", str(folder.study.episodes)]
-            arguments += ["--json", str(folder.judgement_path(cell))]
+            arguments += ["--json", str(folder.evaluation_path(cell))]
         else:
             run.status, arguments = "training", ["train", "--resume", path]
-        run.worker = Worker(self.program, arguments, folder.log_path(cell))
+        run.job = self.engine.start(arguments, folder.log_path(cell))
 
     def _follow(self, run: Run, going: bool) -> None:
         """Look at a run: how far it is, and whether its process has ended."""
-        self._look(run)
-        if run.worker is None:  # in use by a process that is not ours
+        run.look(self.folder)
+        if run.job is None:  # in use by a process that is not ours
             if not is_held(RunFolder.open(self.folder.run_path(run.cell)).lock_path):
                 run.status = "waiting"
-        elif (code := run.worker.poll()) is not None:
+        elif (code := run.job.poll()) is not None:
             done = self.folder.is_trained if run.status == "training" else self.folder.is_finished
             if code == 0 and done(run.cell):
                 if going:
@@ -189,27 +201,19 @@ class Scheduler:
                 else:
                     run.status = "finished" if self.folder.is_finished(run.cell) else "stopped"
             elif going:
-                run.status, run.message = "failed", run.worker.last_words()
+                run.status, run.message = "failed", run.job.last_words()
             else:
                 run.status = "stopped"
             if run.status not in ACTIVE:
-                run.worker = None
-        if not going and run.worker is None and run.status in ("elsewhere", "waiting"):
+                run.job = None
+        if not going and run.job is None and run.status in ("elsewhere", "waiting"):
             run.status = "stopped"
-
-    def _look(self, run: Run) -> None:
-        """Read from its folder how far a run is; rows past its last checkpoint may go when it is resumed."""
-        row = read_last_row(self.folder.run_path(run.cell) / "metrics.jsonl")
-        run.step = min(int(row.get("step", 0)), run.cell.config.steps)
-        elapsed = row.get("time/elapsed_s")
-        if isinstance(elapsed, int | float):
-            run.trained_s = float(elapsed)
 
     def _stop(self) -> None:
         """Ask every process to stop; what waits stays as it is."""
         for run in self.runs:
-            if run.worker is not None:
-                run.worker.ask_to_stop()
+            if run.job is not None:
+                run.job.ask_to_stop()
             elif run.status in ("waiting", "elsewhere"):
                 run.status = "stopped"
 

@@ -4,33 +4,35 @@ Layout::
 
     study.json          what is to be run, and the command that said so
     runs/NAME/          one run folder per cell, see esp_cli.training.run_folder
-    runs/NAME/judgement.json   the trained policies beside the anchors, on episodes of their own
-    runs/NAME/log.txt   what the processes that trained and judged it said
+    runs/NAME/final-evaluation.json   the trained policies beside the reference policies, on episodes of their own
+                        (judgement.json in folders of versions before 0.2)
+    runs/NAME/log.txt   what the processes that trained and evaluated it said
     study.lock          held by the process that works on the study
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli import __version__
-from esp_cli.files.documents import DocumentFormat
+from esp_cli.evaluation.final import FinalEvaluation
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object
 from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_own
+from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
-_STUDY, _RUNS, _LOCK, _JUDGEMENT, _LOG = "study.json", "runs", "study.lock", "judgement.json", "log.txt"
+_STUDY, _RUNS, _LOCK, _LOG = "study.json", "runs", "study.lock", "log.txt"
+_FINAL, _OLD_FINAL = "final-evaluation.json", "judgement.json"
 
 
 class StudyError(ValueError):
@@ -69,7 +71,7 @@ class Study(BaseModel):
         kind: what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand.
         title: one line for people.
         command: the command that plans it again; one a line where several added to it.
-        episodes: per seed, of the judgement of a trained policy.
+        episodes: per seed, of the final evaluation of a trained policy.
         esp_version: of the program that planned it.
         cells: in the order in which they are run and shown.
     """
@@ -186,9 +188,9 @@ class StudyFolder:
         """Return the file that the processes of a cell write to."""
         return self.run_path(cell) / _LOG
 
-    def judgement_path(self, cell: Cell) -> Path:
-        """Return the file that holds the judgement of a cell's trained policy."""
-        return self.run_path(cell) / _JUDGEMENT
+    def evaluation_path(self, cell: Cell) -> Path:
+        """Return the file that the final evaluation of a cell's trained policy is written to."""
+        return self.run_path(cell) / _FINAL
 
     def prepare(self, cell: Cell) -> RunFolder:
         """Make the run folder of a cell, or open the one that is there.
@@ -205,7 +207,7 @@ class StudyFolder:
         return folder
 
     def find_twin(self, cell: Cell, others: Sequence[StudyFolder]) -> Path | None:
-        """Return the folder of a finished run of the same configuration, judged on as many episodes, in other studies.
+        """Return the folder of a finished run of the same configuration and number of episodes in other studies.
 
         None where there is none, or where the cell's own run has begun.
         """
@@ -235,13 +237,13 @@ class StudyFolder:
 
     def is_finished(self, cell: Cell) -> bool:
         """Return whether nothing is left to do for a cell."""
-        return self.is_trained(cell) and read_judgement(self.run_path(cell)) is not None
+        return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
 
 
-def read_judgement(run: Path) -> dict[str, Any] | None:
-    """Read the judgement of the trained policy in a run folder; None where there is none, or half of one."""
-    try:
-        found = json.loads((run / _JUDGEMENT).read_bytes())
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None
+def read_evaluation(run: Path) -> FinalEvaluation | None:
+    """Read the final evaluation of the trained policy in a run folder; None where there is none, or half of one."""
+    for name in (_FINAL, _OLD_FINAL):
+        with contextlib.suppress(OSError, ValueError):
+            text = read_regular(run / name, MAX_DOCUMENT_BYTES) or b""
+            return FinalEvaluation.model_validate(parse_object(text, "text"))
+    return None

@@ -15,6 +15,7 @@ import pytest
 from esp_cli import console
 from esp_cli.commands.study_options import parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.locking import acquire
@@ -149,7 +150,7 @@ def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = StudyFolder.create(tmp_path / "s", small_study())
-    plain, esp_run = runs = Scheduler(folder, folder.study.cells, 1, stand_in()).runs
+    plain, esp_run = runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
     now = [0.0]
     with StudyProgress(clock=lambda: now[0]) as progress:
         plain.status = "training"
@@ -180,7 +181,7 @@ def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     terminal = console.Console(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
     monkeypatch.setattr(console, "err", terminal)
     folder = StudyFolder.create(tmp_path / "s", small_study())
-    runs = Scheduler(folder, folder.study.cells, 1, stand_in()).runs
+    runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
     runs[0].status, runs[0].step, runs[0].trained_s = "training", 100, 10.0
     with StudyProgress() as progress:
         progress.update(Snapshot(runs, 25.0))

@@ -15,7 +15,7 @@ from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
 from esp_cli.deploy import box
 from esp_cli.deploy.box import MANIFEST, Entry, box_folder, config_of, find, load_entry, open_policy, read_box
 from esp_cli.deploy.bundling import add_to_box, best_seed, command_of, play_greedily, score_of
-from esp_cli.evaluation.final import judge
+from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import resolve_config
 from tests.deploy.policies import drawn_policy
 
@@ -102,7 +102,7 @@ def test_what_is_put_in_is_found_and_plays_the_same(small_box: Path) -> None:
     alone = load_entry(entry, small_box)
     assert alone.config.seeds == (entry.seed,)
     assert score_of(play_greedily(alone, 4)) == entry.score
-    assert judge(alone, 4)["greedy"]["mean"] == pytest.approx(entry.score.mean)
+    assert evaluate(alone, 4).greedy.mean == pytest.approx(entry.score.mean)
 
 
 def test_the_seed_is_the_one_that_did_best(small_box: Path) -> None:

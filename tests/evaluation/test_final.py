@@ -1,4 +1,4 @@
-"""The verdict on a policy: numbers by hand, anchors, and batches that depend on seeds alone."""
+"""The final evaluation of a policy: numbers by hand, anchors, and batches that depend on seeds alone."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from esp_cli.evaluation import final
-from esp_cli.evaluation.final import judge, summary
+from esp_cli.evaluation.final import FinalEvaluation, evaluate, summarise_returns
+from esp_cli.evaluation.statistics import SeedSummary
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import HeuristicController, play
@@ -27,53 +28,51 @@ def untrained(tmp_path, seeds=(3, 7), **choice) -> TrainedPolicy:
 
 def test_the_summary_by_hand():
     # episodes 1 3 and 5 7: seeds 2 and 6, mean 4, s.e.m. |2 - 6| / 2; the bootstrap of two seeds reaches from 2 to 6
-    assert summary(torch.tensor([[1.0, 3.0], [5.0, 7.0]])) == {
-        "mean": 4.0,
-        "sem": pytest.approx(2.0),
-        "ci95": (2.0, 6.0),
-        "per_seed": [2.0, 6.0],
-    }
-    assert summary(torch.tensor([[1.0, 3.0]])) == {"mean": 2.0, "sem": None, "ci95": None, "per_seed": [2.0]}
+    two = summarise_returns(torch.tensor([[1.0, 3.0], [5.0, 7.0]]))
+    assert two == SeedSummary(mean=4.0, sem=pytest.approx(2.0), ci95=(2.0, 6.0), per_seed=(2.0, 6.0))
+    one = summarise_returns(torch.tensor([[1.0, 3.0]]))
+    assert one == SeedSummary(mean=2.0, sem=None, ci95=None, per_seed=(2.0,))
 
 
-def test_a_verdict_states_what_was_judged_and_is_json(tmp_path):
+def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     trained = untrained(tmp_path)
-    result = judge(trained, 3)
-    assert (result["task"], result["task_version"], result["convention"]) == ("navigation", 1, trained.spec.convention)
-    assert (result["source"], result["step"], result["seeds"], result["episodes"]) == (str(tmp_path), 0, [3, 7], 3)
-    assert result["greedy"]["per_seed"] != result["stochastic"]["per_seed"]
-    assert json.loads(json.dumps(result, allow_nan=False))["anchors"].keys() == {"random", "heuristic", "cover"}
-    assert result["heuristics"] == ["greedy", "cover"]
-    assert result["anchor_metrics"].keys() == result["anchors"].keys()
-    assert all(metrics.keys() == result["metrics"].keys() for metrics in result["anchor_metrics"].values())
-    for name, values in result["metrics_per_seed"].items():
-        assert sum(values) / len(values) == pytest.approx(result["metrics"][name])
-    assert result["task_settings"]["num_agents"] == 3
-    assert judge(trained, 3) == result, "the same every time"
+    result = evaluate(trained, 3)
+    assert (result.task, result.task_version, result.convention) == ("navigation", 1, trained.spec.convention)
+    assert (result.source, result.step, result.seeds, result.episodes) == (str(tmp_path), 0, (3, 7), 3)
+    assert result.greedy.per_seed != result.stochastic.per_seed
+    assert json.loads(result.model_dump_json())["anchors"].keys() == {"random", "heuristic", "cover"}
+    assert result.heuristics == ("greedy", "cover")
+    assert result.anchor_metrics.keys() == result.anchors.keys()
+    assert all(metrics.keys() == result.metrics.keys() for metrics in result.anchor_metrics.values())
+    for name, values in result.metrics_per_seed.items():
+        assert sum(values) / len(values) == pytest.approx(result.metrics[name])
+    assert result.task_settings["num_agents"] == 3
+    assert evaluate(trained, 3) == result, "the same every time"
+    assert FinalEvaluation.model_validate_json(result.model_dump_json()) == result
 
 
 def test_anchors_lie_where_the_card_says(tmp_path):
-    anchors = judge(untrained(tmp_path), 256)["anchors"]
+    anchors = evaluate(untrained(tmp_path), 256).anchors
     # the card of navigation: random -218, greedy -112; a mean over 512 episodes has an error of about 2
     assert anchors["random"] == pytest.approx(-218, abs=8)
     assert anchors["heuristic"] == pytest.approx(-112, abs=5)
 
 
-def test_a_seed_is_judged_alone_as_among_others(tmp_path):
-    both, first, second = (judge(untrained(tmp_path, seeds), 2) for seeds in ((3, 7), (3,), (7,)))
+def test_a_seed_is_evaluated_alone_as_among_others(tmp_path):
+    both, first, second = (evaluate(untrained(tmp_path, seeds), 2) for seeds in ((3, 7), (3,), (7,)))
     for mode in ("greedy", "stochastic"):
-        alone = first[mode]["per_seed"] + second[mode]["per_seed"]
-        assert both[mode]["per_seed"] == pytest.approx(alone, rel=1e-5)
+        alone = first.returns(mode).per_seed + second.returns(mode).per_seed
+        assert both.returns(mode).per_seed == pytest.approx(alone, rel=1e-5)
     for name in ("random", "heuristic"):
-        mean = (first["anchors"][name] + second["anchors"][name]) / 2
-        assert both["anchors"][name] == pytest.approx(mean, rel=1e-5)
-    assert first["anchors"]["random"] != second["anchors"]["random"]
+        mean = (first.anchors[name] + second.anchors[name]) / 2
+        assert both.anchors[name] == pytest.approx(mean, rel=1e-5)
+    assert first.anchors["random"] != second.anchors["random"]
 
 
 def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypatch):
     trained = untrained(tmp_path)
     monkeypatch.setattr(final, "MAX_WORLDS", 4)  # two worlds for each of the two seeds
-    result = judge(trained, 5)
+    result = evaluate(trained, 5)
     streams = [(0, 2), (2, 2), (4, 1)]  # first episode and number of worlds of each batch
     parts = [
         play(build_environment(trained.config, worlds, "judgement", "heuristic", begin), HeuristicController())
@@ -81,16 +80,16 @@ def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypa
     ]
     episodes = torch.cat([part.returns for part in parts], 1)
     assert episodes.shape == (2, 5)
-    assert result["anchors"]["heuristic"] == pytest.approx(episodes.mean().item())
+    assert result.anchors["heuristic"] == pytest.approx(episodes.mean().item())
     assert len({round(x, 4) for x in episodes.flatten().tolist()}) == 10, "each episode is another one"
 
 
 def test_more_seeds_than_worlds_still_play(tmp_path, monkeypatch):
     monkeypatch.setattr(final, "MAX_WORLDS", 1)
-    assert len(judge(untrained(tmp_path), 2)["greedy"]["per_seed"]) == 2
+    assert len(evaluate(untrained(tmp_path), 2).greedy.per_seed) == 2
 
 
-def test_a_recurrent_policy_of_another_task_is_judged(tmp_path):
-    result = judge(untrained(tmp_path, (3,), task="predator-prey", network__name="gru"), 2)
-    assert set(result["metrics"]) == {"contact", "touches"}
-    assert result["greedy"]["sem"] is None
+def test_a_recurrent_policy_of_another_task_is_evaluated(tmp_path):
+    result = evaluate(untrained(tmp_path, (3,), task="predator-prey", network__name="gru"), 2)
+    assert set(result.metrics) == {"contact", "touches"}
+    assert result.greedy.sem is None

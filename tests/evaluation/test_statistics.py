@@ -9,19 +9,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from esp_cli.evaluation.curve_statistics import StepsToThreshold, area_under_curve, curve_band, steps_to_threshold
 from esp_cli.evaluation.statistics import (
     Estimate,
-    StepsToThreshold,
     aggregate,
-    area_under_curve,
     bootstrap_interval,
-    curve_band,
     difference,
     interquartile_mean,
     mean_and_sem,
     normalise,
     probability_of_improvement,
-    steps_to_threshold,
 )
 
 TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]

@@ -128,7 +128,7 @@ def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
 
 def test_what_is_unfinished_or_not_run_is_said(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
-    folder.judgement_path(folder.study.cells[0]).unlink()
+    folder.evaluation_path(folder.study.cells[0]).unlink()
     found = collect(folder)
     assert [cell["status"] for cell in found["cells"]] == ["unfinished", "not run"]
     assert column(found, "comparison", "return>") == ["at 200", "not run"]

@@ -27,7 +27,7 @@ def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeyp
     iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
     assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
     # greedy, drawn, random, and the two heuristics of navigation, four episodes each
-    assert one.judgement_s == two.judgement_s == 5 * 4 * 0.5
+    assert one.evaluation_s == two.evaluation_s == 5 * 4 * 0.5
 
 
 def test_the_replay_is_counted_as_full_as_it_will_be():

@@ -20,7 +20,7 @@ def probed(monkeypatch) -> list[str]:
 
     def probe(config, episodes):
         seen.append(config.prior.kind)
-        return Cost(training_s=100.0, judgement_s=4.0, disk_bytes=50, peak_bytes=70)
+        return Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
 
     monkeypatch.setattr(module, "probe", probe)
     return seen

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.studies.engine_local import Worker
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.scheduler import Scheduler, likeness, makespan
 from esp_cli.studies.study import StudyFolder
-from tests.studies.small_studies import small_study, stand_in, write_study
+from tests.studies.small_studies import small_study, stand_in, write_part, write_study
 
 FOUR = ("navigation", "predator-prey")
 
@@ -24,8 +24,8 @@ def trace(folder: StudyFolder) -> list[str]:
     return file.read_text().splitlines() if file.exists() else []
 
 
-def run(folder: StudyFolder, jobs: int = 2, program=None, listener=lambda snapshot: True) -> Scheduler:
-    scheduler = Scheduler(folder, folder.study.cells, jobs, program or stand_in())
+def run(folder: StudyFolder, jobs: int = 2, engine=None, listener=lambda snapshot: True) -> Scheduler:
+    scheduler = Scheduler(folder, folder.study.cells, jobs, engine or LocalEngine(stand_in()))
     scheduler.complete = scheduler.run(listener, 0.01)
     return scheduler
 
@@ -39,9 +39,9 @@ def statuses(scheduler: Scheduler) -> list[str]:
     return [run.status for run in scheduler.runs]
 
 
-def test_every_run_is_trained_and_judged_once_and_no_more_than_jobs_at_once(folder):
+def test_every_run_is_trained_and_evaluated_once_and_no_more_than_jobs_at_once(folder):
     seen = []
-    scheduler = run(folder, 2, listener=lambda s: seen.append(s.count("training", "judging", "elsewhere")) or True)
+    scheduler = run(folder, 2, listener=lambda s: seen.append(s.count("training", "evaluating", "elsewhere")) or True)
     assert scheduler.complete
     assert statuses(scheduler) == ["finished"] * 4
     names = [cell.name for cell in folder.study.cells]
@@ -50,10 +50,10 @@ def test_every_run_is_trained_and_judged_once_and_no_more_than_jobs_at_once(fold
     assert all("$ esp" in folder.log_path(cell).read_text() for cell in folder.study.cells)
 
 
-def test_what_is_finished_is_skipped_and_what_is_trained_is_only_judged(tmp_path):
+def test_what_is_finished_is_skipped_and_what_is_trained_is_only_evaluated(tmp_path):
     folder = write_study(tmp_path / "s", small_study(tasks=FOUR), {"MAPPO": [-1.0, -2.0, -3.0]})
     cells = folder.study.cells
-    folder.judgement_path(cells[0]).unlink()
+    folder.evaluation_path(cells[0]).unlink()
     assert statuses(run(folder, 1)) == ["finished"] * 4
     assert trace(folder) == [
         f"eval {cells[0].name}",
@@ -89,18 +89,18 @@ def test_a_run_that_is_something_else_fails_alone(folder):
 def test_a_killed_process_is_told_by_its_signal(folder):
     def killer(snapshot):
         first = snapshot.runs[0]
-        if first.worker is not None and first.step:
-            os.kill(first.worker.pid, signal.SIGKILL)
+        if first.job is not None and first.step:
+            os.kill(first.job.pid, signal.SIGKILL)
         return True
 
-    scheduler = run(folder, 1, stand_in(0.05), killer)
+    scheduler = run(folder, 1, LocalEngine(stand_in(0.05)), killer)
     assert scheduler.runs[0].message == "ended by SIGKILL"
     assert statuses(scheduler) == ["failed"] + ["finished"] * 3
     assert statuses(run(folder)) == ["finished"] * 4
 
 
 def test_a_stop_lets_the_running_ones_end_and_starts_no_other(folder):
-    scheduler = run(folder, 1, stand_in(0.05), lambda snapshot: snapshot.runs[0].step < 100)
+    scheduler = run(folder, 1, LocalEngine(stand_in(0.05)), lambda snapshot: snapshot.runs[0].step < 100)
     assert not scheduler.complete
     assert statuses(scheduler) == ["stopped"] * 4
     assert trace(folder) == [f"train {folder.study.cells[0].name}"]
@@ -115,15 +115,15 @@ def test_after_an_interrupt_nothing_is_left_running(folder):
     started = []
 
     def impatient(snapshot):
-        workers = [run.worker for run in snapshot.runs if run.worker is not None]
-        if workers:
-            started.extend(workers)
+        jobs = [run.job for run in snapshot.runs if run.job is not None]
+        if jobs:
+            started.extend(jobs)
             raise KeyboardInterrupt
         return True
 
     with pytest.raises(KeyboardInterrupt):
-        run(folder, 2, stand_in(5.0), impatient)
-    assert [worker.poll() for worker in started] == [-signal.SIGKILL] * 2
+        run(folder, 2, LocalEngine(stand_in(5.0)), impatient)
+    assert [job.poll() for job in started] == [-signal.SIGKILL] * 2
 
 
 def test_a_run_that_a_killed_study_left_behind_is_waited_for_and_not_run_twice(folder):
@@ -140,13 +140,13 @@ def test_a_run_that_a_killed_study_left_behind_is_waited_for_and_not_run_twice(f
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent ended")
-def test_a_worker_ends_with_the_process_that_started_it(tmp_path):
+def test_a_job_ends_with_the_process_that_started_it(tmp_path):
     waiter = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); import time; time.sleep(60)"
     parent = (
         "import os, signal, sys, pathlib, time\n"
-        "from esp_cli.studies.engine_local import Worker\n"
-        f"worker = Worker([sys.executable, '-c', {waiter!r}], [], pathlib.Path({str(tmp_path / 'log')!r}))\n"
-        "print(worker.pid, flush=True)\n"
+        "from esp_cli.studies.engine_local import LocalEngine\n"
+        f"engine = LocalEngine([sys.executable, '-c', {waiter!r}])\n"
+        f"print(engine.start([], pathlib.Path({str(tmp_path / 'log')!r})).pid, flush=True)\n"
         "time.sleep(60)\n"
     )
     with subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE, text=True) as process:
@@ -160,16 +160,77 @@ def test_a_worker_ends_with_the_process_that_started_it(tmp_path):
     pytest.fail(f"process {child} outlived its parent")
 
 
-def test_the_last_words_of_a_worker_are_its_error_or_its_last_line(tmp_path):
+def test_the_last_words_of_a_job_are_its_error_or_its_last_line(tmp_path):
     def words(code: str) -> str:
-        worker = Worker([sys.executable, "-S", "-c", code], [], tmp_path / "log")
-        while worker.poll() is None:
+        job = LocalEngine([sys.executable, "-S", "-c", code]).start([], tmp_path / "log")
+        while job.poll() is None:
             time.sleep(0.01)
-        return worker.last_words()
+        return job.last_words()
 
     assert words("print('a'); print('error: no disk'); print('b')") == "no disk"
     (tmp_path / "log").unlink()
     assert words("raise ZeroDivisionError('by hand')") == "ZeroDivisionError: by hand"
+
+
+class FakeEngine:
+    """An engine without processes: a job writes what training or evaluation writes, and ends when it is asked to."""
+
+    def __init__(self, folder: StudyFolder, fails: str = "") -> None:
+        self.folder, self.fails, self.started, self.running = folder, fails, [], 0
+
+    def start(self, arguments, log):
+        self.started.append(tuple(arguments))
+        self.running += 1
+        return FakeJob(self, arguments)
+
+
+class FakeJob:
+    def __init__(self, engine: FakeEngine, arguments) -> None:
+        self.engine, self.polls, self.code, self.stopped = engine, 0, None, False
+        path = arguments[-1] if arguments[0] == "train" else arguments[1]
+        self.cell = next(c for c in engine.folder.study.cells if str(engine.folder.run_path(c)) == path)
+        self.trains = arguments[0] == "train"
+
+    def poll(self):
+        self.polls += 1
+        if self.code is None and (self.polls > 2 or self.stopped):
+            self.engine.running -= 1
+            self.code = 2 if self.cell.name == self.engine.fails else 130 if self.stopped else 0
+            if self.code == 0:
+                write_part(self.engine.folder, self.cell, self.trains)
+        return self.code
+
+    def ask_to_stop(self):
+        self.stopped = True
+
+    def kill(self):
+        self.stopped = True
+        self.poll()
+
+    def last_words(self):
+        return "the cluster is full"
+
+
+def test_another_engine_is_one_more_class(folder):
+    engine, most = FakeEngine(folder, fails=folder.study.cells[2].name), []
+    scheduler = run(folder, 3, engine, lambda snapshot: most.append(engine.running) or True)
+    assert scheduler.complete
+    assert statuses(scheduler) == ["finished", "finished", "failed", "finished"]
+    assert scheduler.runs[2].message == "the cluster is full"
+    assert max(most) == 3
+    path = str(folder.run_path(folder.study.cells[0]))
+    final = str(folder.evaluation_path(folder.study.cells[0]))
+    assert [command for command in engine.started if path in command] == [
+        ("train", "--resume", path),
+        ("eval", path, "--episodes", "4", "--json", final),
+    ]
+
+
+def test_every_job_of_another_engine_is_asked_to_stop(folder):
+    engine = FakeEngine(folder)
+    scheduler = run(folder, 2, engine, lambda snapshot: False)
+    assert statuses(scheduler) == ["stopped"] * 4
+    assert (len(engine.started), engine.running) == (2, 0)
 
 
 def test_when_the_last_job_ends():
@@ -182,7 +243,7 @@ def test_when_the_last_job_ends():
 
 
 def test_time_left_is_that_of_the_runs_most_alike(folder):
-    scheduler = Scheduler(folder, folder.study.cells, 1, ())
+    scheduler = Scheduler(folder, folder.study.cells, 1, LocalEngine(()))
     assert scheduler.left_s() is None
     plain, esp, hunt, hunt_esp = scheduler.runs
     plain.step, plain.trained_s = 100, 10.0  # of 200 steps, 0.1 s a step

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from esp_cli.studies.study import StudyFolder, read_judgement
+from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.locking import LockError, is_held
 from tests.studies.small_studies import small_study, write_study
 
@@ -75,14 +75,25 @@ def test_one_process_holds_a_study(tmp_path):
     assert not is_held(folder.path / "no such file")
 
 
-def test_finished_is_trained_and_judged(tmp_path):
+def test_finished_is_trained_and_evaluated(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), ENDS)
     plain, esp = folder.study.cells
     assert (folder.is_finished(plain), folder.is_finished(esp)) == (True, False)
-    folder.judgement_path(plain).write_text('{"task": ')  # half of one, as after a power cut
+    folder.evaluation_path(plain).write_text('{"task": ')  # half of one, as after a power cut
     assert folder.is_trained(plain)
     assert not folder.is_finished(plain)
-    assert read_judgement(folder.run_path(esp)) is None
+    assert read_evaluation(folder.run_path(esp)) is None
+
+
+def test_a_folder_of_an_older_version_has_its_final_evaluation_under_another_name(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), ENDS)
+    plain = folder.study.cells[0]
+    found, old = read_evaluation(folder.run_path(plain)), folder.run_path(plain) / "judgement.json"
+    folder.evaluation_path(plain).rename(old)
+    assert folder.is_finished(plain)
+    assert read_evaluation(folder.run_path(plain)) == found
+    old.write_text("{}")
+    assert not folder.is_finished(plain)
 
 
 def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
@@ -102,14 +113,14 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
     assert folder.find_twin(esp, [other]) is None, "not finished there"
     folder.adopt(plain, twin)
     assert folder.is_finished(plain)
-    assert read_judgement(folder.run_path(plain)) == read_judgement(twin)
+    assert read_evaluation(folder.run_path(plain)) == read_evaluation(twin)
     assert folder.log_path(plain).read_text().endswith(f"taken over from {twin}\n")
     assert folder.find_twin(plain, [other]) is None, "it is there now"
     assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
 
 
 @pytest.mark.parametrize("choice", [{"seeds": (0, 1)}, {"steps": ((None, 300),)}, {"episodes": 8}])
-def test_a_run_of_other_seeds_or_steps_or_judged_otherwise_is_no_twin(tmp_path, choice):
+def test_a_run_of_other_seeds_or_steps_or_evaluated_otherwise_is_no_twin(tmp_path, choice):
     other = write_study(tmp_path / "other", small_study(), ENDS)
     folder = StudyFolder.create(tmp_path / "s", small_study(**choice))
     assert folder.find_twin(folder.study.cells[0], [other]) is None

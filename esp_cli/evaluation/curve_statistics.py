@@ -1,0 +1,109 @@
+"""Statistics of learning curves over seeds: bands, first steps at a threshold, mean heights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+from scipy.integrate import trapezoid
+
+from esp_cli.evaluation.statistics import Floats, bootstrap
+
+_RESAMPLES = 2_000
+Band = Literal["ci95", "sem"]
+
+
+@dataclass(frozen=True)
+class StepsToThreshold:
+    """Env steps per seed at which a threshold is reached first.
+
+    Attributes:
+        of_mean: by the mean over seeds, or None where it never is.
+        per_seed: by each seed, likewise.
+    """
+
+    of_mean: int | None
+    per_seed: tuple[int | None, ...]
+
+
+def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> StepsToThreshold:
+    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
+
+    A value that is not finite, as of a seed that was stopped, reaches nothing.
+
+    Args:
+        steps: env steps per seed, ascending [K].
+        values: [K, S]; higher is better.
+        threshold: e.g. a return.
+
+    Raises:
+        ValueError: shapes that do not fit, or steps that do not ascend.
+    """
+    at, curves = _curves(steps, values)
+    curves = np.where(np.isfinite(curves), curves, np.nan)
+
+    def first(reached: NDArray[np.bool_]) -> int | None:
+        return int(at[np.argmax(reached)]) if reached.any() else None
+
+    per_seed = tuple(first(curve >= threshold) for curve in curves.T)
+    return StepsToThreshold(first(curves.mean(axis=1) >= threshold), per_seed)
+
+
+def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
+    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S].
+
+    Args:
+        steps: env steps per seed, ascending [K], K > 1.
+        values: [K, S]; NaN gives that seed NaN.
+
+    Raises:
+        ValueError: shapes that do not fit, steps that do not ascend, or fewer than two of them.
+    """
+    at, curves = _curves(steps, values)
+    if at.size < 2:
+        raise ValueError("the area under a curve needs two evaluations or more")
+    return np.asarray(trapezoid(curves, at, axis=0) / (at[-1] - at[0]), dtype=np.float64)
+
+
+def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, Floats]:
+    """Return mean, lower and upper edge of a learning curve over seeds, each [K].
+
+    The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
+    is not finite all three are NaN, so that a stopped seed leaves a gap instead of a mean over the survivors.
+
+    Args:
+        values: [K, S].
+        band: 95 % bootstrap interval, or mean -+ one standard error.
+
+    Raises:
+        ValueError: values that are no [K, S].
+    """
+    curves = np.asarray(values, dtype=np.float64)
+    if curves.ndim != 2 or curves.shape[1] == 0:
+        raise ValueError(f"learning curves are evaluations by seeds [K, S], not of shape {list(curves.shape)}")
+    whole = np.isfinite(curves).all(axis=1)
+    mean = np.full(len(curves), np.nan)
+    mean[whole] = curves[whole].mean(axis=1)
+    low, high = mean.copy(), mean.copy()
+    if curves.shape[1] > 1 and whole.any():
+        if band == "sem":
+            sem = stats.sem(curves[whole], axis=1)
+            low[whole], high[whole] = mean[whole] - sem, mean[whole] + sem
+        else:
+            interval = bootstrap((curves[whole],), np.mean, _RESAMPLES)
+            low[whole], high[whole] = interval.low, interval.high
+    return mean, low, high
+
+
+def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
+    at, curves = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    if at.ndim != 1 or curves.ndim != 2 or curves.shape[0] != at.size or curves.size == 0:
+        raise ValueError(
+            f"a learning curve is steps [K] and values [K, S], not {list(at.shape)} and {list(curves.shape)}"
+        )
+    if not (np.diff(at) > 0).all():
+        raise ValueError("the steps of a learning curve have to ascend")
+    return at, curves
