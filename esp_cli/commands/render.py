@@ -81,8 +81,8 @@ def render(
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
     from esp_cli.deploy.box import open_policy
     from esp_cli.drawing import films, rendering
+    from esp_cli.training.build import build_environment
     from esp_cli.training.loading import transfer
-    from esp_cli.training.trainer import build_environment
 
     if kind == ".mp4":
         films.mp4_library()  # a missing one is told before all the work, not after it

@@ -38,7 +38,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
     from esp_cli.studies.engine_local import LocalEngine
     from esp_cli.studies.scheduler import Scheduler, available_cores
     from esp_cli.studies.study import StudyFolder
-    from esp_cli.training.trainer import build_learner
+    from esp_cli.training.build import build_learner
 
     out = choices.out or Path("runs") / kind
     study = plan(kind, choices.request(words, out))

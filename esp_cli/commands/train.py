@@ -75,9 +75,9 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard files too.")] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
+    from esp_cli.training.build import build_learner
     from esp_cli.training.config import resolve_config
     from esp_cli.training.run_folder import RunFolder
-    from esp_cli.training.trainer import build_learner
 
     if resume is not None:
         _refuse_beside_resume(context)

@@ -14,12 +14,10 @@ from esp_cli import __version__
 from esp_cli.deploy.box import Entry, Score, read_box, standard_name, write_box
 from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
-from esp_cli.training.checkpoint import save_checkpoint
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import Episodes, PolicyController
-from esp_cli.training.run_folder import POLICY_FORMAT
-from esp_cli.training.trainer import policy_description
+from esp_cli.training.policy_file import describe_policy, write_policy
 
 _SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
 _OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
@@ -76,8 +74,8 @@ def add_to_box(
     folder.mkdir(parents=True, exist_ok=True)
     others = tuple(entry for entry in read_box(folder) if entry.name != name)
     file = folder / f"{name}.safetensors"
-    description = policy_description(alone.config, alone.spec, alone.step, [score.mean])
-    save_checkpoint(file, alone.policy.state_dict(), description, POLICY_FORMAT)
+    description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
+    write_policy(file, alone.policy.state_dict(), description)
     entry = Entry(
         name=name,
         file=file.name,

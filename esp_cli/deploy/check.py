@@ -21,8 +21,8 @@ from esp_cli.deploy.c_source import FLAGS
 from esp_cli.deploy.onnx_file import library
 from esp_cli.deploy.program import Floats, Program
 from esp_cli.networks.policy import Policy
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
-from esp_cli.training.trainer import build_environment
 
 OBSERVATIONS = 10_000
 """On which every export is compared with its policy."""

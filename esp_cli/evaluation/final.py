@@ -10,6 +10,7 @@ from torch import Tensor
 
 from esp_cli import __version__
 from esp_cli.evaluation.statistics import SeedSummary, summarise
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import (
     Controller,
@@ -20,7 +21,6 @@ from esp_cli.training.play import (
     play,
 )
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment
 from esp_envs.registry import task_class
 
 Mode = Literal["greedy", "stochastic"]

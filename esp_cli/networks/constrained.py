@@ -110,7 +110,7 @@ class EquivariantConfig(NetworkConfig):
 
     name: Literal["equivariant"] = "equivariant"
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
-    group: str = Field("c4", description="the layers commute with this group")
+    group: str = Field("c4", max_length=100, description="the layers commute with this group")
 
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None

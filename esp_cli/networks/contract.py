@@ -32,7 +32,9 @@ class NetworkConfig(BaseModel, ABC):
         (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
     )
     symmetrise: str | None = Field(
-        None, description="a group: the outputs for all images of the input are pulled back and averaged"
+        None,
+        max_length=100,
+        description="a group: the outputs for all images of the input are pulled back and averaged",
     )
 
     @abstractmethod

@@ -175,7 +175,7 @@ class EmpnConfig(NetworkConfig):
     """The settings of the equivariant message passing network."""
 
     name: Literal["empn"] = "empn"
-    group: str = Setting("c4", description="the layers commute with this group")
+    group: str = Setting("c4", max_length=100, description="the layers commute with this group")
 
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
 from esp_cli.evaluation.statistics import bootstrap_interval, difference, mean_and_sem, probability_of_improvement
 from esp_cli.reporting.plots import Curve, learning_curves
+from esp_cli.training.build import build_environment
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config
 from esp_cli.training.metrics import column, read_metrics
 from esp_cli.training.run_folder import RunFolder
-from esp_cli.training.trainer import build_environment
 from esp_envs.spec import TaskSpec
 
 Mode = Literal["greedy", "stochastic"]

@@ -10,9 +10,9 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from esp_cli.reporting.curves import Mode, RunCurve, compare, plot, read_curve
+from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.run_folder import RunFolder
-from esp_cli.training.trainer import build_environment, build_learner
 
 TASK = "wildlife"
 CONTESTANTS: dict[str, dict[str, object]] = {

@@ -24,8 +24,8 @@ from esp_cli.reporting.recipes import command_of
 from esp_cli.reporting.results import returns_of
 from esp_cli.reporting.tables import all_tables
 from esp_cli.studies.study import Cell, Study
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import load_policy
-from esp_cli.training.trainer import build_environment
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
 _TEMPLATES = Path(__file__).with_name("templates")

@@ -10,10 +10,10 @@ import torch
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.off_policy import OffPolicyLearner
+from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.play import PolicyController, play
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment, build_learner
 from esp_envs.registry import task_class
 
 PROBE_SECONDS = 1.0

@@ -27,10 +27,10 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentError, parse_object, shortened
 from esp_cli.files.failures import attempting
 from esp_cli.files.writing import replace_file
+from esp_envs.policy_format import METADATA_KEY
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
 CHECKPOINT_VERSION = 1
-_METADATA_KEY = "esp"
 _RESERVED = ("format", "version", "sha256")
 # parsed JSON takes some 20 times the space of its text, so this bounds the memory that a hostile header can ask for
 _MAX_HEADER_BYTES = 4 * 2**20
@@ -86,7 +86,7 @@ def save_checkpoint(
     stored = _storable(path, tensors)
     described = {"format": format_name, "version": version, **described}
     described["sha256"] = _digest(stored, described)
-    content = safetensors_torch.save(stored, metadata={_METADATA_KEY: json.dumps(described, allow_nan=False)})
+    content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
         raise CheckpointError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
     with attempting("write", path, CheckpointError):
@@ -203,9 +203,9 @@ def _description(header: Mapping[str, Any], format_name: str, version: int) -> d
     metadata = header.get("__metadata__")
     if not isinstance(metadata, dict) or any(not isinstance(value, str) for value in metadata.values()):
         raise CheckpointError("was not written by esp: it has no metadata")
-    if _METADATA_KEY not in metadata:
-        raise CheckpointError(f"was not written by esp: its metadata has no '{_METADATA_KEY}'")
-    description = parse_object(metadata[_METADATA_KEY], "description")
+    if METADATA_KEY not in metadata:
+        raise CheckpointError(f"was not written by esp: its metadata has no '{METADATA_KEY}'")
+    description = parse_object(metadata[METADATA_KEY], "description")
     if description.get("format") != format_name:
         found = shortened(repr(description.get("format")))
         raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed")

@@ -17,11 +17,11 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
-from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.build import build_environment
 from esp_cli.training.config import RunConfig, resolve_task_settings
-from esp_cli.training.run_folder import POLICY_FORMAT, CheckpointWarning, RunFolder
+from esp_cli.training.policy_file import read_policy
+from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment
 from esp_envs.spec import TaskSpec
 
 
@@ -83,7 +83,7 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
         ValueError: nothing there, not one of ours, damaged, or of another version of the task.
     """
     if sha256 is not None or path.is_file():
-        tensors, meta = load_checkpoint(path, format_name=POLICY_FORMAT, sha256=sha256)
+        tensors, meta = read_policy(path, sha256)
         writer = meta.get("esp_version", __version__)
         return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
     folder = RunFolder.open(path)

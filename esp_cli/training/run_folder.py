@@ -33,8 +33,8 @@ from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
+from esp_cli.training.policy_file import write_policy
 
-POLICY_FORMAT = "esp-policy"
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
 
@@ -226,7 +226,7 @@ class RunFolder:
                 file cannot be written).
         """
         reach("policy")
-        save_checkpoint(self.policy_path, tensors, meta, format_name=POLICY_FORMAT)
+        write_policy(self.policy_path, tensors, meta)
         files = self.checkpoints()
         if any(map(_is_final, files)):
             with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):

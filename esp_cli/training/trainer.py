@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,17 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from esp_cli import __version__
-from esp_cli.algorithms.learner import Learner
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.play import PolicyController, play
+from esp_cli.training.policy_file import describe_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
-from esp_envs.base import Environment
-from esp_envs.registry import make
-from esp_envs.spec import TaskSpec
 
 CHECKPOINT_SECONDS = float(os.environ.get("ESP_CHECKPOINT_SECONDS", "30"))
 """Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
@@ -52,26 +47,6 @@ class Progress:
 
 Listener = Callable[[Progress], bool]
 """Told of progress; returns False to ask for a clean stop after this iteration."""
-
-
-def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
-    """Make `num_envs` worlds per seed whose draws come from the named random stream."""
-    return make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
-
-
-def build_learner(config: RunConfig) -> Learner:
-    """Build the learner of a run, with its worlds, from the configuration alone."""
-    cls = ALGORITHMS[config.algorithm]
-    settings = cls.config_class(**config.algorithm_settings)
-    env = build_environment(config, settings.num_envs, "training worlds")
-    return cls(
-        env,
-        settings,
-        config.network,
-        config.prior,
-        generators(config.seeds, "learner"),
-        generators(config.seeds, "prior"),
-    )
 
 
 class Trainer:
@@ -115,7 +90,7 @@ class Trainer:
     @property
     def convention(self) -> str:
         """The reward convention in which returns are counted."""
-        return self.learner.collector.env.spec.convention
+        return self.learner.spec.convention
 
     def final_returns(self) -> dict[str, NDArray[np.float64]]:
         """Return the last evaluation of the run: greedy and stochastic, one return per seed (NaN where it stopped)."""
@@ -221,7 +196,7 @@ class Trainer:
             "iteration": self.iteration,
             "elapsed_s": self.elapsed_s,
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
-            "task_version": self.learner.collector.env.spec.version,
+            "task_version": self.learner.spec.version,
         }
         complete = self.is_complete
         self.folder.write_checkpoint(self.step, self.learner.state_dict(complete), meta, complete)
@@ -246,25 +221,4 @@ class Trainer:
     def _policy_meta(self) -> dict[str, Any]:
         """Describe the policy file so that it can be used without the run folder."""
         returns = self.final_returns()["greedy"].tolist()
-        return policy_description(self.config, self.learner.collector.env.spec, self.step, returns)
-
-
-def policy_description(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
-    """Return what a policy file says of itself.
-
-    Args:
-        config: of the run, or of the one seed of it that the file holds.
-        spec: of the task.
-        step: environment steps per seed behind it.
-        returns: of greedy episodes, one per seed; NaN where it stopped.
-    """
-    return {
-        "task": config.task,
-        "task_version": spec.version,
-        "network": config.network.name,
-        "activation": getattr(config.network, "activation", None),
-        "step": step,
-        "greedy_returns": [None if math.isnan(x) else x for x in returns],
-        "config": config.model_dump(mode="json"),
-        "esp_version": __version__,
-    }
+        return describe_policy(self.config, self.learner.spec, self.step, returns)

@@ -4,8 +4,8 @@ import torch
 
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.symmetry import transform_set
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 
 SMALL = {
     "num_envs": 2,

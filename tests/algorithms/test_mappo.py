@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from esp_cli.algorithms.batch import Batch
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_epochs": 2, "mappo.num_minibatches": 2, "network.hidden": [16, 16]}
 

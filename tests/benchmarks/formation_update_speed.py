@@ -18,8 +18,8 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 
 
 def timed(spent: Counter[str], owner: Any, method: str, label: str) -> None:

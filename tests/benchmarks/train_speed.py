@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from esp_cli.algorithms.mappo import Mappo
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 
 PEER_LAYOUT = {
     "mappo.num_envs": 128,

@@ -7,12 +7,13 @@ from pathlib import Path
 import torch
 
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training.build import build_environment
 from esp_cli.training.checkpoint import save_checkpoint
 from esp_cli.training.config import resolve_config
 from esp_cli.training.loading import TrainedPolicy
-from esp_cli.training.run_folder import POLICY_FORMAT
+from esp_cli.training.policy_file import describe_policy
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment, policy_description
+from esp_envs.policy_format import POLICY_FORMAT
 
 KINDS = {
     "choice": ("navigation", "mappo", {}),
@@ -52,6 +53,6 @@ def drawn_policy(kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ..
 
 def write_policy(trained: TrainedPolicy, path: Path) -> Path:
     """Write a policy file as a run does."""
-    description = policy_description(trained.config, trained.spec, trained.step, [0.0] * len(trained.config.seeds))
+    description = describe_policy(trained.config, trained.spec, trained.step, [0.0] * len(trained.config.seeds))
     save_checkpoint(path, trained.policy.state_dict(), description, POLICY_FORMAT)
     return path

@@ -19,7 +19,7 @@ from esp_cli.deploy.export import WRITERS, export
 from esp_cli.deploy.program import Affine, Recurrent
 from esp_cli.deploy.takeaway.runtime import NumpyPolicy
 from esp_cli.deploy.translate import program_of
-from esp_cli.training.trainer import build_environment
+from esp_cli.training.build import build_environment
 from tests.deploy.policies import KINDS, drawn_policy
 
 FAST = ("numpy", "c", "onnx")

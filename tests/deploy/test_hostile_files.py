@@ -26,7 +26,7 @@ from esp_cli.deploy.library import load_policy
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.loading import load_policy as load_trained
-from esp_cli.training.run_folder import POLICY_FORMAT
+from esp_envs.policy_format import POLICY_FORMAT
 from tests.deploy.policies import drawn_policy, write_policy
 
 T = TypeVar("T")

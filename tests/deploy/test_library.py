@@ -12,7 +12,7 @@ import torch
 
 import esp_cli
 from esp_cli.deploy.library import LoadedPolicy
-from esp_cli.training.trainer import build_environment
+from esp_cli.training.build import build_environment
 from tests.deploy.policies import drawn_policy, write_policy
 
 

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from esp_cli.deploy.export import export
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
-from esp_cli.training.trainer import build_environment
 from esp_envs.epuck.physics import Bodies, make_physics
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.deploy.policies import drawn_policy

@@ -24,10 +24,10 @@ from esp_cli.drawing.rendering import (
     write_picture,
 )
 from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment
 from esp_envs import Body, Scene
 from esp_envs.drawing import TopPainter, draw
 from tests.training.runs import tiny_config

@@ -11,10 +11,10 @@ from esp_cli.evaluation import final
 from esp_cli.evaluation.final import FinalEvaluation, evaluate, summarise_returns
 from esp_cli.evaluation.statistics import SeedSummary
 from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import HeuristicController, play
 from esp_cli.training.streams import generators
-from esp_cli.training.trainer import build_environment
 from tests.training.runs import tiny_config
 
 

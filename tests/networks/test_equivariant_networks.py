@@ -20,8 +20,8 @@ from esp_cli.symmetry import (
     transform_set,
 )
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 from esp_envs import make
 from esp_envs.spec import TaskSpec
 from tests.networks.gradients import assert_same_gradients

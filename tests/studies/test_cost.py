@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from esp_cli.studies import cost
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.trainer import build_learner
 from tests.training.runs import tiny_config
 
 SMALL = {"network.hidden": [8], "evaluation.episodes": 2, "maddpg.num_envs": 2, "maddpg.replay_episodes": 40}

@@ -10,8 +10,9 @@ import torch
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import load_policy, parse_config
-from esp_cli.training.run_folder import POLICY_FORMAT, RunFolder
+from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer
+from esp_envs.policy_format import POLICY_FORMAT
 from tests.training.runs import tiny_config, tiny_folder
 
 

@@ -16,11 +16,11 @@ from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
 from esp_cli.training.metrics import MetricsWriter, read_metrics
 from esp_cli.training.run_folder import (
-    POLICY_FORMAT,
     CheckpointWarning,
     RunFolder,
     RunFolderError,
 )
+from esp_envs.policy_format import POLICY_FORMAT
 
 CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

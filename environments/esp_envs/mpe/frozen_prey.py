@@ -14,8 +14,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION
+
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
-_FORMAT, _VERSION, _TASK, _NETWORK = "esp-policy", 1, "predator-prey", "mlp"
+_TASK, _NETWORK = "predator-prey", "mlp"
 
 
 class FrozenPrey:
@@ -62,7 +64,7 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
             metadata = file.metadata() or {}
             names = [name for name in file.keys() if name.startswith("actor.layers.")]  # noqa: SIM118 - no iterator
             tensors = {name: file.get_tensor(name) for name in names}
-        header = json.loads(metadata.get("esp", "null"))
+        header = json.loads(metadata.get(METADATA_KEY, "null"))
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
         raise ValueError(f"the prey policy {path} is no intact safetensors file ({error}); export it again") from error
     if not isinstance(header, dict):
@@ -72,7 +74,7 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
 
 def _checked(header: dict[str, object], path: str) -> str:
     """Return the activation named in the header of a fitting policy."""
-    wanted = {"format": _FORMAT, "version": _VERSION, "task": _TASK, "network": _NETWORK}
+    wanted = {"format": POLICY_FORMAT, "version": POLICY_VERSION, "task": _TASK, "network": _NETWORK}
     for key, value in wanted.items():
         if header.get(key) != value:
             raise ValueError(f"the prey policy {path} has {key} {header.get(key)!r}, but a prey needs {value!r}")
