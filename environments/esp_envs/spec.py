@@ -16,10 +16,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import ClassVar
 
 
-class Kind(Enum):
-    """What one item of a field is; the value is its width in numbers.
+@dataclass(frozen=True)
+class Kind:
+    """What one item of a field is. These are known; a task may define more, beside elements that act on them.
 
     SCALAR        unchanged by every planar transform (a distance, a flag, a mass).
     PSEUDOSCALAR  changes sign under reflection, unchanged by rotation (a turning rate).
@@ -28,18 +30,26 @@ class Kind(Enum):
     WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
     PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
                   top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
+
+    Attributes:
+        name: one word.
+        width: numbers per item; of a picture, per pixel.
+        is_vector: whether the length of an action's item is bounded by 1, and not each of its numbers.
     """
 
-    SCALAR = "scalar", 1
-    PSEUDOSCALAR = "pseudoscalar", 1
-    VECTOR = "vector", 2
-    WHEELS = "wheels", 2
-    PICTURE = "picture", 1
+    SCALAR: ClassVar[Kind]
+    PSEUDOSCALAR: ClassVar[Kind]
+    VECTOR: ClassVar[Kind]
+    WHEELS: ClassVar[Kind]
+    PICTURE: ClassVar[Kind]
 
-    @property
-    def width(self) -> int:
-        """Numbers per item; of a picture, per pixel."""
-        return self.value[1]
+    name: str
+    width: int
+    is_vector: bool = False
+
+
+Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.PICTURE = Kind("scalar", 1), Kind("pseudoscalar", 1), Kind("picture", 1)
+Kind.VECTOR, Kind.WHEELS = Kind("vector", 2, is_vector=True), Kind("wheels", 2)
 
 
 class Items(Enum):
@@ -70,7 +80,7 @@ class Field:
     pixels: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        if (self.kind is Kind.PICTURE) != (self.pixels is not None):
+        if (self.kind == Kind.PICTURE) != (self.pixels is not None):
             raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
 
     @property
@@ -87,7 +97,7 @@ class Field:
     def described(self) -> str:
         """What it holds, in words: "vector x 2", "picture of 21 x 21 x 1"."""
         size = "" if self.pixels is None else f" of {self.pixels[0]} x {self.pixels[1]}"
-        return f"{self.kind.value[0]}{size} x {self.count}"
+        return f"{self.kind.name}{size} x {self.count}"
 
 
 @dataclass(frozen=True)
@@ -151,7 +161,7 @@ class Discrete:
         if len(self.points) != len(self.names) or len(set(self.points)) != len(self.points):
             raise ValueError("each action needs one name and a meaning of its own")
         if any(len(p) != self.kind.width for p in self.points):
-            raise ValueError(f"a meaning of kind {self.kind.value[0]} has {self.kind.width} numbers")
+            raise ValueError(f"a meaning of kind {self.kind.name} has {self.kind.width} numbers")
 
     @property
     def count(self) -> int:
@@ -180,20 +190,39 @@ ActionSpace = Discrete | Continuous
 RIGHT, LEFT, DOWN, UP = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
 
 
-@dataclass(frozen=True)
-class TaskSpec:
-    """All that a learner, a prior or an exporter needs to know of a task.
+@dataclass(frozen=True, kw_only=True)
+class Spaces:
+    """What a symmetry acts on: all that transforms, a prior and equivariant networks need to know of a task.
+
+    Attributes:
+        num_agents: N, learning agents.
+        observation: layout of one agent's row, D numbers.
+        state: layout of the global state that a centralised critic or mixer may see.
+        action: the action space, the same for every agent.
+        symmetry: name of the largest planar group under which the *dynamics and reward* are invariant ("d4", "o2").
+    """
+
+    num_agents: int
+    observation: Layout
+    state: Layout
+    action: ActionSpace
+    symmetry: str
+
+    @property
+    def label(self) -> str:
+        """What messages call these spaces."""
+        return "the task"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskSpec(Spaces):
+    """All that a learner, a prior or an exporter needs to know of a task; see also `Spaces`.
 
     Attributes:
         name: registry name.
         version: bumped by any change of observation, action, reward or start distribution.
         convention: the reward convention in a few words; printed beside every number.
-        num_agents: N, learning agents.
         horizon: steps of an episode, at which it is truncated.
-        observation: layout of one agent's row, D numbers.
-        state: layout of the global state that a centralised critic or mixer may see.
-        action: the action space, the same for every agent.
-        symmetry: name of the largest planar group under which the *dynamics and reward* are invariant ("d4", "o2").
         shared_reward: whether all agents get the same reward, so that one value per world suffices.
         control_period_s: simulated seconds of one step, for rendering in real time.
         totals: names of the metrics that add up over an episode; the others are averaged over its steps.
@@ -203,17 +232,17 @@ class TaskSpec:
     name: str
     version: int
     convention: str
-    num_agents: int
     horizon: int
-    observation: Layout
-    state: Layout
-    action: ActionSpace
-    symmetry: str
     shared_reward: bool = True
     control_period_s: float = 0.1
     totals: tuple[str, ...] = ()
     terminates: bool = False
     settings: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """What messages call the task."""
+        return self.name
 
     def __post_init__(self) -> None:
         if self.num_agents < 1 or self.horizon < 1 or not math.isfinite(self.control_period_s):

@@ -55,6 +55,7 @@ class Learner(ABC):
     Attributes:
         config_class: model of its hyperparameters.
         task_settings: what it asks of a task that has such settings, where a user says nothing else.
+        replays: whether it has a replay, in which the prior may store copies.
         config: hyperparameters.
         spec: of the task.
         device: where everything is.
@@ -68,6 +69,7 @@ class Learner(ABC):
 
     config_class: ClassVar[type[LearnerConfig]]
     task_settings: ClassVar[Mapping[str, object]] = MappingProxyType({})
+    replays: ClassVar[bool] = False
     config: LearnerConfig
     policy: Policy
     modules: dict[str, nn.Module]
@@ -84,7 +86,7 @@ class Learner(ABC):
         prior_generators: Sequence[torch.Generator],
     ) -> None:
         self.config, self.spec, self.device = config, env.spec, env.device
-        self.prior = SymmetryPrior(prior, env.spec, env.device)
+        self.prior = SymmetryPrior(prior, env.spec, env.device, self.replays)
         self.generators = {"learner": list(generators), "prior": list(prior_generators)}
         self.build(env, network)
 

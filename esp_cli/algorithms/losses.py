@@ -66,12 +66,6 @@ def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, 
     return target
 
 
-def masked_mean(x: Tensor, valid: Tensor) -> Tensor:
-    """Return the mean per seed over what is valid: x [S, B, T, ...], valid [S, B, T] -> [S]."""
-    rows = x.flatten(3).mean(3) if x.dim() > 3 else x
-    return torch.where(valid, rows, 0.0).flatten(1).sum(1) / valid.flatten(1).sum(1).clamp_min(1)
-
-
 def normalise_per_seed(x: Tensor, epsilon: float = 1e-5) -> Tensor:
     """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed; x: [S, ...]."""
     axes = tuple(range(1, x.dim()))

@@ -14,7 +14,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
@@ -23,8 +22,7 @@ from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_
 from esp_cli.networks.joint_q import OneValueEach
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
-from esp_cli.prior import policy_consistency_loss
-from esp_cli.symmetry import Transform
+from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.spec import TaskSpec
 
@@ -88,71 +86,44 @@ class Maddpg(OffPolicyLearner):
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Take one gradient step of the critic, then one of the actor, then move the targets."""
-        transforms = self.prior.for_batch(self.generators["prior"])
-        rows = self._with_copies(batch, transforms)
-        seen = self._critic_rows(rows)
-        metrics = self._learn_critic(batch, rows, seen, transforms) | self._learn_actor(batch, rows, seen, transforms)
+        copies = self.prior.copies(batch, self.generators["prior"])
+        seen = self._critic_rows(copies.rows)
+        metrics = self._learn_critic(copies, seen) | self._learn_actor(copies, seen)
         with torch.no_grad():
             targets: list[Tensor] = [*self.target_policy.parameters(), *self.target_critic.parameters()]
             torch._foreach_lerp_(targets, [*self.actor_parameters, *self.critic_parameters], self.config.tau)
         return metrics
 
-    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
-        """Return S_pi and S_Q of a batch with its copies."""
+    def answers(self, rows: EpisodeBatch) -> Answers:
+        """Return what actor and critic say of rows, for `SymmetryPrior.errors`."""
         values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
-        valid = rows.valid[:, : rows.valid.shape[1] // (1 + len(transforms))]
-        outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
-        return {
-            "policy": self._policy_gap(outputs, valid, transforms),
-            "value": self._value_gap(values, valid, transforms),
-        }
+        return {"policy": (self.head, self.policy.unroll(rows.obs[:, :, :-1], rows.action)), "value": values}
 
-    def _learn_critic(
-        self, batch: EpisodeBatch, rows: EpisodeBatch, seen: Tensor, transforms: list[Transform]
-    ) -> dict[str, Tensor]:
-        """Take one gradient step down L_TD + c S_Q."""
-        count = batch.obs.shape[1]
-        values = self.joint.value(self.critic, seen[:, :, :-1], self.head.encode(rows.action))
-        target = self._targets(batch, seen[:, :count])
-        learned, valid = values[:, :count], batch.valid
-        if self.prior.config.augments_batches:
-            learned, valid, target = values, rows.valid, self._targets_with_copies(target, transforms)
-        error = huber(learned - target, self.config.huber_delta)
-        loss = masked_mean(error, valid)
-        if transforms and self.prior.config.coefficient > 0:
-            loss = loss + self.prior.penalty(None, self._value_gap(values, batch.valid, transforms))
-        norm = self._step(self.critic_optimiser, self.critic_parameters, loss)
-        return {
-            "td_loss": masked_mean(error[:, :count], batch.valid),
-            "value": masked_mean(values[:, :count], batch.valid),
-            "critic_grad_norm": norm,
-        }
+    def _learn_critic(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
+        """Take one gradient step down L_TD + c S_Q; `seen` is what the critic sees of every row."""
+        values = self.joint.value(self.critic, seen[:, :, :-1], self.head.encode(copies.rows.action))
+        target = self._targets(copies.originals, copies.original(seen))
+        loss, metrics = self._td_loss(values, target, copies)
+        return metrics | {"critic_grad_norm": self._step(self.critic_optimiser, self.critic_parameters, loss)}
 
-    def _learn_actor(
-        self, batch: EpisodeBatch, rows: EpisodeBatch, seen: Tensor, transforms: list[Transform]
-    ) -> dict[str, Tensor]:
-        """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi."""
-        count = batch.obs.shape[1]
+    def _learn_actor(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
+        """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `seen` is what the critic sees of every row."""
+        rows, batch = copies.rows, copies.batch
         outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
-        noise = [torch.rand(batch.obs.shape[1:2] + outputs.shape[2:], generator=g) for g in self.generators["learner"]]
-        drawn = torch.stack(noise).to(self.device)
-        learned, used = outputs[:, :count], batch
-        if self.prior.config.augments_batches:
-            learned, used = outputs, rows
-            drawn = drawn.repeat(1, 1 + len(transforms), *[1] * (drawn.dim() - 2))
+        lead = (copies.originals.count, *outputs.shape[2:])
+        noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]]).to(self.device)
+        learned = copies.learned(outputs)
         self.critic.requires_grad_(False)
-        value = self._value_of_policy(seen[:, : learned.shape[1], :-1], learned, drawn, used.action)
+        value = self._value_of_policy(copies.learned(seen)[:, :, :-1], learned, copies.repeated(noise), batch.action)
         self.critic.requires_grad_(True)
         # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
         # that Adam's epsilon slows the actor down.
-        loss = -(self.spec.horizon**0.5) * masked_mean(value, used.valid)
-        policy_loss = loss
-        loss = loss + self.config.output_penalty * masked_mean(self.head.penalty(learned), used.valid)
-        if transforms and self.prior.config.coefficient > 0:
-            loss = loss + self.prior.penalty(self._policy_gap(outputs, batch.valid, transforms), None)
+        policy_loss = -(self.spec.horizon**0.5) * mean_per_seed(value, batch.valid)
+        loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(learned), batch.valid)
+        loss = loss + copies.penalty(policy=(self.head, outputs))
         norm = self._step(self.actor_optimiser, self.actor_parameters, loss)
         metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
-        return metrics | {name: masked_mean(x, used.valid) for name, x in self.head.statistics(learned).items()}
+        return metrics | {name: mean_per_seed(x, batch.valid) for name, x in self.head.statistics(learned).items()}
 
     def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, stored: Tensor) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
@@ -186,11 +157,3 @@ class Maddpg(OffPolicyLearner):
         outputs = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
         following = self.head.encode(self.head.mode(outputs))
         return self._td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))
-
-    def _policy_gap(self, outputs: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
-        """Return S_pi (Eq. 8) per seed, averaged over the copies; outputs [S, B (1 + copies), T, N, ...]."""
-        original, *copies = outputs.split(valid.shape[1], 1)
-        stop, head = self.prior.config.stop_gradient, self.head
-        parts = zip(copies, transforms, strict=True)
-        gaps = [policy_consistency_loss(head.divergence, head.pull_back(p, g), original, stop) for p, g in parts]
-        return torch.stack([masked_mean(gap, valid) for gap in gaps]).mean(0)

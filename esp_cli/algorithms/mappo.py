@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -29,8 +30,7 @@ from esp_cli.algorithms.rollout import Collector, Rollout
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic, CriticInput
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import policy_consistency_loss, value_consistency_loss
-from esp_cli.symmetry import Transform
+from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment, Observation
 from esp_envs.spec import TaskSpec
 
@@ -144,7 +144,7 @@ class Mappo(Learner):
             self.anneal(remaining)
         entropy_coef = config.entropy_coef * (remaining if config.anneal_entropy else 1.0)
 
-        batch, metrics = self._prepare(rollout)
+        batch, metrics = self.prepare(rollout)
         self._remember_old_networks()
         for epoch in range(config.num_epochs):
             is_last = epoch == config.num_epochs - 1
@@ -153,9 +153,11 @@ class Mappo(Learner):
                 self._gradient_step(minibatch, entropy_coef, sums if is_last else None)
         metrics |= {f"train/{name}": value / config.num_minibatches for name, value in sums.items()}
         metrics["train/augmented_share"] = torch.full((batch.obs.shape[0],), self.prior.augmented_share)
-        return metrics | self._symmetry_errors(batch)
+        probed = batch.first(max(1, PROBE_STEPS // batch.obs.shape[2]))
+        errors = self.prior.errors(probed, self.answers)
+        return metrics | {f"train/{name}": error for name, error in errors.items()}
 
-    def _prepare(self, rollout: Rollout) -> tuple[Batch, dict[str, Tensor]]:
+    def prepare(self, rollout: Rollout) -> tuple[Batch, dict[str, Tensor]]:
         """Value every state, estimate advantages, and shape the rollout into sequences."""
         config = self.config
         reward = rollout.reward.mean(-1, keepdim=True) if self.num_values == 1 else rollout.reward
@@ -211,11 +213,25 @@ class Mappo(Learner):
         return self.critic.unroll(observation.obs.unsqueeze(2), observation.state.unsqueeze(2)).squeeze(2)
 
     def _remember_old_networks(self) -> None:
-        """Keep the behaviour policy and the critic of the rollout where something is evaluated anew under them."""
-        recompute = self.prior.config.augments and (
-            self.prior.config.old_log_prob == "recompute" or self.config.clip_value
-        )
-        self._old = (copy.deepcopy(self.policy), copy.deepcopy(self.critic)) if recompute else None
+        """Keep the behaviour policy and the critic of the rollout where copies are evaluated anew under them."""
+        needed = self.prior.augments and (self.prior.recomputes or self.config.clip_value)
+        self._old = (copy.deepcopy(self.policy), copy.deepcopy(self.critic)) if needed else None
+
+    @torch.no_grad()
+    def reevaluated(self, copied: Batch) -> Batch:
+        """Return copies with what the networks of the rollout say of them.
+
+        The old log-probability is that of the original unless the prior recomputes it; the old value, which value
+        clipping alone reads, is always evaluated anew. Recurrent networks are unrolled over the transformed history.
+        """
+        if self._old is None:
+            return copied
+        policy, critic = self._old
+        if self.prior.recomputes:
+            copied = replace(copied, log_prob=policy.head.log_prob(policy.unroll(copied.obs), copied.action))
+        if self.config.clip_value:
+            copied = replace(copied, value=critic.unroll(copied.obs, copied.state))
+        return copied
 
     def _minibatches(self, batch: Batch) -> list[Batch]:
         """Shuffle the sequences of each seed by its own generator and cut them into minibatches."""
@@ -228,13 +244,13 @@ class Mappo(Learner):
 
     def _gradient_step(self, minibatch: Batch, entropy_coef: float, sums: dict[str, Tensor] | None) -> None:
         """Take one gradient step, accumulated over chunks small enough for the processor's cache."""
-        transforms = self.prior.for_minibatch(self.generators["prior"])
+        copies = self.prior.copies(minibatch, self.generators["prior"], self.reevaluated)
         num_seeds, total, length = minibatch.obs.shape[:3]
         size = max(1, self.config.chunk_steps // (num_seeds * length))
         self.optimiser.zero_grad(set_to_none=True)
-        for chunk in minibatch.chunks(size):
-            weight = chunk.obs.shape[1] / total
-            loss = self._loss(chunk, transforms, entropy_coef, weight, sums)
+        for chunk in copies.chunks(size):
+            weight = chunk.originals.count / total
+            loss = self._loss(chunk, entropy_coef, weight, sums)
             (loss.sum() * weight).backward()
         actor_norm = clip_gradients_per_seed([_grad(p) for p in self.actor_parameters], self.config.max_grad_norm)
         critic_norm = clip_gradients_per_seed([_grad(p) for p in self.critic_parameters], self.config.max_grad_norm)
@@ -243,111 +259,47 @@ class Mappo(Learner):
         self.optimiser.step()
 
     def _loss(
-        self,
-        chunk: Batch,
-        transforms: list[Transform],
-        entropy_coef: float,
-        weight: float,
-        sums: dict[str, Tensor] | None,
+        self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
     ) -> Tensor:
         """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S]."""
-        config, prior, head = self.config, self.prior.config, self.policy.head
-        count = chunk.obs.shape[1]
-        rows = self._with_copies(chunk, transforms)
+        config, head, rows, batch = self.config, self.policy.head, copies.rows, copies.batch
         outputs = self.policy.unroll(rows.obs, config.truncation)
         values = self.critic.unroll(rows.obs, rows.state, config.truncation)
 
-        used = rows if prior.augments else chunk
-        learned = outputs, values
-        if len(transforms) and not prior.augments:
-            learned = outputs[:, :count], values[:, :count]
-        log_prob, entropy = head.log_prob(learned[0], used.action), head.entropy(learned[0])
-        log_ratio = log_prob - used.log_prob
-        objective = clipped_surrogate(log_ratio, used.advantage, config.clip_epsilon)
-        old_value = used.value if config.clip_value else None
-        value_error = value_loss(learned[1], used.target, config.huber_delta, old_value, config.clip_epsilon)
-        loss = config.value_coef * _mean(value_error) - _mean(objective) - entropy_coef * _mean(entropy)
+        learned = copies.learned(outputs)
+        log_prob, entropy = head.log_prob(learned, batch.action), head.entropy(learned)
+        log_ratio = log_prob - batch.log_prob
+        objective = clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon)
+        old_value = batch.value if config.clip_value else None
+        value_error = value_loss(
+            copies.learned(values), batch.target, config.huber_delta, old_value, config.clip_epsilon
+        )
+        loss = config.value_coef * mean_per_seed(value_error) - mean_per_seed(objective)
+        loss = loss - entropy_coef * mean_per_seed(entropy)
+        loss = loss + copies.penalty(policy=(head, outputs), value=values)
 
-        if transforms and prior.coefficient > 0:
-            originals = outputs[:, :count], values[:, :count]
-            policy_gap, value_gap = self._consistency(originals, outputs[:, count:], values[:, count:], transforms)
-            loss = loss + self.prior.penalty(policy_gap, value_gap)
         if sums is not None:
-            ratio_gap = log_ratio.detach()[:, :count]
+            ratio_gap = copies.original(log_ratio.detach())
             ratio = ratio_gap.exp()
-            _add(
-                sums,
-                weight,
-                clip_fraction=_mean(((ratio - 1).abs() > config.clip_epsilon).float()),
-                kl=_mean(ratio - 1 - ratio_gap),
-                entropy=_mean(entropy[:, :count]),
-                policy_loss=-_mean(objective[:, :count]),
-                value_loss=_mean(value_error[:, :count]),
-            )
+            parts = {
+                "clip_fraction": ((ratio - 1).abs() > config.clip_epsilon).float(),
+                "kl": ratio - 1 - ratio_gap,
+                "entropy": copies.original(entropy),
+                "policy_loss": -copies.original(objective),
+                "value_loss": copies.original(value_error),
+            }
+            _add(sums, weight, **{name: mean_per_seed(part) for name, part in parts.items()})
         return loss
 
-    def _with_copies(self, chunk: Batch, transforms: list[Transform]) -> Batch:
-        """Return the chunk with its transformed copies behind it along the batch axis."""
-        if not transforms:
-            return chunk
-        return Batch.concatenate([chunk, *(self._transformed(chunk, g) for g in transforms)])
-
-    def _transformed(self, chunk: Batch, g: Transform) -> Batch:
-        """Return (L_g s, K_g a) with advantage and target of the original (Prop. 1).
-
-        The old log-probability is copied, or evaluated anew under the behaviour policy; the old value, which only
-        value clipping reads, is always evaluated anew. Recurrent networks are unrolled over the transformed history.
-        """
-        obs, state, action = g.obs(chunk.obs), g.state(chunk.state), g.action(chunk.action)
-        log_prob, advantage = g.per_agent(chunk.log_prob), g.per_agent(chunk.advantage)
-        target, value = chunk.target, chunk.value
-        if self.num_values > 1:
-            target, value = g.per_agent(target), g.per_agent(value)
-        if self._old is not None:
-            old_policy, old_critic = self._old
-            with torch.no_grad():
-                if self.prior.config.old_log_prob == "recompute":
-                    log_prob = old_policy.head.log_prob(old_policy.unroll(obs), action)
-                if self.config.clip_value:
-                    value = old_critic.unroll(obs, state)
-        return Batch(obs, state, action, log_prob, advantage, target, value)
-
-    @torch.no_grad()
-    def _symmetry_errors(self, batch: Batch) -> dict[str, Tensor]:
-        """Measure how far policy and critic are from symmetry, prior or not: Eq. 8 and 9 on fixed elements."""
-        probe = self.prior.probe
-        if not probe:
-            return {}
-        originals = batch.chunks(max(1, PROBE_STEPS // batch.obs.shape[2]))[0]
-        rows = Batch.concatenate([originals, *(self._transformed(originals, g) for g in probe)])
+    def answers(self, rows: Batch) -> Answers:
+        """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""
         outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(rows.obs, rows.state)
-        count = originals.obs.shape[1]
-        base = outputs[:, :count], values[:, :count]
-        policy_gap, value_gap = self._consistency(base, outputs[:, count:], values[:, count:], probe)
-        return {"train/policy_symmetry_error": policy_gap, "train/value_symmetry_error": value_gap}
-
-    def _consistency(
-        self, originals: tuple[Tensor, Tensor], outputs: Tensor, values: Tensor, transforms: list[Transform]
-    ) -> tuple[Tensor, Tensor]:
-        """Return S_pi (Eq. 8) and S_V (Eq. 9) per seed, averaged over the copies."""
-        stop, head = self.prior.config.stop_gradient, self.policy.head
-        policy_gaps, value_gaps = [], []
-        parts = zip(outputs.chunk(len(transforms), 1), values.chunk(len(transforms), 1), transforms, strict=True)
-        for copied_outputs, copied_values, g in parts:
-            pulled_back = head.pull_back(copied_outputs, g)
-            policy_gaps.append(_mean(policy_consistency_loss(head.divergence, pulled_back, originals[0], stop)))
-            value_gaps.append(_mean(value_consistency_loss(g.values(copied_values), originals[1], stop)))
-        return torch.stack(policy_gaps).mean(0), torch.stack(value_gaps).mean(0)
+        return {"policy": (self.policy.head, outputs), "value": values}
 
 
 def _grad(parameter: torch.nn.Parameter) -> Tensor:
     assert parameter.grad is not None
     return parameter.grad
-
-
-def _mean(x: Tensor) -> Tensor:
-    """Return the mean per seed: [S, ...] -> [S]."""
-    return x.flatten(1).mean(1)
 
 
 def _add(sums: dict[str, Tensor], weight: float, **values: Tensor) -> None:

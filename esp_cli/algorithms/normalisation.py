@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from esp_cli.algorithms.losses import masked_mean
+from esp_cli.prior import mean_per_seed
 
 
 class ValueNormaliser(nn.Module):
@@ -30,11 +30,7 @@ class ValueNormaliser(nn.Module):
 
     def update(self, target: Tensor, valid: Tensor | None = None) -> None:
         """Take in a batch of targets, those alone that are `valid` (of the same shape) where that is given."""
-        flat = target.flatten(1)
-        if valid is None:
-            mean, square = flat.mean(1), flat.square().mean(1)
-        else:
-            mean, square = masked_mean(target, valid), masked_mean(target.square(), valid)
+        mean, square = mean_per_seed(target, valid), mean_per_seed(target.square(), valid)
         for buffer, value in ((self.mean, mean), (self.square, square)):
             buffer.mul_(self.decay).add_(value, alpha=1 - self.decay)
         self.weight.mul_(self.decay).add_(1 - self.decay)

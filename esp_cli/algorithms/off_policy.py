@@ -12,14 +12,13 @@ from torch import Tensor, nn
 
 from esp_cli.algorithms.episodes import EpisodeCollector
 from esp_cli.algorithms.learner import Learner, LearnerConfig, below
-from esp_cli.algorithms.losses import clip_gradients_per_seed, masked_mean, td_targets
+from esp_cli.algorithms.losses import clip_gradients_per_seed, huber, td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.joint_q import OneValue
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.prior import value_consistency_loss
-from esp_cli.symmetry import Transform
+from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
 
 
@@ -59,6 +58,7 @@ class OffPolicyLearner(Learner):
         ValueError: the replay cannot hold what one round collects.
     """
 
+    replays = True
     config: OffPolicyConfig
     policy: HistoryPolicy
     collector: EpisodeCollector
@@ -66,7 +66,7 @@ class OffPolicyLearner(Learner):
     def build(self, env: Environment, network: NetworkConfig) -> None:
         """Make what the off-policy learners have in common; see `Learner.build`."""
         config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
-        per_round = config.num_envs * (1 + self.prior.num_copies * self.prior.config.augments_replay)
+        per_round = config.num_envs * (1 + self.prior.num_stored)
         if per_round > config.replay_episodes:
             raise ValueError(
                 f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
@@ -113,7 +113,8 @@ class OffPolicyLearner(Learner):
         metrics["train/augmented_share"] = torch.full_like(mean_return, self.prior.augmented_share)
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
-            metrics |= self._symmetry_errors(batch) | self._condition(batch)
+            errors = self.prior.errors(batch.first(PROBE_EPISODES), self.answers)
+            metrics |= {f"train/{name}": error for name, error in errors.items()} | self._condition(batch)
         return metrics
 
     @abstractmethod
@@ -121,8 +122,8 @@ class OffPolicyLearner(Learner):
         """Take one gradient step on a batch of originals and return what is logged of it, each [S]."""
 
     @abstractmethod
-    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
-        """Return the symmetry errors, by name and [S] each, of a batch with its copies behind it."""
+    def answers(self, rows: EpisodeBatch) -> Answers:
+        """Return what the networks say of rows, for `SymmetryPrior.errors`."""
 
     def _epsilon(self) -> float:
         """Return the exploration of the next round."""
@@ -137,13 +138,9 @@ class OffPolicyLearner(Learner):
         valid = episodes.valid.unsqueeze(-1).expand(episodes.reward.shape)
         self.reward_scale.update(episodes.reward.flatten(2), valid.flatten(2))
         self.replay.add(episodes)
-        for g in self.prior.for_replay(self.generators["prior"]):
-            self.replay.add(episodes.transformed(g))
+        for copies in self.prior.stored(episodes, self.generators["prior"]):
+            self.replay.add(copies)
         self.episodes += self.config.num_envs
-
-    def _with_copies(self, batch: EpisodeBatch, transforms: list[Transform]) -> EpisodeBatch:
-        """Return the batch with its transformed copies behind it along the batch axis."""
-        return EpisodeBatch.concatenate([batch, *(batch.transformed(g) for g in transforms)])
 
     def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
         """Return what the critic or the mixer sees of every state: [S, B, T + 1(, N), critic width]."""
@@ -170,24 +167,23 @@ class OffPolicyLearner(Learner):
         reward = self.reward_scale.normalise(reward) * self.spec.horizon**-0.5
         return td_targets(reward, next_value, ended.unsqueeze(-1), config.gamma, config.td_lambda)
 
-    def _targets_with_copies(self, target: Tensor, transforms: list[Transform]) -> Tensor:
-        """Return targets for originals and copies: a copy keeps that of its original (Prop. 1)."""
-        per_agent = target.shape[-1] > 1
-        return torch.cat([target, *(g.per_agent(target) if per_agent else target for g in transforms)], 1)
-
-    def _value_gap(self, values: Tensor, valid: Tensor, transforms: list[Transform]) -> Tensor:
-        """Return S_Q = E[(Q(s, a) - Q(L_g s, K_g a))^2] (supplement eq. 19) per seed, averaged over the copies.
+    def _td_loss(
+        self, values: Tensor, target: Tensor, copies: Copies[EpisodeBatch]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return L_TD + c S_Q (supplement eq. 19) per seed, and what is logged of it.
 
         Args:
-            values: [S, B (1 + copies), T, C], originals first.
-            valid: [S, B, T] of the originals.
-            transforms: one per copy.
+            values: [S, B (1 + copies), T, C] of what was done.
+            target: [S, B, T, C] of the originals.
+            copies: the batch.
         """
-        original, *copies = values.split(valid.shape[1], 1)
-        stop = self.prior.config.stop_gradient
-        parts = zip(copies, transforms, strict=True)
-        gaps = [masked_mean(value_consistency_loss(g.values(q), original, stop), valid) for q, g in parts]
-        return torch.stack(gaps).mean(0)
+        error = huber(copies.learned(values) - copies.inherited(target), self.config.huber_delta)
+        loss = mean_per_seed(error, copies.batch.valid) + copies.penalty(value=values)
+        valid = copies.originals.valid
+        return loss, {
+            "td_loss": mean_per_seed(copies.original(error), valid),
+            "value": mean_per_seed(copies.original(values), valid),
+        }
 
     def _step(self, optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor) -> Tensor:
         """Take one step down the losses [S] of all seeds; return their gradient norms [S] before clipping."""
@@ -197,15 +193,6 @@ class OffPolicyLearner(Learner):
         norm = clip_gradients_per_seed(gradients, self.config.max_grad_norm)
         optimiser.step()
         return norm
-
-    @torch.no_grad()
-    def _symmetry_errors(self, batch: EpisodeBatch) -> dict[str, Tensor]:
-        """Measure how far the networks are from symmetry, prior or not, on fixed elements."""
-        probe = self.prior.probe
-        if not probe:
-            return {}
-        rows = self._with_copies(batch.first(PROBE_EPISODES), probe)
-        return {f"train/{name}_symmetry_error": gap for name, gap in self.gaps(rows, probe).items()}
 
     def _condition(self, _: EpisodeBatch) -> dict[str, Tensor]:
         """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""

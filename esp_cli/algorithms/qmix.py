@@ -15,7 +15,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from esp_cli.algorithms.losses import huber, masked_mean
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.contract import NetworkConfig
@@ -23,7 +22,7 @@ from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
 from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.symmetry import Transform
+from esp_cli.prior import Answers
 from esp_envs.base import Environment
 from esp_envs.spec import Discrete, TaskSpec
 
@@ -89,35 +88,20 @@ class Qmix(OffPolicyLearner):
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q."""
-        config, count = self.config, batch.obs.shape[1]
-        transforms = self.prior.for_batch(self.generators["prior"])
-        rows = self._with_copies(batch, transforms)
-        utilities = self.policy.unroll(rows.obs, rows.action)
-        values = self._total(utilities, rows)
-        target = self._targets(batch, utilities[:, :count].detach())
-
-        learned, valid = values[:, :count], batch.valid
-        if self.prior.config.augments_batches:
-            learned, valid, target = values, rows.valid, self._targets_with_copies(target, transforms)
-        error = huber(learned - target, config.huber_delta)
-        loss = masked_mean(error, valid)
-        if transforms and self.prior.config.coefficient > 0:
-            loss = loss + self.prior.penalty(None, self._value_gap(values, batch.valid, transforms))
+        copies = self.prior.copies(batch, self.generators["prior"])
+        utilities = self.policy.unroll(copies.rows.obs, copies.rows.action)
+        values = self._total(utilities, copies.rows)
+        target = self._targets(batch, copies.original(utilities).detach())
+        loss, metrics = self._td_loss(values, target, copies)
         norm = self._step(self.optimiser, self.parameters, loss)
-        if (self.updates + 1) % config.target_every == 0:
+        if (self.updates + 1) % self.config.target_every == 0:
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_mixer.load_state_dict(self.mixer.state_dict())
-        return {
-            "td_loss": masked_mean(error[:, :count], batch.valid),
-            "value": masked_mean(values[:, :count], batch.valid),
-            "grad_norm": norm,
-        }
+        return metrics | {"grad_norm": norm}
 
-    def gaps(self, rows: EpisodeBatch, transforms: list[Transform]) -> dict[str, Tensor]:
-        """Return S_Q of a batch with its copies."""
-        values = self._total(self.policy.unroll(rows.obs, rows.action), rows)
-        count = values.shape[1] // (1 + len(transforms))
-        return {"value": self._value_gap(values, rows.valid[:, :count], transforms)}
+    def answers(self, rows: EpisodeBatch) -> Answers:
+        """Return Q_tot of rows, for `SymmetryPrior.errors`."""
+        return {"value": self._total(self.policy.unroll(rows.obs, rows.action), rows)}
 
     def _total(self, utilities: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A]."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry import Transform
+from esp_cli.prior import SeedBatch
 from esp_envs.spec import Discrete, TaskSpec
 
 
 @dataclass
-class EpisodeBatch:
+class EpisodeBatch(SeedBatch):
     """B whole episodes for each of S seeds; rows past the end of an episode are not valid.
 
     Shape:
@@ -22,33 +21,16 @@ class EpisodeBatch:
         terminated and valid [S, B, T] bool.
     """
 
-    obs: Tensor
-    state: Tensor
-    action: Tensor
+    per_agent = ("reward",)
+
     reward: Tensor
     terminated: Tensor
     valid: Tensor
 
-    def transformed(self, g: Transform) -> EpisodeBatch:
-        """Return (L_g o, L_g s, K_g a) of whole episodes; rewards stay (Eq. 5), or move with their agents."""
-        reward = g.per_agent(self.reward) if self.reward.shape[-1] > 1 else self.reward
-        return EpisodeBatch(
-            g.obs(self.obs), g.state(self.state), g.action(self.action), reward, self.terminated, self.valid
-        )
-
-    def first(self, count: int) -> EpisodeBatch:
-        """Return the first `count` episodes of each seed; views."""
-        return self._map(lambda x: x[:, :count])
-
-    @staticmethod
-    def concatenate(parts: list[EpisodeBatch]) -> EpisodeBatch:
-        """Put batches behind each other along the batch axis."""
-        if len(parts) == 1:
-            return parts[0]
-        return EpisodeBatch(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
-
-    def _map(self, function: Callable[[Tensor], Tensor]) -> EpisodeBatch:
-        return EpisodeBatch(**{name: function(tensor) for name, tensor in vars(self).items()})
+    @property
+    def mask(self) -> Tensor:
+        """[S, B, T] which rows count."""
+        return self.valid
 
 
 class EpisodeReplay:
@@ -104,9 +86,7 @@ class EpisodeReplay:
 
     def select(self, places: Tensor) -> EpisodeBatch:
         """Return the episodes at `places` [S, B]; each seed's come from its own store."""
-        num_seeds = places.shape[0]
-        rows = (places + self.capacity * torch.arange(num_seeds, device=places.device).unsqueeze(1)).flatten()
-        batch = self._store._map(lambda x: x.flatten(0, 1).index_select(0, rows).unflatten(0, places.shape))
+        batch = self._store.select(places)
         if batch.action.dtype == torch.int16:
             batch.action = batch.action.long()
         return batch

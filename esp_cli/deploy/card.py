@@ -86,7 +86,7 @@ def _action(spec: TaskSpec) -> dict[str, Any]:
     if isinstance(spec.action, Discrete):
         points = zip(spec.action.names, spec.action.points, strict=True)
         options = [{"index": k, "name": name, "means": list(point)} for k, (name, point) in enumerate(points)]
-        return {"choose": spec.action.kind.value[0], "options": options}
+        return {"choose": spec.action.kind.name, "options": options}
     return {"bounds": [-1.0, 1.0], "fields": _rows(spec.action.layout)}
 
 
@@ -108,7 +108,7 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
     lines += [_together(program.team)] if program.team > 1 else []
     lines.append("Action of one agent:")
     if isinstance(spec.action, Discrete):
-        lines.append(f"  the index of one of {spec.action.count} options, each a {spec.action.kind.value[0]}:")
+        lines.append(f"  the index of one of {spec.action.count} options, each a {spec.action.kind.name}:")
         shown = list(describe_action(spec.action))
         lines += [f"  {name}: {means}" for name, means in shown[:_MOST_ROWS]]
         lines += ["  ... (the rest is in policy.json)"] if len(shown) > _MOST_ROWS else []
@@ -146,7 +146,7 @@ def readme(alone: TrainedPolicy, description: dict[str, Any], sections: list[str
     lines += ["## Action", ""]
     if isinstance(spec.action, Discrete):
         shown = list(describe_action(spec.action))
-        lines += [f"The index of one option; each means a {spec.action.kind.value[0]}.", ""]
+        lines += [f"The index of one option; each means a {spec.action.kind.name}.", ""]
         lines += ["| option | means |", "|---|---|", *(f"| {name} | {means} |" for name, means in shown[:_MOST_ROWS])]
         lines += ["", f"All {len(shown)} are in `policy.json`."] if len(shown) > _MOST_ROWS else []
     else:

@@ -132,7 +132,7 @@ class Equivariant(Memoryless):
         super().__init__()
         if any(field.pixels is not None for field in io.layout.fields):
             raise ValueError(
-                f"the network 'equivariant' reads numbers, but {io.spec.name} shows pictures; use empn or mlp"
+                f"the network 'equivariant' reads numbers, but {io.spaces.label} shows pictures; use empn or mlp"
             )
         self.group = io.group(config.group)
         hidden = [[regular(self.group, copies_for(width, self.group))] for width in config.hidden]

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from esp_cli.networks.heads import Categorical, Head, best, same_disc, squash
-from esp_cli.symmetry import Transform
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 
@@ -70,10 +69,6 @@ class EpsilonGreedy(ExploringHead):
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return the mean squared difference of the values: [S, B, N]."""
         return (p - q).square().mean(-1)
-
-    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
-        """Return the values that give action a what `outputs` give to K_g a."""
-        return transform.pull_back(outputs)
 
     def encode(self, action: Tensor) -> Tensor:
         """Return one-hot rows."""
@@ -155,10 +150,6 @@ class BoundedPoint(ExploringHead):
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return half the squared distance of the actions, the KL of two Gaussians of deviation 1: [S, B, N]."""
         return 0.5 * (self.mode(p) - self.mode(q)).square().sum(-1)
-
-    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
-        """Return K_g^{-1} applied to the outputs, with which the squash commutes."""
-        return transform.pull_back_mean(outputs)
 
     def encode(self, action: Tensor) -> Tensor:
         """Return the action's own numbers."""

@@ -3,7 +3,7 @@
 The heads of learners that explore by a schedule of their own are in `exploration`.
 
 A head first normalises a network's outputs (once), then turns them into actions, log-probabilities, entropies and
-divergences, and knows how they are pulled back under a symmetry.
+divergences. What it normalised is one number per action, or the numbers of one, so that any symmetry pulls it back.
 Shapes: outputs [S, ..., N, outputs], action [S, ..., N] (discrete) or [S, ..., N, width].
 """
 
@@ -16,8 +16,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.symmetry import Transform
-from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind
+from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 
 class Head(nn.Module, ABC):
@@ -44,10 +43,6 @@ class Head(nn.Module, ABC):
     @abstractmethod
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return how far the policy with outputs p is from that with outputs q: [S, B, N]."""
-
-    @abstractmethod
-    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
-        """Bring outputs at L_g s home: the result gives action a what `outputs` give to K_g a."""
 
     def to_environment(self, action: Tensor) -> Tensor:
         """Return what `Environment.step` takes: the action as it is, unless a head says more."""
@@ -94,10 +89,6 @@ class Categorical(Head):
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return KL[p || q] of two sets of log-probabilities: [S, B, N]."""
         return (p.exp() * (p - q)).sum(-1)
-
-    def pull_back(self, log_probs: Tensor, transform: Transform) -> Tensor:
-        """Return the log-probabilities that give action a what `log_probs` give to K_g a."""
-        return transform.pull_back(log_probs)
 
 
 class BoundedGaussian(Head):
@@ -153,10 +144,6 @@ class BoundedGaussian(Head):
         """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
         return (0.5 * ((p - q) * (-self._log_std(p)).exp()).square()).sum(-1)
 
-    def pull_back(self, outputs: Tensor, transform: Transform) -> Tensor:
-        """Return K_g^{-1} applied to the means."""
-        return transform.pull_back_mean(outputs)
-
     def to_environment(self, action: Tensor) -> Tensor:
         """Squash the latent action to the task's bounds."""
         return squash(action, self.disc)
@@ -168,14 +155,14 @@ def best(values: Tensor) -> Tensor:
 
 
 def same_disc(space: Continuous) -> Tensor:
-    """Return the [width, width] 0/1 matrix that is 1 between numbers of one planar vector, and on the diagonal."""
+    """Return the [width, width] 0/1 matrix that is 1 between numbers of one vector, and on the diagonal."""
     items = [f.kind for f in space.layout.fields for _ in range(f.count)]
-    blocks = [torch.ones(2, 2) if kind is Kind.VECTOR else torch.eye(kind.width) for kind in items]
+    blocks = [torch.ones(k.width, k.width) if k.is_vector else torch.eye(k.width) for k in items]
     return torch.block_diag(*blocks)
 
 
 def squash(action: Tensor, disc: Tensor) -> Tensor:
-    """Map unbounded actions [..., width] into the bounds, planar vectors along their length: u tanh|u| / |u|."""
+    """Map unbounded actions [..., width] into the bounds, vectors along their length: u tanh|u| / |u|."""
     length = (action.square() @ disc + 1e-18).sqrt()
     return action * (torch.tanh(length) / length)
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from esp_cli.symmetry import FiniteGroup, admit, parse_group
 from esp_cli.symmetry.intertwiners import Block, action_blocks, layout_blocks, trivial
-from esp_envs.spec import Layout, TaskSpec, joint_layout
+from esp_envs.spec import Layout, Spaces, joint_layout
 
 Reads = Literal["state", "observations", "own"]
 
@@ -17,14 +17,14 @@ class IoSpec:
     """The input and output of a network in a task.
 
     Attributes:
-        spec: the task.
+        spaces: of the task.
         reads: the global state, all agents' observations in a row, or one agent's own observation; rows of own
             observations hold the agents of a world side by side.
         num_values: number of invariant outputs; None for an actor, whose outputs are one number per discrete action,
             or the numbers of a continuous action.
     """
 
-    spec: TaskSpec
+    spaces: Spaces
     reads: Reads
     num_values: int | None = None
 
@@ -32,8 +32,8 @@ class IoSpec:
     def layout(self) -> Layout:
         """The layout of an input row."""
         if self.reads == "observations":
-            return joint_layout(self.spec.observation, self.spec.num_agents)
-        return self.spec.state if self.reads == "state" else self.spec.observation
+            return joint_layout(self.spaces.observation, self.spaces.num_agents)
+        return self.spaces.state if self.reads == "state" else self.spaces.observation
 
     def group(self, name: str) -> FiniteGroup:
         """Return a group of turns and mirrors by its name.
@@ -41,10 +41,10 @@ class IoSpec:
         Raises:
             ValueError: there is no such group, it is infinite or moves agents, or the task cannot carry it.
         """
-        group = parse_group(name, self.spec.num_agents)
+        group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
             raise ValueError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
-        admit(name, group, self.spec)
+        admit(name, group, self.spaces)
         return group
 
     def inputs(self, group: FiniteGroup) -> list[Block]:
@@ -55,4 +55,4 @@ class IoSpec:
         """Return how an output row transforms."""
         if self.num_values is not None:
             return [trivial(group, self.num_values)]
-        return action_blocks(self.spec.action, group)
+        return action_blocks(self.spaces.action, group)

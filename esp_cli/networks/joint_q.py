@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.layers import SeedLinear, SeedMLP, affine
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Spaces
 
 
 class OneValue:
@@ -22,7 +22,7 @@ class OneValue:
         reads: what the critic sees of a scene: the global state, or all observations.
     """
 
-    def __init__(self, spec: TaskSpec, reads: Literal["state", "observations"]) -> None:
+    def __init__(self, spec: Spaces, reads: Literal["state", "observations"]) -> None:
         self.spec, self.reads = spec, reads
 
     @property

@@ -209,7 +209,7 @@ class MessagePassing(Memoryless):
             )
         picture, others = _fields(io)
         self.group = io.group(group)
-        self.team = io.spec.num_agents
+        self.team = io.spaces.num_agents
         self.picture, self.others = (io.layout.slices()[field.name] for field in (picture, others))
         self.encoder = PictureEncoder(generators, picture, self.group)
         (vector,) = layout_blocks(Layout((Field("way", Kind.VECTOR),)), self.group)
@@ -261,11 +261,11 @@ class MessagePassing(Memoryless):
 def _fields(io: IoSpec) -> tuple[Field, Field]:
     """Return the field of pictures and that of relative positions."""
     fields = io.layout.fields
-    pictures = [f for f in fields if f.kind is Kind.PICTURE]
-    others = [f for f in fields if f.kind is Kind.VECTOR and f.items is Items.OTHERS]
-    if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != io.spec.num_agents - 1:
+    pictures = [f for f in fields if f.kind == Kind.PICTURE]
+    others = [f for f in fields if f.kind == Kind.VECTOR and f.items is Items.OTHERS]
+    if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != io.spaces.num_agents - 1:
         raise ValueError(
-            f"message passing needs a picture and the way to each other agent, but {io.spec.name} does not show "
+            f"message passing needs a picture and the way to each other agent, but {io.spaces.label} does not show "
             "them; use mlp, gru or equivariant"
         )
     return pictures[0], others[0]

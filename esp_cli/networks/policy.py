@@ -13,7 +13,7 @@ from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_hea
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.separate import Separate, action_parts
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Spaces
 
 POLICY_GAIN = 0.01
 """Orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)."""
@@ -35,7 +35,7 @@ class Policy(nn.Module):
 
     def __init__(
         self,
-        spec: TaskSpec,
+        spec: Spaces,
         network: NetworkConfig,
         generators: Sequence[torch.Generator],
         head: Head,
@@ -75,7 +75,7 @@ class StochasticPolicy(Policy):
 
     head: Categorical | BoundedGaussian
 
-    def __init__(self, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
+    def __init__(self, spec: Spaces, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
         super().__init__(spec, network, generators, build_head(spec.action, len(generators)), POLICY_GAIN)
 
     def unroll(self, obs: Tensor, truncation: int = 0) -> Tensor:
@@ -96,7 +96,7 @@ class HistoryPolicy(Policy):
 
     def __init__(
         self,
-        spec: TaskSpec,
+        spec: Spaces,
         network: NetworkConfig,
         generators: Sequence[torch.Generator],
         head: ExploringHead,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import Network
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.symmetry.intertwiners import planar_matrices
-from esp_cli.symmetry.representation import layout_matrix, rows_permutation
+from esp_cli.symmetry.maps import rows_map
 
 
 class Symmetrised(Network):
@@ -31,32 +32,30 @@ class Symmetrised(Network):
         self.group = io.group(group)
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
-        planar = planar_matrices(self.group)
-        self.pictured = any(field.pixels is not None for field in io.layout.fields)
-        self.push: Tensor
-        self.sign: Tensor
-        self.home: Tensor
-        if self.pictured:
-            source, sign = rows_permutation(io.layout, planar, None)
-            self.register_buffer("push", torch.as_tensor(source), False)
-            self.register_buffer("sign", torch.as_tensor(sign, dtype=torch.float32), False)
-        else:
-            matrix = torch.as_tensor(layout_matrix(io.layout, planar), dtype=torch.float32)
-            self.register_buffer("push", matrix.transpose(1, 2).contiguous(), False)
-        blocks = io.outputs(self.group)
+        self.image = rows_map(io.layout, self.group.elements, io.spaces.num_agents)
         home = [
             torch.block_diag(
-                *(torch.as_tensor(b.matrices[g], dtype=torch.float32) for b in blocks for _ in range(b.copies))
+                *(
+                    torch.as_tensor(b.matrices[g], dtype=torch.float32)
+                    for b in io.outputs(self.group)
+                    for _ in range(b.copies)
+                )
             )
             for g in range(self.group.order)
         ]
+        self.home: Tensor
         self.register_buffer("home", torch.stack(home), False)
 
     def _images(self, x: Tensor) -> Tensor:
         """Return all images of rows x [S, B, D], one behind the other: [S, G * B, D]."""
-        if self.pictured:
-            return torch.cat([x.index_select(-1, p) * s for p, s in zip(self.push, self.sign, strict=True)], 1)
-        return torch.matmul(x.unsqueeze(1), self.push).flatten(1, 2)
+        num_seeds, batch, width = x.shape
+        rows = x.reshape(1, -1, width).expand(self.group.order, -1, -1)
+        return self.image.push(rows).view(-1, num_seeds, batch, width).transpose(0, 1).flatten(1, 2)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Symmetrised:
+        """Move the map with the module, as torch moves its buffers."""
+        self.image = self.image.apply(fn)
+        return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def _mean(self, y: Tensor) -> Tensor:
         """Bring outputs [S, G * B, out] home and average them: [S, B, out]."""

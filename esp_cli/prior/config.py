@@ -8,9 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class PriorConfig(BaseModel):
-    """The symmetry prior: which elements, and by which of the two soft means.
+    """The symmetry prior: which elements, and how they enter learning.
 
-    `kind` "esp" is both means, "augment" and "consistency" one of them, "none" the plain learner.
+    `kind` "esp" has both parts, copies and consistency losses; "augment" and "consistency" have one of them; "none" is
+    the plain learner.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -41,16 +42,6 @@ class PriorConfig(BaseModel):
         return self.kind in ("esp", "augment")
 
     @property
-    def augments_batches(self) -> bool:
-        """Whether an off-policy learner's loss takes copies of drawn batches."""
-        return self.augments and self.replay == "sampled"
-
-    @property
-    def augments_replay(self) -> bool:
-        """Whether copies of episodes enter an off-policy learner's replay."""
-        return self.augments and self.replay == "stored"
-
-    @property
     def coefficient(self) -> float:
         """c, or 0 where the consistency loss is off."""
         return self.consistency_coef if self.kind in ("esp", "consistency") else 0.0
@@ -59,7 +50,7 @@ class PriorConfig(BaseModel):
         """Return this prior with every setting that has no effect beside the others at its default.
 
         Two priors with the same effective settings train the same, bit for bit: one without a coefficient is one
-        without consistency, and without either of its means the prior is none.
+        without consistency, and without either part the prior is none.
         """
         loses = {
             "none": set(type(self).model_fields),

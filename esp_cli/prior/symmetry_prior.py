@@ -1,82 +1,124 @@
-"""The object that a learner is given: it hands out transforms and says what to do with them."""
+"""The object that a learner is given: it makes copies of experience and says what they are for."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypedDict
 
 import torch
 from torch import Tensor
 
 from esp_cli.prior.config import PriorConfig
+from esp_cli.prior.copies import Copies, Divergent
+from esp_cli.prior.seed_batch import Rows
 from esp_cli.symmetry import Transform, carried_groups, transform_set
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Spaces
+
+
+class Answers(TypedDict, total=False):
+    """What networks say of rows: see `Copies.gaps`."""
+
+    policy: tuple[Divergent, Tensor]
+    value: Tensor
 
 
 class SymmetryPrior:
-    """A task's known symmetry, ready for use in a learner's update.
-
-    `probe` holds the fixed elements on which symmetry errors are measured, with a prior or without.
+    """A known symmetry of some spaces, ready for use in a learner's update.
 
     Args:
         config: what the user chose.
-        spec: the task; it decides how an element acts, and may refuse it.
+        spaces: of the task; they decide how an element acts, and may refuse it.
         device: where the transforms live.
+        replays: whether the learner has a replay, in which copies may be stored.
+
+    Attributes:
+        config: what the user chose.
+        augments: whether copies of a batch enter the learner's own loss.
+        transforms: the elements that copies are made with; None without a prior.
 
     Raises:
         ValueError: the task cannot carry an element, or all copies of an infinite group are asked for.
     """
 
-    def __init__(self, config: PriorConfig, spec: TaskSpec, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, config: PriorConfig, spaces: Spaces, device: torch.device | str = "cpu", replays: bool = False
+    ) -> None:
         self.config = config
-        self.active = config.augments or config.coefficient > 0
-        self.transforms = transform_set(config.transforms, spec, device) if self.active else None
+        self._stores = config.augments and replays and config.replay == "stored"
+        self.augments = config.augments and not self._stores
+        active = config.augments or config.coefficient > 0
+        self.transforms = transform_set(config.transforms, spaces, device) if active else None
         if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
-
-        self.probe = _probe(spec, device)
+        self._probe = _probe(spaces, device)
 
     @property
     def num_copies(self) -> int:
-        """Transformed copies of every row of a minibatch."""
+        """Transformed copies of every row."""
         if self.transforms is None:
             return 0
         return self.transforms.size if self.config.copies == "all" else 1
+
+    @property
+    def num_stored(self) -> int:
+        """Copies of every episode that are stored beside it."""
+        return self.num_copies if self._stores else 0
 
     @property
     def augmented_share(self) -> float:
         """Share of the rows in a learner's own loss that are copies."""
         return self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
 
-    def for_minibatch(self, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return the transforms of the next minibatch, each one element per seed.
+    @property
+    def recomputes(self) -> bool:
+        """Whether the old log-probability of a copy is evaluated anew (Eq. 7), not that of its original."""
+        return self.augments and self.config.old_log_prob == "recompute"
+
+    def copies(
+        self, batch: Rows, generators: Sequence[torch.Generator], adapt: Callable[[Rows], Rows] | None = None
+    ) -> Copies[Rows]:
+        """Return a batch with the copies for its gradient step; without any where nothing would use them.
 
         Args:
+            batch: the originals.
             generators: one per seed; only `copies` "draw" uses them, and only if there is something to draw.
+            adapt: what the learner changes in a copy that transforming alone leaves wrong.
         """
+        used = self.augments or self.config.coefficient > 0
+        return Copies(self.config, batch, self._draw(generators) if used else [], self.augments, adapt)
+
+    def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
+        """Return the copies of new experience that belong beside it in a replay."""
+        return [batch.transformed(g) for g in self._draw(generators)] if self._stores else []
+
+    @torch.no_grad()
+    def errors(self, batch: Rows, evaluate: Callable[[Rows], Answers]) -> dict[str, Tensor]:
+        """Measure how far networks are from symmetry, with a prior or without, on fixed elements.
+
+        Args:
+            batch: the originals.
+            evaluate: returns what the networks say of rows.
+
+        Returns:
+            "policy_symmetry_error" and "value_symmetry_error", [S] each, as far as `evaluate` answers; empty where the
+            task carries neither a quarter turn nor a mirror.
+        """
+        if not self._probe:
+            return {}
+        copies = Copies(self.config, batch, self._probe, augments=True)
+        return {f"{name}_symmetry_error": gap for name, gap in copies.gaps(**evaluate(copies.rows)).items()}
+
+    def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
+        """Return one transform per copy, each one element per seed."""
         if self.transforms is None:
             return []
         if self.config.copies == "all" or self.transforms.size == 1:
             return self.transforms.each()
         return [self.transforms.draw(generators)]
 
-    def for_replay(self, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return the transforms whose copies of new episodes an off-policy learner stores beside them."""
-        return self.for_minibatch(generators) if self.config.augments_replay else []
 
-    def for_batch(self, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return the transforms of the next batch out of a replay; none where nothing would use them."""
-        used = self.config.augments_batches or self.config.coefficient > 0
-        return self.for_minibatch(generators) if used else []
-
-    def penalty(self, policy_gap: Tensor | None, value_gap: Tensor | None) -> Tensor:
-        """Return c times the sum of the consistency terms that are on (Eq. 10); None is a term that isn't there."""
-        gaps = {"policy": policy_gap, "value": value_gap}
-        chosen = [gap for name, gap in gaps.items() if gap is not None and self.config.terms in ("both", name)]
-        return self.config.coefficient * sum(chosen, start=torch.zeros(()))
-
-
-def _probe(spec: TaskSpec, device: torch.device | str) -> list[Transform]:
+def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:
     """Return a quarter turn and a mirror, as far as the task carries them, for measuring symmetry errors."""
-    carried = carried_groups(spec)
+    carried = carried_groups(spaces)
     elements = ",".join(name for name, group in (("rot90", "c4"), ("flip-x", "d4")) if group in carried)
-    return transform_set(elements, spec, device).each() if elements else []
+    return transform_set(elements, spaces, device).each() if elements else []

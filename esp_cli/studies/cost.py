@@ -106,6 +106,6 @@ def _replay_to_come(config: RunConfig, learner: Learner) -> int:
     if not isinstance(learner, OffPolicyLearner):
         return 0
     replay = learner.replay
-    copies = 1 + learner.prior.num_copies * config.prior.augments_replay
+    copies = 1 + learner.prior.num_stored
     episodes = min(replay.capacity, config.steps // learner.spec.horizon * copies)
     return replay.num_bytes * max(0, episodes - replay.size) // replay.capacity

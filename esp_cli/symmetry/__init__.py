@@ -2,7 +2,7 @@
 
 from esp_cli.symmetry.admission import admit, carried_groups
 from esp_cli.symmetry.checks import environment_errors, network_equivariance_error
-from esp_cli.symmetry.elements import Element, mirror, rotation
+from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import (
     FiniteGroup,
     Group,
@@ -14,12 +14,14 @@ from esp_cli.symmetry.groups import (
     special_orthogonal,
 )
 from esp_cli.symmetry.parse import parse_elements, parse_group
+from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
 from esp_cli.symmetry.transforms import Transform, TransformSet, build_transform, transform_set
 
 __all__ = [
     "Element",
     "FiniteGroup",
     "Group",
+    "PlaneElement",
     "Transform",
     "TransformSet",
     "admit",

@@ -10,100 +10,98 @@ from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
 from esp_cli.symmetry.parse import parse_elements, parse_group
 from esp_cli.symmetry.representation import action_map, joint_sources, state_matrix
-from esp_envs.spec import Discrete, Items, TaskSpec, joint_layout
+from esp_envs.spec import Discrete, Items, Spaces, joint_layout
 
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
 """The planar groups that `carried_groups` tries, smaller ones first."""
 
 
-def admit(text: str, elements: Sequence[Element] | Group, spec: TaskSpec) -> None:
+def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> None:
     """Refuse transforms that a task cannot carry.
 
     Args:
         text: what the user wrote, for the message.
         elements: what it means.
-        spec: the task.
+        spaces: of the task.
 
     Raises:
         ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
             are to change places and a layout does not say which numbers follow them.
     """
     moved = elements.witnesses() if isinstance(elements, Group) else tuple(elements)
-    reason = _reason(moved, spec)
+    reason = _reason(moved, spaces)
     if reason is None:
         return
     advice = "use --prior none"
-    if carried := carried_groups(spec):
+    if carried := carried_groups(spaces):
         plane = [name for name in carried if name != "agents"]
         advice = f"use a group within {plane[-1]}" if plane else "use agents"
-        if _action_reason(moved, spec):
+        if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
-    raise ValueError(f"{text} cannot act on {spec.name}: {reason}; {advice}")
+    raise ValueError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
 
 
-def carried_groups(spec: TaskSpec) -> tuple[str, ...]:
+def carried_groups(spaces: Spaces) -> tuple[str, ...]:
     """Return the named groups that a task's actions and declared symmetry both carry, the largest planar one last.
 
     `agents` stands at the end if the agents of the task may change places.
     """
-    carried = [name for name in PLANE_GROUPS if _carries(name, spec)]
-    if spec.num_agents > 1 and _carries("agents", spec):
+    carried = [name for name in PLANE_GROUPS if _carries(name, spaces)]
+    if spaces.num_agents > 1 and _carries("agents", spaces):
         carried.append("agents")
     return tuple(carried)
 
 
-def _carries(name: str, spec: TaskSpec) -> bool:
-    moved = parse_group(name, spec.num_agents).witnesses()
-    return _reason(moved, spec) is None
+def _carries(name: str, spaces: Spaces) -> bool:
+    moved = parse_group(name, spaces.num_agents).witnesses()
+    return _reason(moved, spaces) is None
 
 
-def _reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why a task cannot carry elements, if it cannot."""
-    return _action_reason(elements, spec) or _task_reason(elements, spec) or _agents_reason(elements, spec)
+    return _action_reason(elements, spaces) or _task_reason(elements, spaces) or _agents_reason(elements, spaces)
 
 
-def _action_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which action has no image, if one has none."""
-    if isinstance(spec.action, Discrete):
+    if isinstance(spaces.action, Discrete):
         try:
-            action_map(spec.action, elements)
+            action_map(spaces.action, elements)
         except ValueError as error:
             return str(error)
     return None
 
 
-def _task_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which element is no symmetry of the dynamics and reward, if one is none."""
-    plane = [name for name in spec.symmetry.split("*") if name != "agents"]
-    declared = parse_group(plane[0] if plane else "c1", spec.num_agents)
+    plane = [name for name in spaces.symmetry.split("*") if name != "agents"]
+    declared = parse_group(plane[0] if plane else "c1", spaces.num_agents)
     for element in elements:
-        if element.planar not in declared:
-            return f"{element.planar.name} is no symmetry of its dynamics and reward, which carry {declared.name}"
+        if element.in_place not in declared:
+            return f"{element.in_place.name} is no symmetry of its dynamics and reward, which carry {declared.name}"
     return None
 
 
-def _agents_reason(elements: Sequence[Element], spec: TaskSpec) -> str | None:
+def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why agents cannot change places, if some are asked to and cannot."""
-    moving = [e.permutation for e in elements if e.permutation is not None]
+    moving = [element for element in elements if element.permutation is not None]
     if not moving:
         return None
-    if any(len(sigma) != spec.num_agents for sigma in moving):
-        return f"the permutation is not one of its {spec.num_agents} agents"
-    places = np.array(moving[:1], dtype=np.int64)
-    plane = np.eye(2)[None]
-    joint = spec.state == joint_layout(spec.observation, spec.num_agents)
-    if not joint and all(f.items is not Items.AGENTS for f in spec.state.fields):
+    if any(len(element.permutation or ()) != spaces.num_agents for element in moving):
+        return f"the permutation is not one of its {spaces.num_agents} agents"
+    joint = spaces.state == joint_layout(spaces.observation, spaces.num_agents)
+    if not joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
-        joint_sources(spec.observation, places)
-        state_matrix(spec, plane, places)
+        joint_sources(spaces.observation, np.array([moving[0].permutation]))
+        state_matrix(spaces, moving[:1])
     except ValueError as error:
         return str(error)
     return None
 
 
-def admitted_elements(text: str, spec: TaskSpec) -> tuple[Element, ...] | Group:
+def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
     """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`)."""
-    elements = parse_elements(text, spec.num_agents)
-    admit(text, elements, spec)
+    elements = parse_elements(text, spaces.num_agents)
+    admit(text, elements, spaces)
     return elements

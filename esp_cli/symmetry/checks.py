@@ -32,10 +32,10 @@ def network_equivariance_error(
     with torch.no_grad():
         if policy is not None:
             here, there = policy(obs), policy(transform.obs(obs))
-            if transform.action_index is None:
-                errors["policy"] = _gap(transform.pull_back_mean(there), here)
-            else:
-                errors["policy"] = _gap(transform.pull_back(there).softmax(-1), here.softmax(-1))
+            pulled = transform.pull_back(there)
+            if transform.action_index is not None:
+                pulled, here = pulled.softmax(-1), here.softmax(-1)
+            errors["policy"] = _gap(pulled, here)
         if value is not None:
             errors["value"] = _gap(transform.values(value(transform.state(state))), value(state))
     return errors

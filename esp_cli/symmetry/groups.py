@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from esp_cli.symmetry.elements import Element, mirror
+from esp_cli.symmetry.elements import Element
+from esp_cli.symmetry.plane import PlaneElement, mirror
 
 LISTED_LIMIT = 1024
 """Largest number of elements that is listed; larger groups (all orders of 7 agents: 5040) are sampled instead."""
@@ -38,7 +39,7 @@ class Group(ABC):
 
 
 class FiniteGroup(Group):
-    """A listed group: identity first, then by mirror, turn and permutation.
+    """A listed group, sorted by `Element.order`: identity first.
 
     Attributes:
         name: what `parse_elements` calls it.
@@ -47,7 +48,7 @@ class FiniteGroup(Group):
 
     def __init__(self, name: str, elements: Iterable[Element]) -> None:
         self.name = name
-        self.elements = tuple(sorted(set(elements), key=lambda e: (e.permutation or (), e.mirrored, e.turn)))
+        self.elements = tuple(sorted(set(elements), key=lambda e: e.order))
         self._index = {element: i for i, element in enumerate(self.elements)}
 
     @classmethod
@@ -58,7 +59,8 @@ class FiniteGroup(Group):
             ValueError: it has more than `LISTED_LIMIT` elements.
         """
         gens = tuple(generators)
-        found, frontier = {Element()}, [Element()]
+        identity = gens[0] @ gens[0].inverse()
+        found, frontier = {identity}, [identity]
         while frontier:
             # In a finite group, products of generators already contain every inverse.
             frontier = [p for p in {g @ h for g in gens for h in frontier} if p not in found]
@@ -105,14 +107,16 @@ class PlaneGroup(Group):
         """Draw an angle uniformly, and for O(2) a fair mirror flag."""
         turn = Fraction(float(torch.rand((), generator=generator, dtype=torch.float64)))
         mirrored = self.mirrors and bool(torch.randint(2, (), generator=generator))
-        return Element(turn, mirrored)
+        return PlaneElement(turn, mirrored)
 
     def __contains__(self, element: object) -> bool:
-        return isinstance(element, Element) and element.permutation is None and (self.mirrors or not element.mirrored)
+        if not isinstance(element, PlaneElement) or element.permutation is not None:
+            return False
+        return self.mirrors or not element.mirrored
 
     def witnesses(self) -> tuple[Element, ...]:
         """Return one radian (its multiples come near every turn) and, for O(2), `flip-x`."""
-        radian = Element(Fraction(1 / math.tau))
+        radian = PlaneElement(Fraction(1 / math.tau))
         return (radian, mirror()) if self.mirrors else (radian,)
 
 
@@ -125,16 +129,16 @@ class AgentPermutations(Group):
 
     def draw(self, generator: torch.Generator) -> Element:
         """Draw an order uniformly."""
-        return Element(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
+        return PlaneElement(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
 
     def __contains__(self, element: object) -> bool:
-        if not isinstance(element, Element) or not element.planar.is_identity:
+        if not isinstance(element, Element) or not element.in_place.is_identity:
             return False
         return element.permutation is None or len(element.permutation) == self.num_agents
 
     def witnesses(self) -> tuple[Element, ...]:
         """Return the swap of the first two agents and the round of all of them, which generate every order."""
-        return tuple(Element(permutation=p) for p in _swap_and_round(self.num_agents))
+        return tuple(PlaneElement(permutation=p) for p in _swap_and_round(self.num_agents))
 
 
 class ProductGroup(Group):
@@ -151,7 +155,7 @@ class ProductGroup(Group):
     def __contains__(self, element: object) -> bool:
         if not isinstance(element, Element):
             return False
-        return element.planar in self.plane and Element(permutation=element.permutation) in self.agents
+        return element.in_place in self.plane and PlaneElement(permutation=element.permutation) in self.agents
 
     def witnesses(self) -> tuple[Element, ...]:
         """Return those of both factors."""
@@ -164,12 +168,12 @@ def _swap_and_round(num_agents: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 def cyclic(n: int) -> FiniteGroup:
     """Return C_n, the turns by multiples of 360/n degrees."""
-    return FiniteGroup.generated_by(f"c{n}", [Element(Fraction(1, n))])
+    return FiniteGroup.generated_by(f"c{n}", [PlaneElement(Fraction(1, n))])
 
 
 def dihedral(n: int) -> FiniteGroup:
     """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
-    return FiniteGroup.generated_by(f"d{n}", [Element(Fraction(1, n)), mirror()])
+    return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])
 
 
 def special_orthogonal() -> PlaneGroup:
@@ -192,7 +196,7 @@ def agent_permutations(num_agents: int) -> Group:
         raise ValueError("agents can only change places where there are two or more; choose a planar group")
     if math.factorial(num_agents) > LISTED_LIMIT:
         return AgentPermutations(num_agents)
-    return FiniteGroup("agents", (Element(permutation=p) for p in permutations(range(num_agents))))
+    return FiniteGroup("agents", (PlaneElement(permutation=p) for p in permutations(range(num_agents))))
 
 
 def direct_product(plane: Group, agents: Group) -> Group:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.groups import FiniteGroup
-from esp_cli.symmetry.representation import Floats, action_map, item_matrix, picture_sources
-from esp_envs.spec import ActionSpace, Discrete, Layout
+from esp_cli.symmetry.representation import action_map, block_matrix
+from esp_envs.spec import ActionSpace, Discrete, Field, Kind, Layout
 
 _INDEPENDENT = 1e-6
 """Length of what is new in a map, of those that are averaged, below which it is rounding."""
@@ -52,15 +53,10 @@ def regular(group: FiniteGroup, copies: int) -> Block:
     return Block(matrices, copies)
 
 
-def planar_matrices(group: FiniteGroup) -> Floats:
-    """Return the matrices [G, 2, 2] by which the elements act on the plane."""
-    return np.stack([element.matrix for element in group.elements])
-
-
 def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
     """Return one block per field of a layout."""
-    planar = planar_matrices(group)
-    return [Block(item_matrix(field, planar), field.count) for field in layout.fields]
+    matrices = [block_matrix(field, group.elements) for field in layout.fields]
+    return [Block(m, field.width // m.shape[-1]) for m, field in zip(matrices, layout.fields, strict=True)]
 
 
 def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:
@@ -75,8 +71,7 @@ def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:
 
 def with_pixels(block: Block, side: int, group: FiniteGroup) -> Block:
     """Return how a square patch of pixels, each holding one copy of a block, transforms: number, then pixel."""
-    sources = picture_sources((side, side), planar_matrices(group))
-    pixels = np.take(np.eye(side * side), sources, axis=0)
+    pixels = block_matrix(Field("patch", Kind.PICTURE, pixels=(side, side)), group.elements)
     size = block.size * side * side
     return Block(np.einsum("gij,gkl->gikjl", block.matrices, pixels).reshape(-1, size, size), block.copies)
 

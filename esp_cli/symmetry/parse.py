@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from fractions import Fraction
 from functools import reduce
 
-from esp_cli.symmetry.elements import Element, mirror, rotation
+from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,
     FiniteGroup,
@@ -18,9 +19,10 @@ from esp_cli.symmetry.groups import (
     orthogonal,
     special_orthogonal,
 )
+from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
 
 _NAMED = {
-    "identity": Element(),
+    "identity": PlaneElement(),
     "flip-x": mirror(0),
     "flip-diagonal": mirror(45),
     "flip-y": mirror(90),
@@ -96,24 +98,35 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
 
 def _factor(word: str, text: str, num_agents: int) -> Element | Group:
     """Read one word: an element or a group."""
+    for read in READERS:
+        if (found := read(word, num_agents)) is not None:
+            return found
+    where = f" in '{text}'" if word != text else ""
+    raise ValueError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+
+
+def _read_plane(word: str, _: int) -> Element | Group | None:
     if word in _NAMED:
         return _NAMED[word]
-    if word == "so2":
-        return special_orthogonal()
-    if word == "o2":
-        return orthogonal()
-    if word == "agents":
-        return agent_permutations(num_agents)
+    if word in ("so2", "o2"):
+        return special_orthogonal() if word == "so2" else orthogonal()
     if match := re.fullmatch(r"([cd])(\d{1,3})", word):
         return _polygon(match[1], int(match[2]))
     if match := re.fullmatch("rot" + _DEGREES, word):
         return rotation(Fraction(match[1]))
     if match := re.fullmatch("flip-?" + _DEGREES, word):
         return mirror(Fraction(match[1]))
-    if re.fullmatch(r"agents(-\d{1,4})+", word):
-        return _permutation(word, num_agents)
-    where = f" in '{text}'" if word != text else ""
-    raise ValueError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+    return None
+
+
+def _read_agents(word: str, num_agents: int) -> Element | Group | None:
+    if word == "agents":
+        return agent_permutations(num_agents)
+    return _permutation(word, num_agents) if re.fullmatch(r"agents(-\d{1,4})+", word) else None
+
+
+READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents]
+"""What reads a word for N agents, or returns None; each kind of transform has its own."""
 
 
 def _polygon(letter: str, n: int) -> FiniteGroup:
@@ -122,9 +135,9 @@ def _polygon(letter: str, n: int) -> FiniteGroup:
     return cyclic(n) if letter == "c" else dihedral(n)
 
 
-def _permutation(word: str, num_agents: int) -> Element:
+def _permutation(word: str, num_agents: int) -> PlaneElement:
     sigma = tuple(int(x) for x in word.split("-")[1:])
     if sorted(sigma) != list(range(num_agents)):
         order = "-".join(map(str, (*range(1, num_agents), 0)))
         raise ValueError(f"'{word}' is no order of {num_agents} agents; write each place once, as in agents-{order}")
-    return Element(permutation=sigma)
+    return PlaneElement(permutation=sigma)

@@ -1,9 +1,9 @@
 """Transforms of whole batches: L_g on observations and states, K_g on actions, and the way back for outputs.
 
-A `Transform` holds one element per seed as stacked matrices and index tables, so that a batch of any size costs one
-matrix product or one gather. Observations, states and actions are pushed forward (`obs`, `state`, `action`,
-`per_agent`); what a network returned on transformed inputs is pulled back (`pull_back`, `pull_back_mean`, `values`)
-to stand beside what it returns on the originals: an equivariant policy has pull_back(policy(obs(x))) == policy(x).
+A `Transform` holds one element per seed as stacked maps, so that a batch of any size costs one matrix product or one
+gather for each space. Observations, states and actions are pushed forward (`obs`, `state`, `action`, `per_agent`); what
+a network returned on transformed inputs is pulled back (`pull_back`, `values`) to stand beside what it returns on the
+originals: an equivariant policy has pull_back(policy(obs(x))) == policy(x).
 
 Multiplying by a signed permutation matrix (every element of D4 and every agent permutation on scalars and vectors)
 is exact in floating point, as long as the device does not round the factors (TF32 does).
@@ -11,20 +11,18 @@ is exact in floating point, as long as the device does not round the factors (TF
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from esp_cli.symmetry.admission import admitted_elements
-from esp_cli.symmetry.elements import Element
+from esp_cli.symmetry.elements import Element, places_of
 from esp_cli.symmetry.groups import Group
-from esp_cli.symmetry.representation import action_map, rows_matrix, rows_permutation, state_matrix
-from esp_envs.spec import Discrete, TaskSpec
+from esp_cli.symmetry.maps import Gather, Map, dense, gather, rows_map
+from esp_cli.symmetry.representation import action_map, state_matrix
+from esp_envs.spec import Discrete, Spaces
 
 _STACK_LIMIT = 512
 """Stacks of at most this many elements are built once; longer ones (d4*agents with N >= 5) at each draw."""
@@ -32,38 +30,26 @@ _STACK_LIMIT = 512
 
 @dataclass(frozen=True)
 class Transform:
-    """One element per seed; with a single element it acts on any number of seeds alike.
+    """One element per seed, on data [S, ...]. A single element acts on any leading axes: [B, ...] or [S, B, ...].
 
-    The first axis of every argument is S; any batch axes may follow. Where agents stay in their places, rows may come
-    without an agent axis too. Results are new tensors, and gradients flow through.
+    Where agents stay in their places, rows may come without an agent axis. Results are new tensors, and gradients flow
+    through.
 
     Attributes:
         elements: the element of each seed.
-        num_agents: N.
-        places: [S, N] int64, agent i moves to places[i]; None where all agents stay.
-        came_from: [S, N] int64, the inverse of `places`.
-        obs_matrix: L_g, [S, D, D], or [S, N * D, N * D] where agents move; None for observations with pictures.
-        obs_source: of these L_g as a signed permutation, [S, D] or [S, N * D] int64: where each number comes from.
-        obs_sign: likewise, what it is multiplied by.
-        state_matrix: L_g of the global state, [S, Ds, Ds].
-        action_index: K_g of a discrete action space, [S, A] int64: what action j becomes.
-        pull_index: [S, A] (or [S, N * A]) int64, the place of each pulled-back number among a policy's outputs.
-        push_index: its inverse.
-        action_matrix: K_g of a continuous action space, [S, width, width], or [S, N * width, N * width].
+        agents: how agents change places, on one number for each; None where all stay.
+        obs_map: L_g of an observation, or of all agents' observations end to end where agents move.
+        state_map: L_g of the global state.
+        output_map: K_g of one number per discrete action, or of a continuous action, likewise.
+        action_index: K_g of a discrete action, [S, A] int64: what action j becomes; None of continuous ones.
     """
 
     elements: tuple[Element, ...]
-    num_agents: int
-    places: Tensor | None
-    came_from: Tensor | None
-    obs_matrix: Tensor | None
-    obs_source: Tensor | None
-    obs_sign: Tensor | None
-    state_matrix: Tensor
+    agents: Gather | None
+    obs_map: Map
+    state_map: Map
+    output_map: Map
     action_index: Tensor | None
-    pull_index: Tensor | None
-    push_index: Tensor | None
-    action_matrix: Tensor | None
 
     @property
     def num_seeds(self) -> int:
@@ -73,103 +59,80 @@ class Transform:
     @property
     def moves_agents(self) -> bool:
         """Whether agents may change places."""
-        return self.places is not None
+        return self.agents is not None
 
     def select(self, indices: Sequence[int]) -> Transform:
         """Return the transform made of the elements at these positions, one per seed."""
-        index = torch.tensor(indices, dtype=torch.int64).to(self.state_matrix.device, non_blocking=True)
-        chosen: dict[str, Any] = {"elements": tuple(self.elements[i] for i in indices)}
-        for f in fields(self):
-            if isinstance(tensor := getattr(self, f.name), Tensor):
-                chosen[f.name] = tensor.index_select(0, index)
-        return replace(self, **chosen)
+        index = torch.tensor(indices, dtype=torch.int64)
+        chosen = tuple(self.elements[i] for i in indices)
+
+        def pick(tensor: Tensor) -> Tensor:
+            return tensor.index_select(0, index.to(tensor.device, non_blocking=True))
+
+        return Transform(
+            elements=chosen,
+            agents=None if self.agents is None else self.agents.apply(pick),
+            obs_map=self.obs_map.apply(pick),
+            state_map=self.state_map.apply(pick),
+            output_map=self.output_map.apply(pick),
+            action_index=None if self.action_index is None else pick(self.action_index),
+        )
 
     def obs(self, x: Tensor) -> Tensor:
         """Apply L_g to observations [S, ..., N, D]; row i moves to row sigma(i)."""
-        if self.obs_matrix is not None:
-            return self._multiply(x, self.obs_matrix, rows=True)
-        assert self.obs_source is not None
-        assert self.obs_sign is not None
-        if self.moves_agents:
-            self._require_agents(x, -2)
-        self._require_width(x, self.obs_source.shape[-1] // (self.num_agents if self.moves_agents else 1))
-        flat = x.reshape(self._seeds_of(x), -1, self.obs_source.shape[-1])
-        moved = flat.gather(2, self.obs_source[:, None, :].expand(flat.shape))
-        return (moved * self.obs_sign[:, None, :].to(x.dtype)).reshape(x.shape)
+        return self._move(x, self.obs_map.push, self.obs_map.width, agent_axis=-2)
 
     def state(self, x: Tensor) -> Tensor:
         """Apply L_g to global states [S, ..., Ds]."""
-        return self._multiply(x, self.state_matrix, rows=False)
+        return self._move(x, self.state_map.push, self.state_map.width)
 
     def action(self, action: Tensor) -> Tensor:
         """Apply K_g to actions: [S, ..., N] int64 (discrete) or [S, ..., N, width]."""
         if self.action_index is None:
-            return self._multiply(action, self._continuous(), rows=True)
+            return self._move(action, self.output_map.push, self.output_map.width, agent_axis=-2)
         flat = action.reshape(self._seeds_of(action), -1)
         return self.per_agent(self.action_index.gather(1, flat).reshape(action.shape))
 
-    def action_one_hot(self, one_hot: Tensor) -> Tensor:
-        """Apply K_g to what counts over actions, such as the one-hot of a previous action or a mask [S, ..., N, A]."""
-        return self._gather(one_hot, self._discrete(self.push_index))
-
     def per_agent(self, x: Tensor) -> Tensor:
-        """Let a number per agent [S, ..., N] (reward, advantage, log-probability) move with its agent."""
-        return x if self.came_from is None else self._gather(x, self.came_from, agent_axis=-1)
+        """Let a number per agent [S, ..., N] (reward, advantage) move with it; one per world [S, ..., 1] stays."""
+        if self.agents is None or x.shape[-1] == 1:
+            return x
+        return self._move(x, self.agents.push, self.agents.width, agent_axis=-1)
 
-    def pull_back(self, logits: Tensor) -> Tensor:
-        """Bring logits or action values on transformed inputs home: out[..., n, a] = logits[..., sigma(n), K_g a].
+    def pull_back(self, outputs: Tensor) -> Tensor:
+        """Bring what a policy says of actions at L_g s home, by K_g^-1, to stand beside what it says at s.
 
-        Shape:
-            [S, ..., N, A] to the same.
-        """
-        return self._gather(logits, self._discrete(self.pull_index))
-
-    def pull_back_mean(self, mean: Tensor) -> Tensor:
-        """Bring continuous actions (a Gaussian's mean) on transformed inputs home, by K_g^-1.
+        Logits and action values: out[..., n, a] = outputs[..., sigma(n), K_g a]. Continuous actions: K_g^-1 of each.
 
         Shape:
-            [S, ..., N, width] to the same.
+            [S, ..., N, A] or [S, ..., N, width] to the same.
         """
-        return self._multiply(mean, self._continuous().transpose(1, 2), rows=True)
-
-    def pull_back_variance(self, variance: Tensor) -> Tensor:
-        """Return the variance of each number of a pulled-back Gaussian with independent numbers.
-
-        Exact for any element; the pulled-back numbers stay independent under D4, and under any rotation if both
-        numbers of a vector have one variance.
-
-        Shape:
-            [S, ..., N, width] to the same.
-        """
-        return self._multiply(variance, self._continuous().square().transpose(1, 2), rows=True)
+        return self._move(outputs, self.output_map.pull, self.output_map.width, agent_axis=-2)
 
     def values(self, values: Tensor) -> Tensor:
-        """Bring invariant values home: one per world is left alone, one per agent goes back to its agent.
-
-        Shape:
-            [S, ..., 1] or [S, ..., N] to the same.
-        """
-        if self.places is None or values.shape[-1] == 1:
+        """Bring invariant values home: one per world [S, ..., 1] is left alone, one per agent [S, ..., N] goes back."""
+        if self.agents is None or values.shape[-1] == 1:
             return values
-        return self._gather(values, self.places, agent_axis=-1)
+        return self._move(values, self.agents.pull, self.agents.width, agent_axis=-1)
 
-    def _multiply(self, x: Tensor, matrix: Tensor, rows: bool) -> Tensor:
-        """Multiply every row (where agents move: every run of N rows) by its seed's matrix."""
-        if rows and self.moves_agents:
-            self._require_agents(x, -2)
-        width = matrix.shape[-1]
-        joint = rows and self.moves_agents
-        self._require_width(x, width // self.num_agents if joint else width)
-        flat = x.reshape(self._seeds_of(x), -1, width)
-        return torch.bmm(flat, matrix.to(x.dtype).transpose(1, 2)).reshape(x.shape)
+    def _move(self, x: Tensor, move: Callable[[Tensor], Tensor], width: int, agent_axis: int | None = None) -> Tensor:
+        """Apply a map of rows of `width` numbers; where agents move, a row holds all N agents' numbers.
 
-    def _gather(self, x: Tensor, index: Tensor, agent_axis: int = -2) -> Tensor:
-        """Reorder the last numbers (where agents move: the last N times as many) by each seed's table."""
-        if self.moves_agents:
-            self._require_agents(x, agent_axis)
-        size = index.shape[-1]
-        flat = x.reshape(self._seeds_of(x), -1, size)
-        return flat.gather(2, index[:, None, :].expand(flat.shape)).reshape(x.shape)
+        Raises:
+            ValueError: the rows have another width, the agent axis another size, or the first axis other seeds.
+        """
+        if self.agents is not None and agent_axis is not None:
+            num_agents = self.agents.width
+            if x.dim() < -agent_axis or x.shape[agent_axis] != num_agents:
+                raise ValueError(
+                    f"agents change places: axis {agent_axis} of {list(x.shape)} must hold {num_agents} agents"
+                )
+            expected = width // num_agents if agent_axis == -2 else width
+        else:
+            expected = width
+        if x.shape[-1] != expected:
+            raise ValueError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
+        return move(x.reshape(self._seeds_of(x), -1, width)).reshape(x.shape)
 
     def _seeds_of(self, x: Tensor) -> int:
         """Return the size of the first axis to compute with: one element for all seeds makes seeds part of a batch."""
@@ -177,26 +140,8 @@ class Transform:
             raise ValueError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
         return self.num_seeds
 
-    def _require_width(self, x: Tensor, expected: int) -> None:
-        if x.shape[-1] != expected:
-            raise ValueError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
 
-    def _require_agents(self, x: Tensor, axis: int) -> None:
-        if x.dim() < 1 - axis or x.shape[axis] != self.num_agents:
-            raise ValueError(f"agents change places: axis {axis} of {list(x.shape)} must hold {self.num_agents} agents")
-
-    def _discrete(self, index: Tensor | None) -> Tensor:
-        if index is None:
-            raise ValueError("this task's actions are continuous; pull back a mean, not logits")
-        return index
-
-    def _continuous(self) -> Tensor:
-        if self.action_matrix is None:
-            raise ValueError("this task's actions are discrete; pull back logits, not a mean")
-        return self.action_matrix
-
-
-def build_transform(elements: Sequence[Element], spec: TaskSpec, device: torch.device | str = "cpu") -> Transform:
+def build_transform(elements: Sequence[Element], spaces: Spaces, device: torch.device | str = "cpu") -> Transform:
     """Stack the representations of some elements, one per seed, on a task's spaces.
 
     Raises:
@@ -204,42 +149,24 @@ def build_transform(elements: Sequence[Element], spec: TaskSpec, device: torch.d
     """
     if not elements:
         raise ValueError("a transform needs one element per seed, got none")
-    planar = np.stack([e.matrix for e in elements])
-    places = None
-    if any(e.permutation is not None for e in elements):
-        stay = tuple(range(spec.num_agents))
-        places = np.array([e.permutation or stay for e in elements], dtype=np.int64)
-    index = pull = matrix = source = sign = obs_matrix = None
-    if any(f.pixels is not None for f in spec.observation.fields):
-        source, sign = rows_permutation(spec.observation, planar, places)
-    else:
-        obs_matrix = rows_matrix(spec.observation, planar, places)
-    if isinstance(spec.action, Discrete):
-        index = pull = action_map(spec.action, elements)
+    chosen, num_agents = tuple(elements), spaces.num_agents
+    places = places_of(chosen, num_agents)
+    index: Tensor | None = None
+    if isinstance(spaces.action, Discrete):
+        image = action_map(spaces.action, chosen)
+        index = torch.as_tensor(image, device=device)
         if places is not None:
-            pull = (places[:, :, None] * spec.action.count + index[:, None, :]).reshape(len(elements), -1)
+            image = (places[:, :, None] * spaces.action.count + image[:, None, :]).reshape(len(chosen), -1)
+        output_map: Map = gather(image, device=device).inverse()
     else:
-        matrix = rows_matrix(spec.action.layout, planar, places)
-
-    def numbers(array: NDArray[np.float64] | None) -> Tensor | None:
-        return None if array is None else torch.as_tensor(array, dtype=torch.float32, device=device)
-
-    def indices(array: NDArray[np.int64] | None) -> Tensor | None:
-        return None if array is None else torch.as_tensor(array, device=device)
-
+        output_map = rows_map(spaces.action.layout, chosen, num_agents, device)
     return Transform(
-        elements=tuple(elements),
-        num_agents=spec.num_agents,
-        places=indices(places),
-        came_from=indices(None if places is None else np.argsort(places, axis=1)),
-        obs_matrix=numbers(obs_matrix),
-        obs_source=indices(source),
-        obs_sign=numbers(sign),
-        state_matrix=torch.as_tensor(state_matrix(spec, planar, places), dtype=torch.float32, device=device),
-        action_index=indices(index),
-        pull_index=indices(pull),
-        push_index=indices(None if pull is None else np.argsort(pull, axis=1)),
-        action_matrix=numbers(matrix),
+        elements=chosen,
+        agents=None if places is None else gather(places, device=device).inverse(),
+        obs_map=rows_map(spaces.observation, chosen, num_agents, device),
+        state_map=dense(state_matrix(spaces, chosen), device),
+        output_map=output_map,
+        action_index=index,
     )
 
 
@@ -252,8 +179,8 @@ class TransformSet:
         size: how many elements are listed, the identity not counted; 0 where the group is sampled.
     """
 
-    def __init__(self, elements: Sequence[Element] | Group, spec: TaskSpec, device: torch.device | str = "cpu") -> None:
-        self.spec = spec
+    def __init__(self, elements: Sequence[Element] | Group, spaces: Spaces, device: torch.device | str = "cpu") -> None:
+        self.spaces = spaces
         self.device = device
         self._group = elements if isinstance(elements, Group) else None
         self._elements = () if isinstance(elements, Group) else tuple(elements)
@@ -262,7 +189,7 @@ class TransformSet:
         self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
         # Built once where it fits: a draw is then a selection.
         stacked = 0 < self.size <= _STACK_LIMIT
-        self._stack = build_transform(self._elements, spec, device) if stacked else None
+        self._stack = build_transform(self._elements, spaces, device) if stacked else None
 
     def draw(self, generators: Sequence[torch.Generator]) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
@@ -275,11 +202,11 @@ class TransformSet:
             generators: one per seed, on the CPU.
         """
         if self._group is not None:
-            return build_transform([_draw_moving(self._group, g) for g in generators], self.spec, self.device)
+            return build_transform([_draw_moving(self._group, g) for g in generators], self.spaces, self.device)
         picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
         if self._stack is not None:
             return self._stack.select(picks)
-        return build_transform([self._elements[i] for i in picks], self.spec, self.device)
+        return build_transform([self._elements[i] for i in picks], self.spaces, self.device)
 
     def each(self) -> list[Transform]:
         """Return every element in order, each the same for all seeds.
@@ -291,21 +218,21 @@ class TransformSet:
             raise ValueError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
         if self._stack is not None:
             return [self._stack.select([i]) for i in range(self.size)]
-        return [build_transform([e], self.spec, self.device) for e in self._elements]
+        return [build_transform([e], self.spaces, self.device) for e in self._elements]
 
 
-def transform_set(text: str, spec: TaskSpec, device: torch.device | str = "cpu") -> TransformSet:
+def transform_set(text: str, spaces: Spaces, device: torch.device | str = "cpu") -> TransformSet:
     """Read transforms from text and build them for a task.
 
     Args:
         text: see `parse_elements`.
-        spec: the task.
+        spaces: of the task.
         device: where the tensors live.
 
     Raises:
         ValueError: the text means nothing, or the task cannot carry what it means.
     """
-    return TransformSet(admitted_elements(text, spec), spec, device)
+    return TransformSet(admitted_elements(text, spaces), spaces, device)
 
 
 def _draw_moving(group: Group, generator: torch.Generator) -> Element:

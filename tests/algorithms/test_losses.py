@@ -11,11 +11,11 @@ from esp_cli.algorithms.losses import (
     explained_variance,
     gae,
     huber,
-    masked_mean,
     normalise_per_seed,
     td_targets,
     value_loss,
 )
+from esp_cli.prior import mean_per_seed
 
 
 def row(*numbers):
@@ -122,8 +122,8 @@ def test_lambda_one_is_the_discounted_return_and_lambda_zero_the_one_step_target
 def test_a_masked_mean_counts_what_is_valid_alone():
     x = torch.tensor([[[1.0, 2.0], [3.0, torch.nan]], [[5.0, 5.0], [7.0, 7.0]]])
     valid = torch.tensor([[[True, True], [True, False]], [[False, False], [False, False]]])
-    assert masked_mean(x, valid).tolist() == [2.0, 0.0]
-    assert masked_mean(torch.stack([x, x + 2], -1), valid).tolist() == [3.0, 0.0]
+    assert mean_per_seed(x, valid).tolist() == [2.0, 0.0]
+    assert mean_per_seed(torch.stack([x, x + 2], -1), valid).tolist() == [3.0, 0.0]
 
 
 def test_normalisation_is_per_seed():

@@ -7,7 +7,7 @@ import torch
 
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.plain import MLP
-from tests.algorithms.off_policy import learner, turn
+from tests.algorithms.off_policy import learner
 
 
 def prepared(**choice):
@@ -132,7 +132,7 @@ def test_the_actor_climbs_the_critic_and_leaves_it_alone(rule):
     before = [p.clone() for p in trained.critic.parameters()]
     seen = trained._critic_rows(episodes)
     for _ in range(150):
-        trained._learn_actor(episodes, episodes, seen, [])
+        trained._learn_actor(trained.prior.copies(episodes, []), seen)
     probability = trained.policy.unroll(episodes.obs[:, :, :-1], episodes.action).exp()[..., 2]
     assert probability.mean() > 0.8
     assert all(torch.equal(p, q) for p, q in zip(before, trained.critic.parameters(), strict=True))
@@ -151,16 +151,16 @@ def test_target_networks_go_a_small_part_of_the_way():
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
 def test_the_policy_consistency_vanishes_for_a_policy_that_turns_with_the_world_alone(actions):
     trained, episodes = prepared(task__actions=actions, prior__transforms="rot90")
-    g = turn(trained.spec)
-    rows = trained._with_copies(episodes, [g])
-    velocity = rows.obs[:, :, :-1, :, :2]
+    copies = trained.prior.copies(episodes, trained.generators["prior"])
+    velocity = copies.rows.obs[:, :, :-1, :, :2]
     if actions == "discrete":
         follow = torch.log_softmax(velocity @ torch.tensor(trained.spec.action.points).T, -1)
         stubborn = torch.log_softmax(torch.arange(5.0), 0).expand(follow.shape)
     else:
         follow = velocity
         stubborn = torch.tensor([math.atanh(0.5), 0.0]).expand(follow.shape)
-    assert trained._policy_gap(follow, episodes.valid, [g]).max() < 1e-6
-    assert trained._policy_gap(stubborn, episodes.valid, [g]).min() > 0.1
+    assert copies.gaps(policy=(trained.head, follow))["policy"].max() < 1e-6
+    gap = copies.gaps(policy=(trained.head, stubborn))["policy"]
+    assert gap.min() > 0.1
     if actions == "continuous":  # (1/2, 0) pulled back is (0, -1/2): |(1/2, 1/2)|^2 / 2
-        torch.testing.assert_close(trained._policy_gap(stubborn, episodes.valid, [g]), torch.full((2,), 0.25))
+        torch.testing.assert_close(gap, torch.full((2,), 0.25))

@@ -85,10 +85,10 @@ def test_recomputed_old_log_probability_starts_the_ratio_at_one_and_a_copied_one
     def first_ratio(rule):
         trained = learner(prior__kind="augment", prior__transforms="rot90", prior__old_log_prob=rule)
         trained.iterate(0.0)
-        batch, _ = trained._prepare(trained.collector.collect(25))
+        batch, _ = trained.prepare(trained.collector.collect(25))
         trained._remember_old_networks()
-        (g,) = trained.prior.for_minibatch(trained.generators["prior"])
-        rows = trained._transformed(batch, g)
+        copies = trained.prior.copies(batch, trained.generators["prior"], trained.reevaluated)
+        rows = copies.rows.map(lambda x: x[:, batch.count :])
         log_prob = trained.policy.head.log_prob(trained.policy.unroll(rows.obs), rows.action)
         return (log_prob - rows.log_prob).abs().max().item()
 
@@ -98,9 +98,9 @@ def test_recomputed_old_log_probability_starts_the_ratio_at_one_and_a_copied_one
 
 def test_a_transformed_batch_turns_what_turns_and_keeps_what_stays():
     trained = learner(prior__transforms="rot90")
-    batch, _ = trained._prepare(trained.collector.collect(25))
-    (g,) = trained.prior.for_minibatch(trained.generators["prior"])
-    turned = trained._transformed(batch, g)
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    copies = trained.prior.copies(batch, trained.generators["prior"])
+    turned = copies.rows.map(lambda x: x[:, batch.count :])
     x, y = batch.obs[..., 0], batch.obs[..., 1]
     torch.testing.assert_close(turned.obs[..., 0], -y)
     torch.testing.assert_close(turned.obs[..., 1], x)
@@ -112,7 +112,7 @@ def test_a_transformed_batch_turns_what_turns_and_keeps_what_stays():
 
 def test_advantages_are_normalised_before_rows_are_copied():
     trained = learner()
-    batch, _ = trained._prepare(trained.collector.collect(25))
+    batch, _ = trained.prepare(trained.collector.collect(25))
     torch.testing.assert_close(batch.advantage.flatten(1).mean(1), torch.zeros(2), atol=1e-4, rtol=0)
     torch.testing.assert_close(batch.advantage.flatten(1).std(1), torch.ones(2), atol=1e-2, rtol=0)
 
@@ -168,7 +168,7 @@ def test_a_rollout_has_a_row_for_every_minibatch():
 def test_the_old_value_of_value_clipping_is_what_the_critic_said():
     trained = learner(mappo__clip_value=True)
     trained.iterate(0.0)
-    batch, _ = trained._prepare(trained.collector.collect(25))
+    batch, _ = trained.prepare(trained.collector.collect(25))
     now = trained.critic.unroll(batch.obs, batch.state)
     torch.testing.assert_close(batch.value, now, rtol=1e-4, atol=1e-5)
 
@@ -217,9 +217,9 @@ def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_valu
             expected = trained._value_of(rollout.finals[t])
             torch.testing.assert_close(following[:, :, t][cut[:, :, t]], expected[cut[:, :, t]])
     # what comes after an end is another episode: its value must not matter
-    batch, _ = trained._prepare(rollout)
+    batch, _ = trained.prepare(rollout)
     marred = copy.deepcopy(rollout)
     for t, final in marred.finals.items():
         final.obs[rollout.terminated[:, :, t]] = 7.0
-    again, _ = learner("wildlife", **settings)._prepare(marred)
+    again, _ = learner("wildlife", **settings).prepare(marred)
     torch.testing.assert_close(again.advantage, batch.advantage)

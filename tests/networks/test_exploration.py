@@ -71,7 +71,7 @@ def test_a_bounded_action_and_its_noise_stay_within_the_bounds(space):
     for action in (greedy, noisy):
         for field, span in zip(space.layout.fields, space.layout.slices().values(), strict=True):
             part = action[..., span]
-            size = part.norm(dim=-1) if field.kind is Kind.VECTOR else part.abs()
+            size = part.norm(dim=-1) if field.kind == Kind.VECTOR else part.abs()
             assert size.max() <= 1 + 1e-6
     assert not torch.equal(greedy, noisy)
     head.explore(0.0)
@@ -103,7 +103,7 @@ def test_squash_noise_and_bounds_turn_with_the_world():
     turned = head.sample(g.action(latent), g.action(noise))
     torch.testing.assert_close(turned, g.action(plain), atol=1e-5, rtol=1e-5)
     assert not torch.allclose(turned, plain, atol=1e-2)
-    torch.testing.assert_close(head.pull_back(turned, g), plain, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(g.pull_back(turned), plain, atol=1e-5, rtol=1e-5)
 
 
 def policy(name, continuous):

@@ -7,7 +7,7 @@ from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import HistoryPolicy, StochasticPolicy
 from esp_cli.networks.separate import action_parts
-from esp_cli.symmetry.elements import mirror
+from esp_cli.symmetry import mirror
 from esp_cli.symmetry.transforms import build_transform
 from esp_envs.registry import make
 from esp_envs.spec import Discrete, Kind

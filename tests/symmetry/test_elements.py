@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from esp_cli.symmetry import Element, mirror, rotation
+from esp_cli.symmetry import PlaneElement, mirror, rotation
 
 RIGHT, UP = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
@@ -30,7 +30,7 @@ def test_rot90_is_counter_clockwise() -> None:
         (mirror(135), "flip-antidiagonal", (-1, -2)),
     ],
 )
-def test_names_and_images_of_the_square(element: Element, name: str, image: tuple[int, int]) -> None:
+def test_names_and_images_of_the_square(element: PlaneElement, name: str, image: tuple[int, int]) -> None:
     assert element.name == name
     np.testing.assert_array_equal(element.matrix @ np.array([2.0, 1.0]), image)
 
@@ -56,38 +56,38 @@ def test_the_right_factor_of_a_product_acts_first() -> None:
 def test_inverses() -> None:
     assert rotation(90).inverse() == rotation(270)
     assert mirror(30).inverse() == mirror(30)
-    assert Element(permutation=(1, 2, 0)).inverse() == Element(permutation=(2, 0, 1))
+    assert PlaneElement(permutation=(1, 2, 0)).inverse() == PlaneElement(permutation=(2, 0, 1))
 
 
 def test_permutations_send_agent_i_to_sigma_of_i() -> None:
-    swap, round_ = Element(permutation=(1, 0, 2)), Element(permutation=(1, 2, 0))
+    swap, round_ = PlaneElement(permutation=(1, 0, 2)), PlaneElement(permutation=(1, 2, 0))
     # Agent 0 goes round to place 1, and the swap brings place 1 to place 0.
     assert (swap @ round_).permutation == (0, 2, 1)
     assert (round_ @ swap).permutation == (2, 1, 0)
 
 
 def test_an_order_that_moves_nobody_is_the_identity() -> None:
-    assert Element(permutation=(0, 1, 2)) == Element()
-    assert Element(permutation=(0, 1)).is_identity
+    assert PlaneElement(permutation=(0, 1, 2)) == PlaneElement()
+    assert PlaneElement(permutation=(0, 1)).is_identity
 
 
 @pytest.mark.parametrize(
     ("element", "name"),
     [
         (rotation("22.5"), "rot22.5"),
-        (Element(Fraction(1, 7)), "rot360/7"),
+        (PlaneElement(Fraction(1, 7)), "rot360/7"),
         (mirror("22.5"), "flip22.5"),
-        (Element(permutation=(1, 0, 2)), "agents-1-0-2"),
-        (rotation(90) @ Element(permutation=(1, 0)), "rot90*agents-1-0"),
-        (Element(Fraction(0.123456789)), "rot44.444"),
+        (PlaneElement(permutation=(1, 0, 2)), "agents-1-0-2"),
+        (rotation(90) @ PlaneElement(permutation=(1, 0)), "rot90*agents-1-0"),
+        (PlaneElement(Fraction(0.123456789)), "rot44.444"),
     ],
 )
-def test_names_of_other_elements(element: Element, name: str) -> None:
+def test_names_of_other_elements(element: PlaneElement, name: str) -> None:
     assert element.name == name
 
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match="is no permutation"):
-        Element(permutation=(0, 0, 1))
+        PlaneElement(permutation=(0, 0, 1))
     with pytest.raises(ValueError, match="of 2 and of 3 agents cannot be composed"):
-        Element(permutation=(1, 0)) @ Element(permutation=(1, 0, 2))
+        PlaneElement(permutation=(1, 0)) @ PlaneElement(permutation=(1, 0, 2))

@@ -22,6 +22,7 @@ from esp_cli.symmetry import (
     rotation,
     transform_set,
 )
+from esp_cli.symmetry.maps import Dense
 from esp_envs import Environment, make
 from esp_envs.epuck.physics import engine_names
 
@@ -68,8 +69,8 @@ def test_robots_can_change_places() -> None:
 
 def with_wheels_unswapped(env: Environment) -> Transform:
     right = build_transform([mirror(0)], env.spec)
-    assert right.action_matrix is not None
-    return replace(right, action_matrix=torch.eye(2).expand_as(right.action_matrix))
+    assert isinstance(right.output_map, Dense)
+    return replace(right, output_map=Dense(torch.eye(2).expand_as(right.output_map.matrix)))
 
 
 def test_a_mirror_that_leaves_the_wheels_alone_is_noticed() -> None:

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from esp_cli.symmetry import (
-    Element,
     FiniteGroup,
+    PlaneElement,
     agent_permutations,
     cyclic,
     dihedral,
@@ -45,7 +45,7 @@ def group(request: pytest.FixtureRequest) -> FiniteGroup:
 
 def test_name_and_order(group: FiniteGroup) -> None:
     assert group.order == ORDERS[group.name][1]
-    assert group.elements[0] == Element()
+    assert group.elements[0] == PlaneElement()
 
 
 def test_the_product_table_is_closed_and_each_row_and_column_holds_all(group: FiniteGroup) -> None:
@@ -103,7 +103,7 @@ def test_eight_agents_are_sampled_and_every_draw_is_an_order() -> None:
     draws = [group.draw(generator) for _ in range(50)]
     assert len(set(draws)) > 40
     assert all(d in group for d in draws)
-    assert Element(permutation=(1, 0)) not in group
+    assert PlaneElement(permutation=(1, 0)) not in group
     assert rotation(90) not in group
 
 
@@ -123,9 +123,9 @@ def test_membership_of_continuous_groups() -> None:
     assert rotation("12.34") in special_orthogonal()
     assert mirror(0) not in special_orthogonal()
     assert mirror(0) in orthogonal()
-    assert Element(permutation=(1, 0)) not in orthogonal()
+    assert PlaneElement(permutation=(1, 0)) not in orthogonal()
     both = direct_product(orthogonal(), agent_permutations(2))
     assert both.name == "o2*agents"
-    assert mirror(10) @ Element(permutation=(1, 0)) in both
+    assert mirror(10) @ PlaneElement(permutation=(1, 0)) in both
     assert all(w in both for w in both.witnesses())
     assert "rot90" not in both

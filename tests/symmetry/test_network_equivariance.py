@@ -51,10 +51,7 @@ def test_a_plain_network_fails_and_a_symmetrised_one_passes(make_spec, generator
     plain = network_equivariance_error(policy, value, obs, state, drawn)
     assert min(plain.values()) > 1e-2
 
-    def pull(t):
-        return t.pull_back_mean if continuous else t.pull_back
-
-    even_policy = symmetrised(policy, transforms.each(), lambda t: t.obs, pull)
+    even_policy = symmetrised(policy, transforms.each(), lambda t: t.obs, lambda t: t.pull_back)
     even_value = symmetrised(value, transforms.each(), lambda t: t.state, lambda t: t.values)
     even = network_equivariance_error(even_policy, even_value, obs, state, drawn)
     assert max(even.values()) < 1e-12
@@ -72,5 +69,5 @@ def test_a_wrong_table_of_actions_is_noticed(make_spec) -> None:
     obs = torch.randn(1, WORLDS, 3, spec.observation.width, generator=torch.Generator().manual_seed(1))
     assert network_equivariance_error(follow_velocity, None, obs, obs, right) == {"policy": 0.0}
     wrong = build_transform(right.elements, spec)
-    object.__setattr__(wrong, "pull_index", mirror.pull_index)
+    object.__setattr__(wrong, "output_map", mirror.output_map)
     assert network_equivariance_error(follow_velocity, None, obs, obs, wrong)["policy"] > 0.1

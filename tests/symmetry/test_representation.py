@@ -7,37 +7,38 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from esp_cli.symmetry import Element, agent_permutations, dihedral, direct_product, mirror, rotation
+from esp_cli.symmetry import Element, PlaneElement, agent_permutations, dihedral, direct_product, mirror, rotation
 from esp_cli.symmetry.representation import (
     action_map,
-    item_matrix,
+    block_matrix,
     joint_matrix,
     layout_matrix,
     state_matrix,
 )
-from esp_envs.spec import Discrete, Field, Items, Kind, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Layout, layout
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
+KINDS = [Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.VECTOR, Kind.WHEELS, Kind.PICTURE]
 D4, D8 = dihedral(4), dihedral(8)
 D4_AGENTS = direct_product(D4, agent_permutations(3))
 
 
-def stack(*elements: Element, num_agents: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Return planar matrices [G, 2, 2] and places [G, N]."""
+def joint(row_layout: Layout, *elements: Element, num_agents: int = 3) -> np.ndarray:
+    """Return L_g of all agents' rows, also where none moves."""
     stay = tuple(range(num_agents))
-    return np.stack([e.matrix for e in elements]), np.array([e.permutation or stay for e in elements])
+    return joint_matrix(row_layout, elements, np.array([e.permutation or stay for e in elements]))
 
 
 def field_of(name: str, kind: Kind, count: int = 1, items: Items = Items.FIXED) -> Field:
     """Return a field of any kind; a picture has 3 x 3 pixels."""
-    return Field(name, kind, count, items=items, pixels=(3, 3) if kind is Kind.PICTURE else None)
+    return Field(name, kind, count, items=items, pixels=(3, 3) if kind == Kind.PICTURE else None)
 
 
-@pytest.mark.parametrize("kind", Kind)
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_kinds_are_orthogonal_homomorphisms(kind: Kind) -> None:
     field = field_of("field", kind)
-    group = D4 if kind is Kind.PICTURE else D8
-    matrices = item_matrix(field, stack(*group.elements)[0])
+    group = D4 if kind == Kind.PICTURE else D8
+    matrices = block_matrix(field, group.elements)
     assert matrices.shape == (group.order, field.width, field.width)
     np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[group.product], atol=1e-15)
     identity = np.tile(np.eye(field.width), (group.order, 1, 1))
@@ -53,7 +54,7 @@ def test_a_row_by_hand() -> None:
         Field("landmarks", Kind.VECTOR, 2),
     )
     row = np.array([1.0, 2.0, 7.0, 3.0, 0.25, 0.5, 1.0, 0.0, 0.0, 1.0])
-    turned, mirrored = layout_matrix(row_layout, stack(rotation(90), mirror(0))[0]) @ row
+    turned, mirrored = layout_matrix(row_layout, [rotation(90), mirror(0)]) @ row
     np.testing.assert_array_equal(turned, [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0])
     np.testing.assert_array_equal(mirrored, [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1])
 
@@ -63,7 +64,7 @@ def test_others_are_reordered_by_hand() -> None:
     row_layout = layout(Field("own", Kind.SCALAR), Field("others", Kind.SCALAR, 2, items=Items.OTHERS))
     rows = np.array([[10, 11, 12], [11, 10, 12], [12, 10, 11]], dtype=float)
     # Agent 0 goes to place 1, 1 to 2, 2 to 0: the places now hold 12, 10, 11.
-    matrix = joint_matrix(row_layout, *stack(Element(permutation=(1, 2, 0))))[0]
+    matrix = joint(row_layout, PlaneElement(permutation=(1, 2, 0)))[0]
     np.testing.assert_array_equal((matrix @ rows.ravel()).reshape(3, 3), [[12, 10, 11], [10, 12, 11], [11, 12, 10]])
 
 
@@ -87,8 +88,8 @@ WORLD = layout(
 def test_transforming_rows_equals_observing_the_transformed_world() -> None:
     rng = np.random.default_rng(0)
     positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
-    joint = joint_matrix(WORLD, *stack(*D4_AGENTS.elements))
-    for element, matrix in zip(D4_AGENTS.elements, joint, strict=True):
+    matrices = joint(WORLD, *D4_AGENTS.elements)
+    for element, matrix in zip(D4_AGENTS.elements, matrices, strict=True):
         moved = np.empty_like(positions)
         for i in range(3):
             place = i if element.permutation is None else element.permutation[i]
@@ -101,7 +102,7 @@ def test_forgetting_that_items_are_others_is_noticed() -> None:
     wrong = replace(WORLD, fields=tuple(replace(f, items=Items.FIXED) for f in WORLD.fields))
     rng = np.random.default_rng(0)
     positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
-    swap = joint_matrix(wrong, *stack(Element(permutation=(1, 0, 2))))[0]
+    swap = joint(wrong, PlaneElement(permutation=(1, 0, 2)))[0]
     got = (swap @ observe(positions, landmark).ravel()).reshape(3, -1)
     assert np.abs(got - observe(positions[[1, 0, 2]], landmark)).max() > 0.1
 
@@ -113,7 +114,7 @@ def random_layout(rng: np.random.Generator, num_agents: int):
     for i in range(rng.integers(1, 7)):
         items = list(Items)[rng.integers(3)]
         count = counts[items] or int(rng.integers(1, 4))
-        fields.append(field_of(f"f{i}", list(Kind)[rng.integers(len(Kind))], count, items))
+        fields.append(field_of(f"f{i}", KINDS[rng.integers(len(KINDS))], count, items))
     return layout(*fields)
 
 
@@ -123,7 +124,7 @@ def test_joint_matrices_are_homomorphisms_over_random_layouts(seed: int) -> None
     row_layout = random_layout(rng, 3)
     g = rng.integers(D4_AGENTS.order, size=40)
     h = rng.integers(D4_AGENTS.order, size=40)
-    matrices = joint_matrix(row_layout, *stack(*D4_AGENTS.elements))
+    matrices = joint(row_layout, *D4_AGENTS.elements)
     # Signed permutation matrices: products are exact.
     np.testing.assert_array_equal(matrices[g] @ matrices[h], matrices[D4_AGENTS.product[g, h]])
     np.testing.assert_array_equal(matrices[D4_AGENTS.inverses], matrices.transpose(0, 2, 1))
@@ -131,18 +132,18 @@ def test_joint_matrices_are_homomorphisms_over_random_layouts(seed: int) -> None
 
 
 def test_states_are_homomorphisms_and_a_joint_state_moves_like_the_rows(make_spec) -> None:
-    places = stack(*D4_AGENTS.elements)
-    own = state_matrix(make_spec(), *places)
+    own = state_matrix(make_spec(), D4_AGENTS.elements)
     np.testing.assert_array_equal(own[:, None] @ own, own[D4_AGENTS.product])
-    joint = make_spec(joint_state=True)
-    np.testing.assert_array_equal(state_matrix(joint, *places), joint_matrix(joint.observation, *places))
+    spec = make_spec(joint_state=True)
+    expected = joint(spec.observation, *D4_AGENTS.elements)
+    np.testing.assert_array_equal(state_matrix(spec, D4_AGENTS.elements), expected)
 
 
 def test_a_state_by_hand(make_spec) -> None:
     # positions of agents 0, 1, 2; two landmarks; turning rates of agents 0, 1, 2.
     state = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0.1, 0.2, 0.3])
-    element = mirror(0) @ Element(permutation=(1, 2, 0))
-    got = state_matrix(make_spec(), *stack(element))[0] @ state
+    element = mirror(0) @ PlaneElement(permutation=(1, 2, 0))
+    got = state_matrix(make_spec(), [element])[0] @ state
     np.testing.assert_array_equal(got, [5, -6, 1, -2, 3, -4, 7, -8, 9, -10, -0.3, -0.1, -0.2])
 
 
@@ -180,11 +181,11 @@ def test_an_action_without_an_image_is_named() -> None:
 
 
 def test_items_that_cannot_follow_are_refused(make_spec) -> None:
-    planar, places = stack(Element(permutation=(1, 0, 2)))
+    swap = PlaneElement(permutation=(1, 0, 2))
     with pytest.raises(ValueError, match="field 'others' has 4 items for 2 other agents"):
-        joint_matrix(layout(Field("others", Kind.VECTOR, 4, items=Items.OTHERS)), planar, places)
+        joint(layout(Field("others", Kind.VECTOR, 4, items=Items.OTHERS)), swap)
     with pytest.raises(ValueError, match="field 'tags' has 2 items for 3 agents"):
-        joint_matrix(layout(Field("tags", Kind.SCALAR, 2, items=Items.AGENTS)), planar, places)
+        joint(layout(Field("tags", Kind.SCALAR, 2, items=Items.AGENTS)), swap)
     odd = replace(make_spec(), state=layout(Field("others", Kind.VECTOR, 2, items=Items.OTHERS)))
     with pytest.raises(ValueError, match="a state has no observer"):
-        state_matrix(odd, planar, places)
+        state_matrix(odd, [swap])

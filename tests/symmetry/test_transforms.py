@@ -5,14 +5,22 @@ from __future__ import annotations
 import pytest
 import torch
 
-from esp_cli.symmetry import Element, Transform, build_transform, mirror, rotation, transform_set
+from esp_cli.symmetry import (
+    Element,
+    PlaneElement,
+    Transform,
+    build_transform,
+    mirror,
+    rotation,
+    transform_set,
+)
 from tests.symmetry.toy_actions import EVERYTHING, FORCE, WHEELS
 
 ELEMENTS = [rotation(90), mirror(0), rotation(270)]
 MOVING = [
-    rotation(90) @ Element(permutation=(1, 2, 0)),
+    rotation(90) @ PlaneElement(permutation=(1, 2, 0)),
     mirror(45),
-    Element(permutation=(0, 2, 1)),
+    PlaneElement(permutation=(0, 2, 1)),
 ]
 BATCHES = [(4,), (2, 3), (0,), ()]
 
@@ -23,6 +31,11 @@ def batch(*shape: int) -> torch.Tensor:
 
 def sigma(element: Element) -> tuple[int, ...]:
     return element.permutation or (0, 1, 2)
+
+
+def per_action(transform: Transform, x: torch.Tensor) -> torch.Tensor:
+    """Return what counts over actions [S, ..., N, A] where K_g brings it."""
+    return transform.output_map.push(x.reshape(transform.num_seeds, -1, transform.output_map.width)).reshape(x.shape)
 
 
 def test_rows_by_hand(make_spec) -> None:
@@ -40,7 +53,7 @@ def test_actions_and_pull_back_against_their_definitions(make_spec, elements, le
     transform = build_transform(elements, make_spec())
     action = torch.randint(5, (3, *lead, 3), generator=torch.Generator().manual_seed(0))
     logits = batch(3, *lead, 3, 5)
-    moved, home, one_hot = transform.action(action), transform.pull_back(logits), transform.action_one_hot(logits)
+    moved, home, one_hot = transform.action(action), transform.pull_back(logits), per_action(transform, logits)
     for s, element in enumerate(elements):
         k = transform.action_index[s]
         for n in range(3):
@@ -55,7 +68,7 @@ def test_one_hots_move_as_actions_do(make_spec, elements) -> None:
     transform = build_transform(elements, make_spec())
     action = torch.randint(5, (3, 6, 3), generator=torch.Generator().manual_seed(0))
     one_hot = torch.nn.functional.one_hot
-    assert torch.equal(transform.action_one_hot(one_hot(action, 5)), one_hot(transform.action(action), 5))
+    assert torch.equal(per_action(transform, one_hot(action, 5)), one_hot(transform.action(action), 5))
 
 
 @pytest.mark.parametrize("action", [FORCE, WHEELS, EVERYTHING], ids=["force", "wheels", "everything"])
@@ -63,23 +76,15 @@ def test_one_hots_move_as_actions_do(make_spec, elements) -> None:
 def test_continuous_actions_come_home(make_spec, elements, action) -> None:
     transform = build_transform(elements, make_spec(action=action))
     x = batch(3, 2, 4, 3, action.width)
-    assert torch.equal(transform.pull_back_mean(transform.action(x)), x)
-    assert torch.equal(transform.pull_back_variance(transform.action(x).square()), x.square())
+    assert torch.equal(transform.pull_back(transform.action(x)), x)
 
 
 def test_continuous_actions_by_hand(make_spec) -> None:
-    transform = build_transform([rotation(90) @ Element(permutation=(1, 0))], make_spec(2, EVERYTHING))
+    transform = build_transform([rotation(90) @ PlaneElement(permutation=(1, 0))], make_spec(2, EVERYTHING))
     x = torch.tensor([[[1.0, 2, 3, 4, 5], [6, 7, 8, 9, 10]]])[None]
     assert transform.action(x)[0, 0].tolist() == [[-7, 6, 8, 9, 10], [-2, 1, 3, 4, 5]]
     flip = build_transform([mirror(0)], make_spec(2, EVERYTHING))
     assert flip.action(x)[0, 0].tolist() == [[1, -2, 4, 3, -5], [6, -7, 9, 8, -10]]
-
-
-def test_variance_of_a_turned_gaussian(make_spec) -> None:
-    transform = build_transform([rotation(30)], make_spec(action=FORCE))
-    # Turned back by 30 degrees: var x' = cos^2 var x + sin^2 var y = 0.75 * 4 + 0.25 * 1.
-    got = transform.pull_back_variance(torch.tensor([4.0, 1.0]).expand(1, 1, 3, 2))[0, 0, 0]
-    torch.testing.assert_close(got, torch.tensor([3.25, 1.75]))
 
 
 @pytest.mark.parametrize("elements", [ELEMENTS, MOVING], ids=["plane", "agents"])
@@ -89,13 +94,13 @@ def test_the_inverse_elements_undo(make_spec, elements) -> None:
     obs, state, logits = batch(3, 5, 3, spec.observation.width), batch(3, 5, spec.state.width), batch(3, 5, 3, 5)
     assert torch.equal(back.obs(there.obs(obs)), obs)
     assert torch.equal(back.state(there.state(state)), state)
-    assert torch.equal(there.pull_back(there.action_one_hot(logits)), logits)
+    assert torch.equal(there.pull_back(per_action(there, logits)), logits)
     assert torch.equal(back.per_agent(there.per_agent(obs[..., 0])), obs[..., 0])
     assert torch.equal(there.values(there.per_agent(obs[..., 0])), obs[..., 0])
 
 
 def test_values(make_spec) -> None:
-    moving = build_transform([Element(permutation=(1, 2, 0))], make_spec())
+    moving = build_transform([PlaneElement(permutation=(1, 2, 0))], make_spec())
     v = torch.tensor([[[10.0, 11, 12]]])
     assert moving.per_agent(v).tolist() == [[[12, 10, 11]]]
     assert moving.values(v).tolist() == [[[11, 12, 10]]]
@@ -111,6 +116,27 @@ def test_one_element_serves_any_number_of_seeds(make_spec) -> None:
     assert torch.equal(one.pull_back(logits), three.pull_back(logits))
 
 
+def test_one_element_needs_no_seed_axis(make_spec) -> None:
+    spec = make_spec()
+    for element in (rotation(90), MOVING[0]):
+        transform = build_transform([element], spec)
+        x, state, action = (
+            batch(2, 4, 3, spec.observation.width),
+            batch(2, 4, spec.state.width),
+            batch(2, 4, 3, 5).argmax(-1),
+        )
+        for name, data in {
+            "obs": x,
+            "state": state,
+            "action": action,
+            "pull_back": x[..., :5],
+            "values": x[..., 0],
+        }.items():
+            act = getattr(transform, name)
+            torch.testing.assert_close(act(data[0]), act(data)[0], rtol=0, atol=0)
+            torch.testing.assert_close(act(data[0, 0]), act(data)[0, 0], rtol=0, atol=0)
+
+
 def test_rows_need_no_agent_axis_where_agents_stay(make_spec) -> None:
     spec = make_spec()
     transform = build_transform(ELEMENTS, spec)
@@ -124,7 +150,7 @@ def test_gradients_flow_back_through_the_pull_back(make_spec) -> None:
     weight = batch(3, 4, 3, 5)
     transform = build_transform(MOVING, make_spec())
     (transform.pull_back(logits) * weight).sum().backward()
-    assert torch.equal(logits.grad, transform.action_one_hot(weight))
+    assert torch.equal(logits.grad, per_action(transform, weight))
 
 
 def test_shapes_are_checked(make_spec) -> None:
@@ -137,10 +163,10 @@ def test_shapes_are_checked(make_spec) -> None:
     for lead in ((3, 4, 2), (3, 12)):
         with pytest.raises(ValueError, match="must hold 3 agents"):
             build_transform(MOVING, spec).obs(batch(*lead, width))
-    with pytest.raises(ValueError, match="actions are discrete"):
-        build_transform(ELEMENTS, spec).pull_back_mean(batch(3, 4, 3, 2))
-    with pytest.raises(ValueError, match="actions are continuous"):
-        build_transform(ELEMENTS, make_spec(action=FORCE)).pull_back(batch(3, 4, 3, 2))
+    with pytest.raises(ValueError, match="of 5 numbers was given rows of 2"):
+        build_transform(ELEMENTS, spec).pull_back(batch(3, 4, 3, 2))
+    with pytest.raises(ValueError, match="of 2 numbers was given rows of 5"):
+        build_transform(ELEMENTS, make_spec(action=FORCE)).pull_back(batch(3, 4, 3, 5))
     with pytest.raises(ValueError, match="one element per seed"):
         build_transform([], spec)
 
@@ -172,7 +198,7 @@ def test_a_seed_draws_the_same_alone_and_among_ten(make_spec, text, num_agents, 
 
     together, alone = draws(list(range(10))), draws([7])
     assert [t.elements[7] for t in together] == [t.elements[0] for t in alone]
-    assert torch.equal(together[-1].obs_matrix[7], alone[-1].obs_matrix[0])
+    assert torch.equal(together[-1].obs_map.matrix[7], alone[-1].obs_map.matrix[0])
     assert not any(e.is_identity for t in together for e in t.elements)
     assert len({e for t in together for e in t.elements}) > 5
 
@@ -200,7 +226,11 @@ def test_large_listed_sets_are_built_as_drawn(make_spec, generators) -> None:
     spec = make_spec(5)
     transforms = transform_set("d4*agents", spec)
     assert transforms.size == 8 * 120 - 1
-    assert transforms.draw(generators).obs_matrix.shape == (3, 5 * spec.observation.width, 5 * spec.observation.width)
+    assert transforms.draw(generators).obs_map.matrix.shape == (
+        3,
+        5 * spec.observation.width,
+        5 * spec.observation.width,
+    )
     assert len(transforms.each()) == transforms.size
 
 

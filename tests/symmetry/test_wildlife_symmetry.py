@@ -19,14 +19,16 @@ from esp_cli.symmetry import (
     rotation,
     transform_set,
 )
-from esp_cli.symmetry.representation import picture_sources, rows_matrix, rows_permutation
+from esp_cli.symmetry.maps import Gather
+from esp_cli.symmetry.plane import picture_sources
+from esp_cli.symmetry.representation import rows_matrix, rows_permutation
 from esp_envs import Environment, Field, Items, Kind, layout, make
 
 STEPS = 6
 
 
 def turn_picture(picture: Tensor, element) -> Tensor:
-    sources = picture_sources(tuple(picture.shape), element.matrix[None])[0]
+    sources = picture_sources(tuple(picture.shape), element.matrix)
     return picture.flatten()[torch.as_tensor(sources)].view(picture.shape)
 
 
@@ -42,7 +44,7 @@ def test_a_picture_turns_counter_clockwise() -> None:
 def test_pixels_that_find_no_place_are_refused() -> None:
     for pixels, element in (((3, 3), rotation(45)), ((3, 5), rotation(90))):
         with pytest.raises(ValueError, match="do not come to lie on pixels"):
-            picture_sources(pixels, element.matrix[None])
+            picture_sources(pixels, element.matrix)
 
 
 def test_only_pictures_have_pixels() -> None:
@@ -59,12 +61,10 @@ def test_the_permutation_is_the_matrix() -> None:
         Field("spin", Kind.PSEUDOSCALAR),
         Field("wheels", Kind.WHEELS),
     )
-    elements = parse_elements("d4*agents", 3)
-    planar = np.stack([e.matrix for e in elements])
-    places = np.array([e.permutation or (0, 1, 2) for e in elements])
-    for where in (None, places):
-        source, sign = rows_permutation(row, planar, where)
-        dense = rows_matrix(row, planar, where)
+    for text in ("d4", "d4*agents"):
+        elements = parse_elements(text, 3)
+        source, sign = rows_permutation(row, elements, 3)
+        dense = rows_matrix(row, elements, 3)
         group, width = source.shape
         rebuilt = np.zeros((group, width, width))
         np.put_along_axis(rebuilt, source[..., None], sign[..., None], axis=2)
@@ -128,11 +128,11 @@ def test_a_wrong_action_table_is_noticed() -> None:
 
 def test_pictures_that_do_not_turn_along_are_noticed() -> None:
     env, right = worlds("rot90")
-    assert right.obs_source is not None
-    still = right.obs_source.clone()
+    assert isinstance(right.obs_map, Gather)
+    still = right.obs_map.source.clone()
     pixels = env.spec.observation.slices()["picture"]
     still[:, pixels] = torch.arange(pixels.start, pixels.stop)
-    assert errors(env, replace(right, obs_source=still))["observation"] == 1
+    assert errors(env, replace(right, obs_map=replace(right.obs_map, source=still)))["observation"] == 1
 
 
 def test_a_poacher_whose_moves_are_not_turned_along_is_noticed() -> None:

@@ -1,0 +1,88 @@
+"""Experience of S seeds that a symmetry can act on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from esp_cli.symmetry import Transform
+
+Rows = TypeVar("Rows", bound="SeedBatch")
+
+
+@dataclass
+class SeedBatch:
+    """Tensors [S, B, ...] of what was seen and done; a subclass adds fields and names those that count per agent.
+
+    Attributes:
+        obs: [S, B, ..., N, D].
+        state: [S, B, ..., Ds].
+        action: [S, B, ..., N(, width)].
+        per_agent: names of fields [S, B, ..., N] that move with their agents; those with one number per world stay.
+    """
+
+    per_agent: ClassVar[tuple[str, ...]] = ()
+
+    obs: Tensor
+    state: Tensor
+    action: Tensor
+
+    @property
+    def count(self) -> int:
+        """B."""
+        return self.obs.shape[1]
+
+    @property
+    def mask(self) -> Tensor | None:
+        """[S, B, T] which rows count; None where all do."""
+        return None
+
+    def map(self: Rows, function: Callable[[Tensor], Tensor]) -> Rows:
+        """Return the batch with every tensor put through a function."""
+        return type(self)(**{name: function(tensor) for name, tensor in vars(self).items()})
+
+    def first(self: Rows, count: int) -> Rows:
+        """Return the first `count` rows of each seed; views."""
+        return self.map(lambda x: x[:, :count])
+
+    def select(self: Rows, rows: Tensor) -> Rows:
+        """Return the rows [S, m] of each seed."""
+        flat = (rows + self.count * torch.arange(rows.shape[0], device=rows.device).unsqueeze(1)).flatten()
+        return self.map(lambda x: x.flatten(0, 1).index_select(0, flat).unflatten(0, rows.shape))
+
+    def chunks(self: Rows, size: int) -> list[Rows]:
+        """Cut the batch axis into pieces of at most `size`; views."""
+        pieces = zip(*(tensor.split(size, 1) for tensor in vars(self).values()), strict=True)
+        return [type(self)(*piece) for piece in pieces]
+
+    def transformed(self: Rows, g: Transform) -> Rows:
+        """Return (L_g s, K_g a); all else stays (Eq. 5, Prop. 1), or moves with its agents."""
+        moved = {name: g.per_agent(getattr(self, name)) for name in self.per_agent}
+        return replace(self, obs=g.obs(self.obs), state=g.state(self.state), action=g.action(self.action), **moved)
+
+    @classmethod
+    def concatenate(cls: type[Rows], parts: Sequence[Rows]) -> Rows:
+        """Put batches behind each other along the batch axis."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
+
+
+def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean of each seed over what counts.
+
+    Args:
+        x: [S, B, T, ...]; without a mask [S, ...].
+        mask: [S, B, T] which rows count; all where it is None.
+
+    Returns:
+        [S]; 0 where nothing counts.
+    """
+    if mask is None:
+        return x.flatten(1).mean(1)
+    rows = x.flatten(3).mean(3) if x.dim() > 3 else x
+    return torch.where(mask, rows, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)

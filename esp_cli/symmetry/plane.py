@@ -1,0 +1,221 @@
+"""Turns and mirrors of the plane, with or without a permutation of the agents, and how they act on each field kind.
+
+Convention, pinned by `tests/symmetry/test_elements.py`: angles are counter-clockwise, `rot90` sends (1, 0) to (0, 1),
+so *right* becomes *up*; a product `g @ h` applies h first, hence L_g L_h = L_{gh}. `flip-x` is the mirror in the
+x-axis, (x, y) -> (x, -y); `flip-y` the one in the y-axis, (x, y) -> (-x, y).
+
+An element is stored as an exact fraction of a turn, a mirror flag and a permutation, so that closure, products and
+inverses are decided without rounding; matrices are derived.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from esp_cli.symmetry.elements import Element, Floats, Indices, compose_permutations
+from esp_envs.spec import Field, Kind
+
+_PIXEL_TOLERANCE = 1e-6
+
+_MIRROR_NAMES = {
+    Fraction(0): "flip-x",
+    Fraction(45): "flip-diagonal",
+    Fraction(90): "flip-y",
+    Fraction(135): "flip-antidiagonal",
+}
+
+
+@lru_cache(maxsize=1024)
+def _cos_sin(turn: Fraction) -> tuple[float, float]:
+    """Return (cos, sin) of a fraction of a turn, exact at multiples of a quarter and symmetric between quadrants."""
+    quarter, rest = divmod(turn * 4, 1)
+    angle = float(rest) * math.pi / 2
+    cos, sin = (1.0, 0.0) if rest == 0 else (math.cos(angle), math.sin(angle))
+    for _ in range(int(quarter)):
+        # Adding 0.0 turns the -0.0 of a negated zero into 0.0.
+        cos, sin = -sin + 0.0, cos
+    return cos, sin
+
+
+def _number(value: Fraction) -> str:
+    """Write degrees exactly where that is short (90, 22.5, 360/7), else rounded."""
+    for text in (f"{float(value):g}", str(value)):
+        if Fraction(text) == value and len(text) <= 9:
+            return text
+    return f"{float(value):.3f}"
+
+
+def _scalar(_: Floats) -> Floats:
+    return np.ones((1, 1))
+
+
+def _pseudoscalar(planar: Floats) -> Floats:
+    # Round: the determinant of an orthogonal matrix is +1 or -1.
+    return np.rint(np.linalg.det(planar)).reshape(1, 1)
+
+
+def _vector(planar: Floats) -> Floats:
+    return planar
+
+
+def _wheels(planar: Floats) -> Floats:
+    return np.eye(2) if _pseudoscalar(planar) > 0 else np.array([[0.0, 1.0], [1.0, 0.0]])
+
+
+KIND_MATRICES: dict[Kind, Callable[[Floats], Floats]] = {
+    Kind.SCALAR: _scalar,
+    Kind.PSEUDOSCALAR: _pseudoscalar,
+    Kind.VECTOR: _vector,
+    Kind.WHEELS: _wheels,
+}
+"""One representation per field kind, pictures apart: a planar matrix [2, 2] to [width, width]."""
+
+
+def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
+    """Return where each pixel of a transformed picture comes from.
+
+    A pixel's place is its middle's (x, y), seen from the picture's: the first row is the top, the first column left.
+
+    Args:
+        pixels: rows and columns.
+        planar: orthogonal matrix [2, 2].
+
+    Returns:
+        [rows * columns], the index of the old pixel that shows in each new one.
+
+    Raises:
+        ValueError: some pixel would come to lie between others, or outside.
+    """
+    rows, columns = pixels
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    place = np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row], -1)
+    origin = place @ planar  # the inverse is the transpose
+    old = np.stack([(rows - 1) / 2 - origin[:, 1], origin[:, 0] + (columns - 1) / 2], -1)
+    whole = np.rint(old)
+    if np.abs(whole - old).max() >= _PIXEL_TOLERANCE or (whole < 0).any() or (whole >= [rows, columns]).any():
+        raise ValueError(f"the pixels of a picture of {rows} x {columns} do not come to lie on pixels")
+    return (whole[:, 0] * columns + whole[:, 1]).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class PlaneElement(Element):
+    """One transform: mirror in the x-axis if `mirrored`, then turn, and let agent i take the place of agent sigma(i).
+
+    Attributes:
+        turn: counter-clockwise fraction of a full turn in [0, 1).
+        mirrored: whether y changes sign before the turn.
+        permutation: sigma, with sigma[i] the place that agent i moves to; None where agents stay.
+    """
+
+    turn: Fraction = Fraction(0)
+    mirrored: bool = False
+    permutation: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "turn", Fraction(self.turn) % 1)
+        sigma = self.permutation
+        if sigma is None:
+            return
+        if sorted(sigma) != list(range(len(sigma))):
+            raise ValueError(f"{sigma} is no permutation; write each agent number from 0 to {len(sigma) - 1} once")
+        if sigma == tuple(range(len(sigma))):
+            object.__setattr__(self, "permutation", None)
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """The orthogonal 2x2 matrix of the planar part, Eq. 1; exact integers at multiples of 90 degrees."""
+        cos, sin = _cos_sin(self.turn)
+        sign = -1.0 if self.mirrored else 1.0
+        return np.array([[cos, -sin * sign + 0.0], [sin, cos * sign + 0.0]])
+
+    @property
+    def degrees(self) -> Fraction:
+        """The turn in degrees."""
+        return self.turn * 360
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether nothing moves."""
+        return self == PlaneElement()
+
+    @property
+    def in_place(self) -> PlaneElement:
+        """The same element with all agents in their places."""
+        return PlaneElement(self.turn, self.mirrored)
+
+    @property
+    def order(self) -> tuple[tuple[int, ...], bool, Fraction]:
+        """What the elements of a group are sorted by: permutation, mirror, turn."""
+        return self.permutation or (), self.mirrored, self.turn
+
+    @property
+    def participle(self) -> str:
+        """How messages say that something was transformed."""
+        return f"mirrored by {self.in_place.name}" if self.mirrored else f"turned by {float(self.degrees):g} degrees"
+
+    @property
+    def name(self) -> str:
+        """The name that `parse_elements` reads: rot90, flip-x, flip22.5, agents-1-0-2, rot90*agents-1-0-2."""
+        parts = []
+        if self.mirrored:
+            axis = self.degrees / 2
+            parts.append(_MIRROR_NAMES.get(axis, f"flip{_number(axis)}"))
+        elif self.turn:
+            parts.append(f"rot{_number(self.degrees)}")
+        if self.permutation is not None:
+            parts.append("agents-" + "-".join(map(str, self.permutation)))
+        return "*".join(parts) or "identity"
+
+    def __matmul__(self, other: PlaneElement) -> PlaneElement:
+        """Compose: `g @ h` applies h first, then g.
+
+        Raises:
+            ValueError: the two permute different numbers of agents.
+        """
+        # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
+        turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
+        permutation = compose_permutations(self.permutation, other.permutation)
+        return PlaneElement(turn, self.mirrored != other.mirrored, permutation)
+
+    def inverse(self) -> PlaneElement:
+        """Return the element that undoes this one."""
+        turn = self.turn if self.mirrored else -self.turn
+        sigma = self.permutation
+        back = None if sigma is None else tuple(sigma.index(i) for i in range(len(sigma)))
+        return PlaneElement(turn, self.mirrored, back)
+
+    def block(self, field: Field) -> Floats:
+        """Return how one item of a field transforms: [item width, item width].
+
+        Raises:
+            ValueError: the pixels of a picture do not come to lie on pixels, or the kind is unknown in the plane.
+        """
+        if field.pixels is not None:
+            return np.eye(field.item_width)[picture_sources(field.pixels, self.matrix)]
+        if field.kind not in KIND_MATRICES:
+            raise ValueError(
+                f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns"
+            )
+        return KIND_MATRICES[field.kind](self.matrix)
+
+    def gather(self, field: Field) -> tuple[Indices, Floats]:
+        """Return `block` as a signed permutation; of a picture without the large matrix."""
+        if field.pixels is None:
+            return super().gather(field)
+        return picture_sources(field.pixels, self.matrix), np.ones(field.item_width)
+
+
+def rotation(degrees: Fraction | int | str) -> PlaneElement:
+    """Return the counter-clockwise turn by an exact number of degrees."""
+    return PlaneElement(Fraction(degrees) / 360)
+
+
+def mirror(axis_degrees: Fraction | int | str = 0) -> PlaneElement:
+    """Return the mirror in the line through the origin at this angle; 0 is `flip-x`, 90 is `flip-y`."""
+    return PlaneElement(Fraction(axis_degrees) / 180, mirrored=True)
