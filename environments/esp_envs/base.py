@@ -7,7 +7,7 @@ influence each other. Everything is a tensor on one device; nothing here synchro
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
@@ -97,6 +97,8 @@ class Environment(ABC):
     spec: TaskSpec
     heuristics: ClassVar[tuple[str, ...]] = ()
     """Names that `heuristic` accepts, the main anchor first."""
+    robot: ClassVar[Mapping[str, float]] = {}
+    """Dimensions of the e-puck that a policy of this task can drive, by name with unit; empty for other tasks."""
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         if num_envs < 1 or not generators:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from esp_cli import console
 from esp_cli.commands.options import (
-    BoxAlgoOption,
-    BoxPriorOption,
+    BundledAlgoOption,
+    BundledPriorOption,
     EpisodesOption,
     JsonOption,
     PhysicsOption,
@@ -31,15 +31,15 @@ def evaluate(
     episodes: EpisodesOption = 320,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
-    algo: BoxAlgoOption = None,
-    prior: BoxPriorOption = None,
+    algo: BundledAlgoOption = None,
+    prior: BundledPriorOption = None,
     json: JsonOption = None,
 ) -> None:
     """Play episodes greedily and stochastically; print mean, s.e.m., 95 % interval, anchors and task metrics.
 
     A policy may be played under other settings of its task than it was trained under: another physics, more noise.
     """
-    from esp_cli.deploy.box import open_policy
+    from esp_cli.deploy.bundled import open_policy
     from esp_cli.evaluation.final import evaluate as evaluate_policy
     from esp_cli.training.loading import transfer
 

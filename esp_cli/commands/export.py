@@ -1,4 +1,4 @@
-"""`esp export`: take a trained policy away, or put it into the box of policies."""
+"""`esp export`: write a trained policy in other formats, or add it to the bundled policies."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import (
-    BoxAlgoOption,
-    BoxPriorOption,
+    BundledAlgoOption,
+    BundledPriorOption,
     ForceOption,
     JsonOption,
     OutOption,
@@ -36,7 +36,7 @@ def export(
         typer.Option(
             "--format",
             "-f",
-            help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy, for the box.",
+            help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy: bundle it.",
             metavar="FORMAT",
         ),
     ],
@@ -44,13 +44,14 @@ def export(
     seed: Annotated[
         int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
     ] = None,
-    algo: BoxAlgoOption = None,
-    prior: BoxPriorOption = None,
+    algo: BundledAlgoOption = None,
+    prior: BundledPriorOption = None,
     episodes: Annotated[
-        int, typer.Option("--episodes", "-e", min=2, help="Per seed, to find the best; as many others judge a policy.")
+        int,
+        typer.Option("--episodes", "-e", min=2, help="Per seed, to find the best; as many others evaluate it."),
     ] = 320,
     name: Annotated[
-        str | None, typer.Option("--name", help="Of a policy in the box; by default TASK-ALGO-PRIOR.")
+        str | None, typer.Option("--name", help="Name of a bundled policy; by default TASK-ALGO-PRIOR.")
     ] = None,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -61,22 +62,20 @@ def export(
     """
     for unknown in set(formats) - set(FORMATS):
         raise ValueError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
-    from esp_cli.deploy.box import open_policy
-    from esp_cli.deploy.bundling import add_to_box
+    from esp_cli.deploy.bundled import open_policy
+    from esp_cli.deploy.bundling import bundle
     from esp_cli.deploy.export import export as write
     from esp_cli.training.loading import single_seed
 
     if "policy" in formats and len(formats) > 1:
-        raise ValueError(
-            "-f policy puts a policy into a box; leave out the other formats, or export them by themselves"
-        )
+        raise ValueError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
     if name is not None and "policy" not in formats:
         raise ValueError("--name is for -f policy alone; leave it out")
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
     if "policy" in formats:
-        entry = add_to_box(trained, out, episodes, seed, name)
+        entry = bundle(trained, out, episodes, seed, name)
         low, high = entry.score.ci95
         console.note(
             f"{entry.name}: seed {entry.seed} of {entry.chosen_from}, return {entry.score.mean:.2f} "

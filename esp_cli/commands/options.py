@@ -199,11 +199,11 @@ PolicyArgument = Annotated[
         metavar="RUN|POLICY",
     ),
 ]
-BoxAlgoOption = Annotated[
+BundledAlgoOption = Annotated[
     str | None,
     typer.Option("--algo", "-a", help="Of the policies that come along, the one by this algorithm.", metavar="ALGO"),
 ]
-BoxPriorOption = Annotated[
+BundledPriorOption = Annotated[
     Literal["esp", "augment", "consistency", "none"] | None,
     typer.Option("--prior", help="Of the policies that come along, one with this prior (none: the plain learner)."),
 ]

@@ -19,11 +19,11 @@ def policies(
     json: JsonOption = None,
 ) -> None:
     """List the trained policies that come along, with what each scores and the command that trains such a run."""
-    from esp_cli.deploy.box import box_folder, read_box
+    from esp_cli.deploy.bundled import bundled_folder, read_bundled
 
-    found = [entry for entry in read_box() if task in (None, entry.task)]
+    found = [entry for entry in read_bundled() if task in (None, entry.task)]
     if not found:
-        raise ValueError(f"{box_folder()} holds no policy of {task or 'any task'}; 'esp policies' lists all")
+        raise ValueError(f"{bundled_folder()} holds no policy of {task or 'any task'}; 'esp policies' lists all")
     if json != "-":
         rows = [
             (

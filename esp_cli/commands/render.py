@@ -11,8 +11,8 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import (
-    BoxAlgoOption,
-    BoxPriorOption,
+    BundledAlgoOption,
+    BundledPriorOption,
     OutOption,
     PhysicsOption,
     PolicyArgument,
@@ -68,8 +68,8 @@ def render(
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
-    algo: BoxAlgoOption = None,
-    prior: BoxPriorOption = None,
+    algo: BundledAlgoOption = None,
+    prior: BundledPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
     kind = out.suffix.lower()
@@ -79,7 +79,7 @@ def render(
         raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
     if out.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
-    from esp_cli.deploy.box import open_policy
+    from esp_cli.deploy.bundled import open_policy
     from esp_cli.drawing import films, rendering
     from esp_cli.training.build import build_environment
     from esp_cli.training.loading import transfer

@@ -1,1 +1,1 @@
-"""Trained policies in other hands: the box that comes along, loading by name, export."""
+"""Bundled policies, loading a policy by name, export to other programs and robots."""

@@ -1,4 +1,4 @@
-"""Putting a trained policy into the box: the run's best seed, judged on episodes that nobody chose it by."""
+"""Adding a trained policy to the bundled ones: the best seed of a run, evaluated on worlds that did not select it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from esp_cli import __version__
-from esp_cli.deploy.box import Entry, Score, read_box, standard_name, write_box
+from esp_cli.deploy.bundled import Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.training.config import RunConfig, resolve_config
@@ -46,14 +46,14 @@ def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:
     return play_batches(alone, PolicyController(alone.policy), "greedy", episodes)
 
 
-def add_to_box(
+def bundle(
     trained: TrainedPolicy, folder: Path, episodes: int, seed: int | None = None, name: str | None = None
 ) -> Entry:
-    """Write one seed's policy into a box and list it in the manifest, in the place of one of the same name.
+    """Write one seed's policy and list it in the manifest; an entry of the same name is replaced.
 
     Args:
         trained: a run.
-        folder: of the box; made where it is missing.
+        folder: of the manifest; made where it is missing.
         episodes: to choose the seed by, and as many others to judge it by.
         seed: which one; by default the best.
         name: of the policy; by default from task, algorithm and prior.
@@ -72,7 +72,7 @@ def add_to_box(
     played = play_greedily(alone, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
-    others = tuple(entry for entry in read_box(folder) if entry.name != name)
+    others = tuple(entry for entry in read_bundled(folder) if entry.name != name)
     file = folder / f"{name}.safetensors"
     description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
     write_policy(file, alone.policy.state_dict(), description)
@@ -94,7 +94,7 @@ def add_to_box(
         esp_version=__version__,
         config=config.model_dump(mode="json"),
     )
-    write_box(folder, (*others, entry))
+    write_bundled(folder, (*others, entry))
     return entry
 
 

@@ -1,5 +1,11 @@
 """The functions of an exported C source, one for each kind of layer; names in capitals are replaced by numbers."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from esp_cli.deploy.program import NORM_EPSILON, Convolution, Floats, GlobalMaxPool, MessageAggregation, Norm
+
 AFFINE = """static void affine(const float *weight, const float *bias, int inputs, int outputs,
                    const float *x, float *y)
 {
@@ -61,7 +67,7 @@ CONVOLVE = """static void convolve(const float *weight, const float *bias, int c
 }
 """
 
-LARGEST = """static void largest(int channels, int places, const float *x, float *y)
+GLOBAL_MAX_POOL = """static void global_max_pool(int channels, int places, const float *x, float *y)
 {
     int channel, place;
     for (channel = 0; channel < channels; channel++) {
@@ -73,11 +79,11 @@ LARGEST = """static void largest(int channels, int places, const float *x, float
 }
 """
 
-HEAR = """static void hear(const float *ways, int width, const float *x, float *y)
+AGGREGATE = """static void aggregate(const float *ways, int width, const float *x, float *y)
 {
     int i, j, k;
     for (i = 0; i < ESP_POLICY_AGENTS; i++, ways += ESP_POLICY_OBSERVATION) {
-        float *own = y + i * ROW, *way = own + width, *heard = way + 2, count = 1.0f;
+        float *own = y + i * ROW, *way = own + width, *received = way + 2, count = 1.0f;
         memcpy(own, x + i * ROW, sizeof(float) * width);
         for (k = 0; k < width + 2; k++) way[k] = 0.0f;
         for (j = 0; j < ESP_POLICY_AGENTS; j++) {
@@ -85,10 +91,10 @@ HEAR = """static void hear(const float *ways, int width, const float *x, float *
             if (j == i || !(to[0] * to[0] + to[1] * to[1] < REACH_SQUARED)) continue;
             count += 1.0f;
             for (k = 0; k < 2; k++) way[k] += to[k];
-            for (k = 0; k < width; k++) heard[k] += x[j * ROW + k];
+            for (k = 0; k < width; k++) received[k] += x[j * ROW + k];
         }
         for (k = 0; k < 2; k++) way[k] /= count * REACH;
-        for (k = 0; k < width; k++) heard[k] /= count;
+        for (k = 0; k < width; k++) received[k] /= count;
     }
 }
 """
@@ -119,3 +125,33 @@ static void recur(float *hidden)
     }
 }
 """
+
+
+def array(name: str, values: Floats) -> str:
+    """Return the definition of a constant array."""
+    return f"static const float {name}[{values.size}] = {{\n{numbers(values.ravel().tolist())}}};"
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Return the items of an array, eight a line."""
+    literals = [literal(value) for value in values]
+    return "".join(f"    {', '.join(literals[k : k + 8])},\n" for k in range(0, len(literals), 8))
+
+
+def literal(value: float) -> str:
+    """Return a float32 in full: nine digits tell every one apart."""
+    text = f"{value:.9g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def aggregate(layer: MessageAggregation) -> str:
+    """Return the function that aggregates messages within the layer's range."""
+    return AGGREGATE.replace("REACH_SQUARED", literal(layer.reach_squared)).replace("REACH", literal(layer.reach))
+
+
+LAYERS = {
+    Norm: NORM.replace("NORM_EPSILON", literal(NORM_EPSILON)),
+    Convolution: CONVOLVE,
+    GlobalMaxPool: GLOBAL_MAX_POOL,
+}
+"""Functions that the source has where the program has such a layer."""

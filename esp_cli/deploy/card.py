@@ -11,8 +11,7 @@ from esp_cli.deploy.check import Sample
 from esp_cli.deploy.program import Program
 from esp_cli.networks.heads import BoundedGaussian
 from esp_cli.training.loading import TrainedPolicy
-from esp_envs.epuck.formation import FADING_M
-from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, MAX_WHEEL_SPEED, WHEEL_RADIUS_M
+from esp_envs.registry import task_class
 from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 
 EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
@@ -30,15 +29,8 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
     """
     config, spec = alone.config, alone.spec
     first = slice(program.team) if program.team > 1 else 0
-    std, robot = {}, {}
-    if spec.name == "formation":
-        robot["robot"] = {
-            "body_radius_m": BODY_RADIUS_M,
-            "wheel_radius_m": WHEEL_RADIUS_M,
-            "axle_m": AXLE_M,
-            "max_wheel_speed_rad_s": MAX_WHEEL_SPEED,
-            "fading_m": FADING_M,
-        }
+    robot = task_class(config.task).robot
+    std = {}
     if isinstance(alone.policy.head, BoundedGaussian):
         head = alone.policy.head
         std = {"latent_std": head.log_std[0].exp()[head.item].tolist()}
@@ -64,7 +56,7 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
             "flops_per_action": program.flops,
             **std,
         },
-        **robot,
+        **({"robot": dict(robot)} if robot else {}),
         "observation": _rows(spec.observation),
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},
@@ -122,7 +114,7 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
 
 
 def _together(team: int) -> str:
-    return f"The {team} agents of a world hear each other and act together: their rows stand side by side."
+    return f"The {team} agents of a world exchange messages and act together: their rows stand side by side."
 
 
 def _unit(unit: str) -> str:

@@ -108,24 +108,24 @@ def _c(job: _Job) -> Files:
 def _epuck(job: _Job) -> Files:
     """Return the numpy policy with what a robot's program needs beside it."""
     spec = job.alone.spec
-    if spec.name != "formation":
+    if "robot" not in job.description:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
     if job.program.memory_width:
         raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
-    return {**_numpy(job), "esp_epuck.py": _takeaway("esp_epuck.py")}
+    return {**_numpy(job), "esp_epuck.py": _runtime_file("esp_epuck.py")}
 
 
-def _takeaway(name: str) -> bytes:
+def _runtime_file(name: str) -> bytes:
     # read, not imported: it imports what only a robot's machine has
-    return (Path(__file__).parent / "takeaway" / name).read_bytes()
+    return (Path(__file__).parent / "runtime" / name).read_bytes()
 
 
 def _webots(job: _Job) -> Files:
-    return {**_epuck(job), "esp_epuck_webots.py": _takeaway("esp_epuck_webots.py")}
+    return {**_epuck(job), "esp_epuck_webots.py": _runtime_file("esp_epuck_webots.py")}
 
 
 def _ros2(job: _Job) -> Files:
-    return {**_epuck(job), "esp_epuck_ros2.py": _takeaway("esp_epuck_ros2.py")}
+    return {**_epuck(job), "esp_epuck_ros2.py": _runtime_file("esp_epuck_ros2.py")}
 
 
 WRITERS: dict[str, Callable[[_Job], Files]] = {

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from esp_cli.deploy.box import open_policy
+from esp_cli.deploy.bundled import open_policy
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_envs.spec import Continuous, Layout, TaskSpec
 
@@ -111,7 +111,7 @@ class LoadedPolicy:
         rows = self._checked(obs, layout.width, "observation", field_list(layout))
         if self.team > 1 and rows.shape[-2:-1] != (self.team,):
             raise ValueError(
-                f"the observation has shape {rows.shape}, but the agents of {self.source} hear each other: give "
+                f"the observation has shape {rows.shape}, but the agents of {self.source} exchange messages: give "
                 f"(..., {self.team}, {layout.width}), one row for each agent of a world"
             )
         return rows
@@ -138,7 +138,7 @@ def load_policy(
     """Load a trained policy; loading never runs code.
 
     Args:
-        where: a task ("formation") or a name in the box of trained policies, a policy file, or a run folder.
+        where: a task ("formation") or the name of a bundled policy, a policy file, or a run folder.
         algo: of a task's policies, the one that this algorithm trained.
         prior: likewise this kind of prior; "none" is the plain learner.
         seed: which seed of a run acts; by default its first.

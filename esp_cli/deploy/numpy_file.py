@@ -8,7 +8,7 @@ import json
 import textwrap
 
 from esp_cli.deploy.program import Program
-from esp_cli.deploy.takeaway import runtime
+from esp_cli.deploy.runtime import numpy_policy
 
 _IMPORTS = "from typing import Any\n\nimport numpy as np\n"
 """Of the runtime; those of the lines below it join them."""
@@ -23,7 +23,7 @@ def numpy_source(program: Program, comment: str, description: str) -> str:
         description: JSON with layout, actions and the worked example.
     """
     body = (
-        inspect.getsource(runtime)
+        inspect.getsource(numpy_policy)
         .partition('"""\n')[2]
         .replace(_IMPORTS, f"import base64\nimport json\nimport sys\n{_IMPORTS}")
     )

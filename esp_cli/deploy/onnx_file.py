@@ -15,14 +15,14 @@ from esp_cli.deploy.program import (
     Activation,
     Affine,
     Convolution,
-    Cut,
     Floats,
-    Hear,
-    Largest,
+    GlobalMaxPool,
     Layer,
+    MessageAggregation,
     Norm,
     Program,
     Recurrent,
+    Slice,
 )
 
 OPSET = 17
@@ -135,10 +135,10 @@ class _Graph:
             Affine: self.affine,
             Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
             Norm: self.normalise,
-            Cut: lambda x, layer: self.cut(x, layer.begin, layer.end),
+            Slice: lambda x, layer: self.cut(x, layer.begin, layer.end),
             Convolution: self.convolve,
-            Largest: lambda x, layer: self.reduce("ReduceMax", self.reshape(x, -1, layer.channels, layer.places), 2),
-            Hear: self.hear,
+            GlobalMaxPool: self.global_max_pool,
+            MessageAggregation: self.aggregate,
         }
         return writers[type(layer)](x, layer)
 
@@ -161,7 +161,11 @@ class _Graph:
         out = self.node("Conv", [pictures, weight, self.constant(layer.bias)], strides=[layer.stride, layer.stride])
         return self.reshape(out, -1, layer.width)
 
-    def hear(self, x: str, layer: Hear) -> str:
+    def global_max_pool(self, x: str, layer: GlobalMaxPool) -> str:
+        """Take the largest number of each channel."""
+        return self.reduce("ReduceMax", self.reshape(x, -1, layer.channels, layer.places), 2)
+
+    def aggregate(self, x: str, layer: MessageAggregation) -> str:
         """Return own features beside the means over the near."""
         number = [self.constant(np.array(value, np.float32)) for value in (1, layer.reach_squared, layer.reach)]
         one, reach_squared, reach = number

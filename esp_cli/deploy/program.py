@@ -9,7 +9,7 @@ A program maps a row of observation, and of memory where it has one, to outputs,
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
 The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
-agents hear each other, the rows of a world's agents stand side by side.
+agents exchange messages, the rows of a world's agents stand side by side.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Recurrent:
 
 
 @dataclass(frozen=True)
-class Cut(Fixed):
+class Slice(Fixed):
     """Columns `begin` to `end` of a row."""
 
     begin: int
@@ -156,7 +156,7 @@ class Convolution(Learned):
 
 
 @dataclass(frozen=True)
-class Largest(Fixed):
+class GlobalMaxPool(Fixed):
     """The largest number of each channel: [channels x places] to [channels]."""
 
     channels: int
@@ -169,7 +169,7 @@ class Largest(Fixed):
 
 
 @dataclass(frozen=True)
-class Hear(Fixed):
+class MessageAggregation(Fixed):
     """Own features x beside what the near ones say: [x, mean of their way / reach, mean of their x].
 
     The others of the team stand in the observation's columns from `begin`, two numbers each, in the team's order
@@ -203,7 +203,7 @@ class Hear(Fixed):
         return (self.team - 1) * (9 + 2 * self.width) + 4
 
 
-Layer = Affine | Norm | Activation | Recurrent | Cut | Convolution | Largest | Hear
+Layer = Affine | Norm | Activation | Recurrent | Slice | Convolution | GlobalMaxPool | MessageAggregation
 
 
 @dataclass(frozen=True)
@@ -272,13 +272,13 @@ def _describe(layer: Layer) -> dict[str, object]:
         return {"kind": "norm", "width": layer.weight.size}
     if isinstance(layer, Activation):
         return {"kind": layer.name, "width": layer.width}
-    if isinstance(layer, Cut):
+    if isinstance(layer, Slice):
         return {"kind": "cut", "begin": layer.begin, "end": layer.end}
     if isinstance(layer, Convolution):
         return {"kind": "convolution", **_named(layer, "channels", "rows", "columns", "side", "stride", "outputs")}
-    if isinstance(layer, Largest):
+    if isinstance(layer, GlobalMaxPool):
         return {"kind": "largest", "channels": layer.channels, "places": layer.places}
-    if isinstance(layer, Hear):
+    if isinstance(layer, MessageAggregation):
         return {"kind": "hear", **_named(layer, "begin", "end", "team", "reach_squared")}
     return {"kind": "gru", "inputs": layer.input.weight.shape[0], "hidden": layer.hidden}
 

@@ -13,13 +13,13 @@ from esp_cli.deploy.program import (
     Activation,
     Affine,
     Convolution,
-    Cut,
-    Hear,
-    Largest,
+    GlobalMaxPool,
     Layer,
+    MessageAggregation,
     Norm,
     Program,
     Recurrent,
+    Slice,
 )
 
 
@@ -88,13 +88,13 @@ def _apply(x: Tensor, layer: Layer, arrays: list[Tensor], observation: Tensor) -
         return torch.relu(x) if layer.name == "relu" else torch.tanh(x)
     if isinstance(layer, Norm):
         return nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], NORM_EPSILON)
-    if isinstance(layer, Cut):
+    if isinstance(layer, Slice):
         return x[:, layer.begin : layer.end]
     if isinstance(layer, Convolution):
         return _convolve(x, layer, arrays)
-    if isinstance(layer, Hear):
+    if isinstance(layer, MessageAggregation):
         return _hear(x, observation, layer)
-    assert isinstance(layer, Largest)
+    assert isinstance(layer, GlobalMaxPool)
     return x.unflatten(1, (layer.channels, layer.places)).amax(2)
 
 
@@ -105,7 +105,7 @@ def _convolve(x: Tensor, layer: Convolution, arrays: list[Tensor]) -> Tensor:
     return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
 
 
-def _hear(x: Tensor, observation: Tensor, layer: Hear) -> Tensor:
+def _hear(x: Tensor, observation: Tensor, layer: MessageAggregation) -> Tensor:
     """Put what the near ones say beside each agent's own features."""
     ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
     near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()

@@ -9,14 +9,14 @@ from esp_cli.deploy.program import (
     Activation,
     Affine,
     Convolution,
-    Cut,
     Floats,
-    Hear,
-    Largest,
+    GlobalMaxPool,
     Layer,
+    MessageAggregation,
     Norm,
     Program,
     Recurrent,
+    Slice,
 )
 from esp_cli.networks.constrained import ConstrainedLinear, Equivariant
 from esp_cli.networks.contract import Network
@@ -82,11 +82,11 @@ def _network(actor: Network) -> tuple[int, list[Layer]]:
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:
     """Return the layers of a team: every agent's picture, then what it hears."""
-    layers: list[Layer] = [Cut(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
+    layers: list[Layer] = [Slice(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
     for layer in actor.layers:
         affine = _affine(layer)
         width = (affine.weight.shape[0] - 2) // 2
-        heard = Hear(actor.others.start, actor.team, width, REACH_SQUARED)
+        heard = MessageAggregation(actor.others.start, actor.team, width, REACH_SQUARED)
         layers += [heard, affine, _activation("relu", affine)]
     return [*layers, _affine(actor.head)]
 
@@ -100,7 +100,7 @@ def _pictures(encoder: PictureEncoder) -> list[Layer]:
         layers += [filters, Activation("relu", filters.width)]
         shape = (filters.outputs, *filters.places)
     channels, rows, columns = shape
-    return [*layers, Largest(channels, rows * columns)]
+    return [*layers, GlobalMaxPool(channels, rows * columns)]
 
 
 def _width(mlp: SeedMLP) -> int:

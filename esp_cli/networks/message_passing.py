@@ -29,7 +29,7 @@ CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
 """Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
 REACH_SQUARED = 18.0
 """Square of the communication range in cells, 3 sqrt(2) cells; van der Pol's code. Drones at exactly this range do not
-hear each other. Squared distances are integers, so the comparison is exact."""
+exchange messages. Squared distances are integers, so the comparison is exact."""
 _LOT = 16
 """The number of encoded pictures is a multiple of this, so that few shapes of matrix products occur."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli.deploy import check
-from esp_cli.deploy.box import MANIFEST, box_folder, read_box
+from esp_cli.deploy.bundled import MANIFEST, bundled_folder, read_bundled
 from tests.cli.running import DAMAGE, esp, refused
 
 
@@ -42,39 +42,39 @@ def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
     assert "Not compared with the policy" in (tmp_path / "README.md").read_text()
 
 
-def test_a_policy_goes_into_a_box_and_is_used_from_there(
+def test_a_policy_goes_into_a_folder_and_is_used_from_there(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    box = tmp_path / "checkpoints"
-    result = esp("export", finished, "-f", "policy", "-o", box, "--episodes", 4)
-    (entry,) = read_box(box)
+    folder = tmp_path / "checkpoints"
+    result = esp("export", finished, "-f", "policy", "-o", folder, "--episodes", 4)
+    (entry,) = read_bundled(folder)
     assert f"{entry.name}: seed {entry.seed} of 2" in result.stderr
-    monkeypatch.setattr("esp_cli.deploy.box.box_folder", lambda: box)
+    monkeypatch.setattr("esp_cli.deploy.bundled.bundled_folder", lambda: folder)
     judged = json.loads(esp("eval", "navigation", "--episodes", 4, "--json", "-").stdout)
     assert judged["greedy"]["mean"] == pytest.approx(entry.score.mean)
     assert entry.name in esp("policies", "navigation").stdout
     esp("render", entry.name, "-o", tmp_path / "n.png")
     assert (tmp_path / "n.png").stat().st_size
     said = refused("eval", "navigation", "--algo", "qmix")
-    assert "no policy fits navigation --algo qmix; the box has navigation-mappo-esp" in said
+    assert "no policy fits navigation --algo qmix; the bundled policies are navigation-mappo-esp" in said
     assert "holds no policy of formation" in refused("policies", "formation")
-    (box / MANIFEST).write_text("{")
+    (folder / MANIFEST).write_text("{")
     assert "is not valid JSON" in refused("eval", "navigation")
 
 
-def test_the_box_that_comes_along_is_listed() -> None:
+def test_the_folder_that_comes_along_is_listed() -> None:
     listed = json.loads(esp("policies", "--json", "-").stdout)
-    assert [item["name"] for item in listed] == [entry.name for entry in read_box()]
+    assert [item["name"] for item in listed] == [entry.name for entry in read_bundled()]
     shown = esp("policies").stdout
-    assert all(entry.name in shown for entry in read_box())
-    assert (box_folder() / MANIFEST).is_file()
+    assert all(entry.name in shown for entry in read_bundled())
+    assert (bundled_folder() / MANIFEST).is_file()
 
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
         (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy, webots, ros2, policy"),
-        (["-f", "policy", "-f", "c"], "-f policy puts a policy into a box; leave out the other formats"),
+        (["-f", "policy", "-f", "c"], "-f policy bundles a policy; leave out the other formats"),
         (["-f", "c", "--name", "mine"], "--name is for -f policy alone"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.deploy.box import find
+from esp_cli.deploy.bundled import find
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "load_policy.py"
 

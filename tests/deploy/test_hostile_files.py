@@ -20,8 +20,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from esp_cli.deploy.box import MANIFEST, read_box, write_box
-from esp_cli.deploy.bundling import add_to_box
+from esp_cli.deploy.bundled import MANIFEST, read_bundled, write_bundled
+from esp_cli.deploy.bundling import bundle
 from esp_cli.deploy.library import load_policy
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.loading import TrainedPolicy
@@ -204,15 +204,15 @@ def test_files_written_on_purpose_give_a_sentence_or_a_policy(kind: str, tmp_pat
 
 
 def test_spoilt_manifests_give_a_sentence_or_entries(tmp_path: Path) -> None:
-    add_to_box(drawn_policy("choice", hidden=(4,)), tmp_path, 4)
+    bundle(drawn_policy("choice", hidden=(4,)), tmp_path, 4)
     file, draw = tmp_path / MANIFEST, random.Random("manifest")
-    content, entries = file.read_bytes(), read_box(tmp_path)
+    content, entries = file.read_bytes(), read_bundled(tmp_path)
     for k in range(MANIFESTS):
         file.write_bytes(SPOILERS[k % 5](bytearray(content), draw))
-        found = attempt(lambda: read_box(tmp_path))
+        found = attempt(lambda: read_bundled(tmp_path))
         assert found is None or all(len(e.sha256) == 64 and "/" not in e.file for e in found)
-    write_box(tmp_path, entries)
-    assert read_box(tmp_path) == entries
+    write_bundled(tmp_path, entries)
+    assert read_bundled(tmp_path) == entries
 
 
 def container(header: bytes, data: bytes = b"") -> bytes:

@@ -1,4 +1,4 @@
-"""Policies whose agents hear each other leave the application whole: layers by hand, costs, who is near, refusals."""
+"""Policies whose agents exchange messages leave the application whole: layers by hand, costs, who is near, refusals."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from esp_cli.deploy import check
 from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.export import export
 from esp_cli.deploy.library import LoadedPolicy
-from esp_cli.deploy.program import Affine, Convolution, Cut, Hear, Largest, Program
-from esp_cli.deploy.takeaway.runtime import NumpyPolicy
+from esp_cli.deploy.program import Affine, Convolution, GlobalMaxPool, MessageAggregation, Program, Slice
+from esp_cli.deploy.runtime.numpy_policy import NumpyPolicy
 from esp_cli.deploy.torch_file import TorchProgram
 from esp_cli.deploy.translate import program_of
 from tests.deploy.policies import drawn_policy
@@ -34,14 +34,14 @@ def test_a_picture_through_convolution_and_largest_response_by_hand() -> None:
     weight = np.array([1, 2, 3, 4, -1, -2, -3, -4], np.float32)[:, None]
     filters = Convolution(weight, np.array([0.5], np.float32), channels=2, rows=2, columns=4, side=2, stride=2)
     assert (filters.places, filters.width, filters.flops) == ((1, 2), 2, 2 * 8 * 2)
-    program = Program(17, (Cut(1, 17), filters), 2, 0, 0, "choose", ())
+    program = Program(17, (Slice(1, 17), filters), 2, 0, 0, "choose", ())
     first = [[1, 0, 0, 1], [0, 1, 0, 0]]
     second = [[0, 0, 0, 0], [1, 0, 1, 0]]
     row = np.concatenate([[99], np.ravel(first), np.ravel(second)]).astype(np.float32)
     # left: 1 * 1 + 4 * 1 - 3 * 1 + 0.5, right: 2 * 1 - 3 * 1 + 0.5
     for outputs in both(program, row[None]):
         assert outputs.tolist() == [[2.5, -0.5]]
-    pooled = Program(17, (Cut(1, 17), filters, Largest(1, 2)), 1, 0, 0, "choose", ())
+    pooled = Program(17, (Slice(1, 17), filters, GlobalMaxPool(1, 2)), 1, 0, 0, "choose", ())
     for outputs in both(pooled, row[None]):
         assert outputs.tolist() == [[2.5]]
     assert pooled.flops == 2 * 8 * 2 + 1 + 1
@@ -49,8 +49,8 @@ def test_a_picture_through_convolution_and_largest_response_by_hand() -> None:
 
 def test_what_is_heard_by_hand() -> None:
     # own feature, then the ways to the two others; agents 0 and 1 are near each other, agent 2 is too far from both
-    hear = Hear(begin=1, team=3, width=1, reach_squared=4.0)
-    program = Program(5, (Cut(0, 1), hear), 4, 0, 0, "choose", (), team=3)
+    hear = MessageAggregation(begin=1, team=3, width=1, reach_squared=4.0)
+    program = Program(5, (Slice(0, 1), hear), 4, 0, 0, "choose", (), team=3)
     rows = np.array([[10, 1, 1, 0, 2], [20, -1, -1, -1, 9], [40, 0, -2, 1, -9]], np.float32)
     # divided by two: the one heard and the agent itself; the way in reaches of 2; two cells are not less than two
     expected = [[10, 0.25, 0.25, 10], [20, -0.25, -0.25, 5], [40, 0, 0, 0]]
@@ -106,8 +106,8 @@ def runner_of(program: Program) -> check.Runner:
 def test_a_drawn_network_as_layers_and_its_costs() -> None:
     program = program_of(drawn_policy("team", hidden=(12, 10)).policy)
     kinds = [type(layer).__name__ for layer in program.layers]
-    pictures = ["Cut", "Convolution", "Activation", "Convolution", "Activation", "Largest"]
-    assert kinds == [*pictures, "Hear", "Affine", "Activation", "Hear", "Affine", "Activation", "Affine"]
+    pictures = ["Slice", "Convolution", "Activation", "Convolution", "Activation", "GlobalMaxPool"]
+    assert kinds == [*pictures, *["MessageAggregation", "Affine", "Activation"] * 2, "Affine"]
     assert (program.num_inputs, program.team, program.memory_width) == (WIDTH, 3, 0)
     shapes = [layer.weight.shape for layer in program.layers if isinstance(layer, Affine)]
     # what a drone found and what it hears, 32 numbers each, and the mean way
@@ -127,7 +127,7 @@ def test_the_worked_example_is_a_whole_world(tmp_path: Path) -> None:
     assert check.example_runs(tmp_path)
     subprocess.run(["python", "policy.py"], cwd=tmp_path, check=True, capture_output=True)
     for file in ("README.md", "policy.h", "policy.py"):
-        assert "The 3 agents of a world hear each other and act together" in (tmp_path / file).read_text()
+        assert "The 3 agents of a world exchange messages and act together" in (tmp_path / file).read_text()
     changed = (tmp_path / "policy_example.c").read_text()
     begin = changed.index("expected[ESP_POLICY_AGENTS] = {") + len("expected[ESP_POLICY_AGENTS] = {")
     (tmp_path / "policy_example.c").write_text(changed[:begin] + "7" + changed[begin + 1 :])
@@ -155,7 +155,7 @@ def test_a_loaded_team_acts_world_by_world(lead: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("shape", [(WIDTH,), (2, WIDTH), (3, 2, WIDTH), (6, WIDTH)])
 def test_a_loaded_team_refuses_rows_that_are_no_world(shape: tuple[int, ...]) -> None:
     with pytest.raises(
-        ValueError, match=r"hear each other: give \(\.\.\., 3, 445\), one row for each agent of a world"
+        ValueError, match=r"exchange messages: give \(\.\.\., 3, 445\), one row for each agent of a world"
     ):
         LoadedPolicy(drawn_policy("team")).act(np.zeros(shape))
 
@@ -167,13 +167,13 @@ def test_an_equivariant_team_is_exported_as_plain_layers() -> None:
     assert len(sample.obs) == 300
     agreement = check.compare(sample, runner_of(program))
     assert agreement.max_difference < 5e-5
-    moved = Program(**{**vars(program), "layers": (Cut(1, 442), *program.layers[1:])})
+    moved = Program(**{**vars(program), "layers": (Slice(1, 442), *program.layers[1:])})
     with pytest.raises(RuntimeError, match="differs from the policy"):
         check.compare(sample, runner_of(moved))
 
 
 def test_c_refuses_a_team_whose_actions_are_no_choices() -> None:
-    program = Program(5, (Cut(0, 1), Hear(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
+    program = Program(5, (Slice(0, 1), MessageAggregation(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
     with pytest.raises(ValueError, match="only choices are written as C"):
         c_source(program, "")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import ClassVar
 
@@ -25,7 +25,7 @@ from esp_envs.epuck import steering
 from esp_envs.epuck.formation_spec import LEVELS, WHEEL_PAIRS, FormationSettings, formation_spec
 from esp_envs.epuck.gl import space_painter
 from esp_envs.epuck.physics import Bodies, make_physics
-from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED
+from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
 
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
@@ -90,6 +90,7 @@ class Formation(Environment):
 
     Settings: ClassVar[type[TaskSettings]] = FormationSettings
     heuristics: ClassVar[tuple[str, ...]] = ("avoid", "straight")
+    robot: ClassVar[Mapping[str, float]] = {**DIMENSIONS, "fading_m": FADING_M}
     settings: FormationSettings
 
     def __init__(self, settings: FormationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:

@@ -26,6 +26,13 @@ MAX_SPIN_RAD_S = 2 * MAX_SPEED_M_S / AXLE_M
 FRICTION = 1.0
 """Of the wheels on the floor: no wheel pushes harder than this times its share of the weight."""
 GRAVITY_M_S2 = 9.81
+DIMENSIONS = {
+    "body_radius_m": BODY_RADIUS_M,
+    "wheel_radius_m": WHEEL_RADIUS_M,
+    "axle_m": AXLE_M,
+    "max_wheel_speed_rad_s": MAX_WHEEL_SPEED,
+}
+"""What the program on a robot has to know."""
 
 
 def drive(wheels: Array) -> tuple[Array, Array]:

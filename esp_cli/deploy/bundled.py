@@ -1,7 +1,7 @@
-"""The box of trained policies that comes with the application: files in `checkpoints/` and a manifest of them.
+"""The trained policies that come with the application: files in `checkpoints/`, listed in a manifest.
 
-A checkout has the box beside the packages, an installed wheel inside `esp_cli`. A policy in it is found by its name
-(`formation-mappo-esp`) or by its task, and then by algorithm and prior.
+The folder is beside the packages in a checkout, and inside `esp_cli` in an installed wheel. A policy is found by its
+name (`formation-mappo-esp`) or by its task, and then by algorithm and prior.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import TrainedPolicy, load_policy
 from esp_envs.registry import task_names
 
-BOX_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
+MANIFEST_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
 MANIFEST = "manifest.json"
 _FOLDER = "checkpoints"
 _NAME = r"[a-z0-9]+(-[a-z0-9]+)*"
@@ -37,7 +37,7 @@ class Score(BaseModel):
 
 
 class Entry(BaseModel):
-    """One policy of the box, as the manifest describes it."""
+    """One bundled policy, as the manifest describes it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -65,7 +65,7 @@ class Entry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What the manifest of a box lists."""
+    """What a manifest lists."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -73,62 +73,63 @@ class Manifest(BaseModel):
 
 
 def standard_name(task: str, algorithm: str, prior: str) -> str:
-    """Return the name under which a policy goes into the box."""
+    """Return the default name of a bundled policy."""
     return f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
 
 
-def box_folder() -> Path:
-    """Return the folder of the box: beside the packages in a checkout, else inside `esp_cli`."""
+def bundled_folder() -> Path:
+    """Return the folder of the bundled policies: beside the packages in a checkout, else inside `esp_cli`."""
     package = Path(__file__).parents[1]
     inside = package / _FOLDER
     return inside if inside.is_dir() else package.parent / _FOLDER
 
 
-def read_box(folder: Path | None = None) -> tuple[Entry, ...]:
+def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
     """Return what the manifest lists; nothing where there is no manifest.
 
     Args:
-        folder: of the box; by default that of this installation.
+        folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: the manifest is damaged or of a newer version.
     """
-    file = (folder or box_folder()) / MANIFEST
+    file = (folder or bundled_folder()) / MANIFEST
     if not file.is_file():
         return ()
-    entries = BOX_FORMAT.parse(file, Manifest).policies
+    entries = MANIFEST_FORMAT.parse(file, Manifest).policies
     if len({entry.name for entry in entries}) < len(entries):
         raise ValueError(f"{file} is damaged: it names a policy twice")
     return entries
 
 
-def write_box(folder: Path, entries: tuple[Entry, ...]) -> None:
-    """Write the manifest of a box, sorted by name."""
+def write_bundled(folder: Path, entries: tuple[Entry, ...]) -> None:
+    """Write a manifest, sorted by name."""
     listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
-    BOX_FORMAT.write(folder / MANIFEST, {"policies": listed})
+    MANIFEST_FORMAT.write(folder / MANIFEST, {"policies": listed})
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None, folder: Path | None = None) -> Entry:
-    """Find a policy of the box.
+    """Find a bundled policy.
 
     Args:
         name: its own, or that of a task; of a task's policies MAPPO's and those with the prior come first.
         algo: only those that this algorithm trained.
         prior: only those that this kind of prior helped to train ("none": the plain learner).
-        folder: of the box; by default that of this installation.
+        folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: there is none.
     """
-    entries = read_box(folder)
+    entries = read_bundled(folder)
     named = [e for e in entries if e.name == name]
     asked = named or [e for e in entries if e.task == name]
     found = [e for e in asked if algo in (None, e.algorithm) and prior in (None, e.prior)]
     if found:
         return min(found, key=_rank)
     wanted = " ".join([name, *(f"--algo {algo}" for _ in [0] if algo), *(f"--prior {prior}" for _ in [0] if prior)])
-    there = ", ".join(e.name for e in asked or entries) or "no policy at all"
-    raise ValueError(f"no policy fits {wanted}; the box has {there}; train one with esp train, and name its run folder")
+    names = ", ".join(e.name for e in asked or entries)
+    there = f"the bundled policies are {names}" if names else "no policy is bundled"
+    raise ValueError(f"no policy fits {wanted}; {there}; train one with esp train, and name its run folder")
 
 
 def _rank(entry: Entry) -> tuple[bool, int, int]:
@@ -140,15 +141,15 @@ def _rank(entry: Entry) -> tuple[bool, int, int]:
 def open_policy(
     where: Path, algo: str | None = None, prior: str | None = None, folder: Path | None = None
 ) -> TrainedPolicy:
-    """Open a run folder, a policy file, or a policy of the box by its name or its task's.
+    """Open a run folder, a policy file, or a bundled policy by its name or its task's.
 
-    What lies at the path goes before what has the name, unless algorithm or prior say that the box is meant.
+    An existing path goes before a bundled policy of that name, unless algorithm or prior is given.
 
     Args:
         where: path or name.
-        algo: of the box's policies, only those that this algorithm trained.
+        algo: of the bundled policies, only those that this algorithm trained.
         prior: likewise this kind of prior.
-        folder: of the box; by default that of this installation.
+        folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: nothing there, damaged, or of another version.
@@ -160,7 +161,7 @@ def open_policy(
         raise ValueError(f"there is no policy {shortened(str(where))}: {error.strerror}") from None
     if there and not choosy:
         return load_policy(where)
-    if str(where) in task_names() or any(entry.name == str(where) for entry in read_box(folder)):
+    if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled(folder)):
         return load_entry(find(str(where), algo, prior, folder), folder)
     if choosy:
         raise ValueError(f"--algo and --prior choose among a task's policies, but {where} is no task; leave them out")
@@ -168,12 +169,12 @@ def open_policy(
 
 
 def load_entry(entry: Entry, folder: Path | None = None) -> TrainedPolicy:
-    """Load a policy of the box.
+    """Load a bundled policy.
 
     Raises:
         ValueError: its file is missing, another than the manifest names, or of another version.
     """
-    trained = load_policy((folder or box_folder()) / entry.file, entry.sha256)
+    trained = load_policy((folder or bundled_folder()) / entry.file, entry.sha256)
     described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
     if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
         raise ValueError(f"{trained.source} holds another policy than its manifest says; get both anew")

@@ -1,4 +1,4 @@
-"""The box of trained policies: every one does what its manifest says, and is found by name."""
+"""Bundled policies: every one does what its manifest says, and is found by name."""
 
 from __future__ import annotations
 
@@ -12,21 +12,30 @@ from pathlib import Path
 import pytest
 
 from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
-from esp_cli.deploy import box
-from esp_cli.deploy.box import MANIFEST, Entry, box_folder, config_of, find, load_entry, open_policy, read_box
-from esp_cli.deploy.bundling import add_to_box, best_seed, command_of, play_greedily, score_of
+from esp_cli.deploy import bundled
+from esp_cli.deploy.bundled import (
+    MANIFEST,
+    Entry,
+    bundled_folder,
+    config_of,
+    find,
+    load_entry,
+    open_policy,
+    read_bundled,
+)
+from esp_cli.deploy.bundling import best_seed, bundle, command_of, play_greedily, score_of
 from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import resolve_config
 from tests.deploy.policies import drawn_policy
 
-ENTRIES = read_box()
+ENTRIES = read_bundled()
 EPISODES = {"formation": 8}
 """Episodes to judge a policy anew by, where fewer than 128 will do: they are long, and all alike."""
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
 def test_a_policy_does_what_its_manifest_says(entry: Entry) -> None:
-    file = box_folder() / entry.file
+    file = bundled_folder() / entry.file
     assert hashlib.sha256(file.read_bytes()).hexdigest() == entry.sha256
     trained = load_entry(entry)
     assert (trained.spec.version, trained.spec.convention) == (entry.task_version, entry.convention)
@@ -69,50 +78,50 @@ def test_the_command_of_a_manifest_resolves_to_its_configuration(entry: Entry) -
 
 
 def test_no_file_of_the_box_is_without_a_line_in_the_manifest() -> None:
-    files = {file.name for file in box_folder().iterdir() if file.suffix != ".md"}
+    files = {file.name for file in bundled_folder().iterdir() if file.suffix != ".md"}
     assert files == {MANIFEST, *(entry.file for entry in ENTRIES)}
-    assert all((box_folder() / name).stat().st_size < 512 * 1024 for name in files)
+    assert all((bundled_folder() / name).stat().st_size < 512 * 1024 for name in files)
 
 
 def test_the_box_is_beside_the_packages_or_in_the_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert box_folder() == Path(__file__).parents[2] / "checkpoints"
+    assert bundled_folder() == Path(__file__).parents[2] / "checkpoints"
     package = tmp_path / "site-packages" / "esp_cli"
     (package / "deploy").mkdir(parents=True)
-    monkeypatch.setattr(box, "__file__", str(package / "deploy" / "box.py"))
-    assert box_folder() == tmp_path / "site-packages" / "checkpoints"
+    monkeypatch.setattr(bundled, "__file__", str(package / "deploy" / "bundled.py"))
+    assert bundled_folder() == tmp_path / "site-packages" / "checkpoints"
     shutil.copytree(Path(__file__).parents[2] / "checkpoints", package / "checkpoints")
-    assert box_folder() == package / "checkpoints"
-    assert read_box() == ENTRIES
+    assert bundled_folder() == package / "checkpoints"
+    assert read_bundled() == ENTRIES
 
 
 @pytest.fixture(scope="module")
-def small_box(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A box of drawn policies: two of navigation, one of which has a name of its own, and one by another algorithm."""
-    folder = tmp_path_factory.mktemp("box")
-    add_to_box(drawn_policy("choice", seeds=(3, 7)), folder, 4)
-    add_to_box(drawn_policy("exploring choice, recurrent"), folder, 4)
-    add_to_box(drawn_policy("vector"), folder, 4, name="navigation-vectors")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Drawn policies in a manifest: two of navigation, one with a name of its own, and one by another algorithm."""
+    folder = tmp_path_factory.mktemp("bundled")
+    bundle(drawn_policy("choice", seeds=(3, 7)), folder, 4)
+    bundle(drawn_policy("exploring choice, recurrent"), folder, 4)
+    bundle(drawn_policy("vector"), folder, 4, name="navigation-vectors")
     return folder
 
 
-def test_what_is_put_in_is_found_and_plays_the_same(small_box: Path) -> None:
-    entry = find("navigation", folder=small_box)
+def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
+    entry = find("navigation", folder=small)
     assert (entry.name, entry.file) == ("navigation-mappo-esp", "navigation-mappo-esp.safetensors")
     assert (entry.chosen_from, entry.score.episodes, entry.step) == (2, 4, 100)
-    alone = load_entry(entry, small_box)
+    alone = load_entry(entry, small)
     assert alone.config.seeds == (entry.seed,)
     assert score_of(play_greedily(alone, 4)) == entry.score
     assert evaluate(alone, 4).greedy.mean == pytest.approx(entry.score.mean)
 
 
-def test_the_seed_is_the_one_that_did_best(small_box: Path) -> None:
+def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
     trained = drawn_policy("choice", seeds=(3, 7))
     best = best_seed(trained, 64)
-    with_seed = {seed: add_to_box(trained, small_box, 64, seed, f"seed-{seed}").score.mean for seed in (3, 7)}
+    with_seed = {seed: bundle(trained, small, 64, seed, f"seed-{seed}").score.mean for seed in (3, 7)}
     assert best == max(with_seed, key=with_seed.__getitem__)
     for seed in (3, 7):
-        (small_box / f"seed-{seed}.safetensors").unlink()
-    box.write_box(small_box, tuple(e for e in read_box(small_box) if not e.name.startswith("seed")))
+        (small / f"seed-{seed}.safetensors").unlink()
+    bundled.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
 
 
 @pytest.mark.parametrize(
@@ -125,47 +134,45 @@ def test_the_seed_is_the_one_that_did_best(small_box: Path) -> None:
         (("navigation-vectors", "mappo", None), "navigation-vectors"),
     ],
 )
-def test_a_policy_is_found_by_task_algorithm_and_prior(small_box: Path, asked: tuple, name: str) -> None:
-    assert find(*asked, folder=small_box).name == name
-    assert open_policy(Path(asked[0]), *asked[1:], small_box).source.name == f"{name}.safetensors"
+def test_a_policy_is_found_by_task_algorithm_and_prior(small: Path, asked: tuple, name: str) -> None:
+    assert find(*asked, folder=small).name == name
+    assert open_policy(Path(asked[0]), *asked[1:], small).source.name == f"{name}.safetensors"
 
 
 @pytest.mark.parametrize(
     ("asked", "sentence"),
     [
-        (("navigation", "qmix", None), "no policy fits navigation --algo qmix; the box has navigation-"),
-        (("navigation", None, "none"), "no policy fits navigation --prior none; the box has"),
-        (("formation", None, None), "no policy fits formation; the box has navigation-"),
+        (("navigation", "qmix", None), "no policy fits navigation --algo qmix; the bundled policies are navigation-"),
+        (("navigation", None, "none"), "no policy fits navigation --prior none; the bundled policies are"),
+        (("formation", None, None), "no policy fits formation; the bundled policies are navigation-"),
         (("nothing", "mappo", None), "--algo and --prior choose among a task's policies, but nothing is no task"),
         (("nothing", None, None), "nothing does not exist"),
     ],
 )
-def test_what_is_not_there_is_told_in_one_sentence(small_box: Path, asked: tuple, sentence: str) -> None:
+def test_what_is_not_there_is_told_in_one_sentence(small: Path, asked: tuple, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        open_policy(Path(asked[0]), *asked[1:], small_box)
+        open_policy(Path(asked[0]), *asked[1:], small)
 
 
-def test_a_folder_of_the_name_goes_before_the_box(
-    small_box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_of_the_name_goes_before_the_box(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("navigation").mkdir()
     with pytest.raises(ValueError, match="navigation is no run folder"):
-        open_policy(Path("navigation"), folder=small_box)
-    assert open_policy(Path("navigation"), "mappo", folder=small_box).source.parent == small_box
+        open_policy(Path("navigation"), folder=small)
+    assert open_policy(Path("navigation"), "mappo", folder=small).source.parent == small
 
 
 def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
-    first = add_to_box(drawn_policy("choice"), tmp_path, 4)
-    second = add_to_box(drawn_policy("choice", hidden=(5,)), tmp_path, 4)
+    first = bundle(drawn_policy("choice"), tmp_path, 4)
+    second = bundle(drawn_policy("choice", hidden=(5,)), tmp_path, 4)
     assert first.sha256 != second.sha256
-    assert read_box(tmp_path) == (second,)
+    assert read_bundled(tmp_path) == (second,)
     with pytest.raises(ValueError, match=r"'Best one!' is no name for a policy"):
-        add_to_box(drawn_policy("choice"), tmp_path, 4, name="Best one!")
+        bundle(drawn_policy("choice"), tmp_path, 4, name="Best one!")
 
 
-def test_a_file_that_is_not_the_manifests_is_refused(small_box: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small_box, tmp_path / "box"))
+def test_a_file_that_is_not_the_manifests_is_refused(small: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small, tmp_path / "bundled"))
     shutil.copy(folder / "navigation-vectors.safetensors", folder / "navigation-mappo-esp.safetensors")
     with pytest.raises(ValueError, match="is not the file that its manifest names: their SHA-256 differ"):
         open_policy(Path("navigation"), folder=folder)
@@ -174,10 +181,10 @@ def test_a_file_that_is_not_the_manifests_is_refused(small_box: Path, tmp_path: 
         open_policy(Path("navigation"), folder=folder)
 
 
-def test_a_manifest_that_says_something_else_of_a_file_is_refused(small_box: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small_box, tmp_path / "box"))
+def test_a_manifest_that_says_something_else_of_a_file_is_refused(small: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small, tmp_path / "bundled"))
     entry = find("navigation", folder=folder)
-    box.write_box(folder, (entry.model_copy(update={"seed": 5}),))
+    bundled.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
     with pytest.raises(ValueError, match="holds another policy than its manifest says"):
         open_policy(Path("navigation"), folder=folder)
 
@@ -196,15 +203,15 @@ def test_a_manifest_that_says_something_else_of_a_file_is_refused(small_box: Pat
         (lambda m: [m], "is no JSON object"),
     ],
 )
-def test_a_damaged_manifest_is_told_in_one_sentence(small_box: Path, tmp_path: Path, change, sentence: str) -> None:
-    manifest = json.loads((small_box / MANIFEST).read_text())
+def test_a_damaged_manifest_is_told_in_one_sentence(small: Path, tmp_path: Path, change, sentence: str) -> None:
+    manifest = json.loads((small / MANIFEST).read_text())
     (tmp_path / MANIFEST).write_text(json.dumps(change(manifest)))
     with pytest.raises(ValueError, match=sentence) as caught:
-        read_box(tmp_path)
+        read_bundled(tmp_path)
     assert "\n" not in str(caught.value)
 
 
 def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path) -> None:
-    assert read_box(tmp_path) == ()
-    with pytest.raises(ValueError, match="no policy fits navigation; the box has no policy at all"):
+    assert read_bundled(tmp_path) == ()
+    with pytest.raises(ValueError, match="no policy fits navigation; no policy is bundled"):
         find("navigation", folder=tmp_path)
