@@ -137,11 +137,27 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise ValueError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
-        for agent in self.agents:
-            if not self.action_spaces[agent].contains(actions[agent]):
-                raise ValueError(f"{agent}'s action {actions[agent]!r} is outside {self.action_spaces[agent]}")
-        joint = torch.as_tensor(np.stack([np.asarray(actions[agent]) for agent in self.agents]))
-        return joint.unsqueeze(0).unsqueeze(0)
+        joint = np.stack([self._checked(agent, actions[agent]) for agent in self.agents])
+        return torch.as_tensor(joint).unsqueeze(0).unsqueeze(0)
+
+    def _checked(self, agent: str, action: object) -> _Array:
+        """Return an agent's action as an integer or a float32 vector; any NumPy or Python numbers are taken."""
+        space = self._env.spec.action
+        try:
+            array = np.asarray(action)
+        except ValueError:  # rows of different lengths
+            array = np.empty(0, object)
+        shape = (space.width,) if isinstance(space, Continuous) else ()
+        if array.shape != shape and not (shape == () and array.shape == (1,)):
+            wanted = f"an array of shape {shape}" if shape else "one integer"
+            raise ValueError(f"{agent}'s action has shape {array.shape}; give {wanted}")
+        if isinstance(space, Continuous):
+            if array.dtype.kind not in "fiu" or not ((array >= -1) & (array <= 1)).all():  # false for NaN too
+                raise ValueError(f"{agent}'s action {action!r} is not within -1 and 1; give numbers from there")
+            return array.astype(np.float32)
+        if array.dtype.kind not in "iu" or not 0 <= int(array.reshape(())) < space.count:
+            raise ValueError(f"{agent}'s action {action!r} is not an integer from 0 to {space.count - 1}")
+        return array.reshape(()).astype(np.int64)
 
     def _take(self, observation: Observation) -> dict[str, _Array]:
         """Keep the global state and return each agent's observation."""

@@ -40,8 +40,8 @@ class MappoConfig(LearnerConfig):
 
     num_envs: int = Field(32, ge=1, description="worlds per seed; MAPPO paper on MPE: 128")
     num_steps: int = Field(25, ge=1, description="steps per world and update")
-    num_epochs: int = Field(10, ge=1)
-    num_minibatches: int = Field(4, ge=1, description="paper: 1")
+    num_epochs: int = Field(10, ge=1, le=1000)
+    num_minibatches: int = Field(4, ge=1, le=10_000, description="paper: 1")
     learning_rate: float = Field(1e-3, gt=0, description="paper: 7e-4")
     anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run")
     adam_epsilon: float = Field(1e-5, gt=0)

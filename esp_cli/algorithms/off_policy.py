@@ -26,8 +26,8 @@ class OffPolicyConfig(LearnerConfig):
     """Hyperparameters of both off-policy learners; every default stands here, or in the algorithm's own file."""
 
     num_envs: int = Field(8, ge=1, description="worlds per seed, one episode each a round; paper: 1")
-    rounds: int = Field(1, ge=1, description="rounds of collecting and learning between two lines of metrics")
-    updates_per_episode: int = Field(1, ge=1, description="gradient steps per collected episode")
+    rounds: int = Field(1, ge=1, le=1000, description="rounds of collecting and learning between two lines of metrics")
+    updates_per_episode: int = Field(1, ge=1, le=10_000, description="gradient steps per collected episode")
     batch_episodes: int = Field(32, ge=1, description="episodes per seed of a gradient step")
     replay_episodes: int = Field(1000, ge=1, description="episodes that each seed remembers; paper: 5000")
     warmup_episodes: int = Field(5, ge=0, description="episodes of random actions before learning begins")

@@ -6,7 +6,7 @@ stands in the command.
 
 from __future__ import annotations
 
-import json
+import math
 import re
 from collections.abc import Callable, Iterable
 from decimal import Decimal
@@ -15,10 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
+from esp_cli.files.documents import parse_value
+
 T = TypeVar("T")
 
 _MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
 _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
+MAX_STEPS = 10**12
+"""Steps that one run may take; the fastest machine needs years for them."""
 MAX_SEEDS = 1000
 """Seeds that one run may hold; more is a slip of the keyboard, not a study."""
 
@@ -27,7 +31,7 @@ def parse_count(value: str | int) -> int:
     """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6.
 
     Raises:
-        ValueError: no number, not positive, or not a whole number of steps.
+        ValueError: no number, not positive, not a whole number of steps, or more than `MAX_STEPS`.
     """
     text = str(value).strip()
     match = _COUNT.fullmatch(text)
@@ -36,6 +40,8 @@ def parse_count(value: str | int) -> int:
     count = Decimal(match["number"].replace("_", "")) * _MULTIPLIERS[match["letter"].lower()]
     if count != count.to_integral_value() or count < 1:
         raise ValueError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
+    if count > MAX_STEPS:
+        raise ValueError(f"'{text}' is more than the {MAX_STEPS:.0e} steps that can be asked for; write for example 3M")
     return int(count)
 
 
@@ -82,8 +88,10 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
         if name in settings:
             raise ValueError(f"--set names '{name}' twice; set it once")
         try:
-            settings[name] = json.loads(text)
-        except json.JSONDecodeError:
+            settings[name] = parse_value(text)
+        except ValueError:
+            if text.lstrip()[:1] in ("[", "{"):
+                raise ValueError(f"--set {name} has a value that is not JSON; write lists as [64,64]") from None
             settings[name] = text.strip()
     return settings
 
@@ -102,6 +110,17 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
             raise ValueError(f"--set {name} changes no setting of the task; here it takes only task.NAME=VALUE")
     own = {name.removeprefix("task."): value for name, value in settings.items()}
     return own if physics is None else {**own, "physics": physics}
+
+
+def check_finite(option: str, *values: float) -> None:
+    """Refuse numbers of an option that are not finite, which typer lets through.
+
+    Raises:
+        ValueError: one of them is NaN or infinite.
+    """
+    for value in values:
+        if not math.isfinite(value):
+            raise ValueError(f"{option} {value} is not a finite number; write for example {option} -125")
 
 
 def resolve_device(wanted: str) -> str:

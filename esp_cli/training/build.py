@@ -5,6 +5,7 @@ from __future__ import annotations
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
+from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.registry import make
@@ -16,9 +17,14 @@ def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Envi
 
 
 def build_learner(config: RunConfig) -> Learner:
-    """Build the learner of a run, with its worlds, from the configuration alone."""
+    """Build the learner of a run, with its worlds, from the configuration alone.
+
+    Raises:
+        ValueError: parts of the configuration do not go together, or it needs more memory than the machine has.
+    """
     cls = ALGORITHMS[config.algorithm]
     settings = cls.config_class(**config.algorithm_settings)
+    refuse_what_does_not_fit(config, settings, build_environment(config, 1, "shape").spec)
     env = build_environment(config, settings.num_envs, "training worlds")
     return cls(
         env,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from esp_cli.algorithms.presets import PRESETS, TUNED
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.files.documents import one_sentence, parse_value
+from esp_cli.files.documents import one_sentence, parse_value, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
@@ -34,7 +35,7 @@ class RunConfig(BaseModel):
     task: str = Field(max_length=100)
     algorithm: str = Field(max_length=100)
     preset: str = Field("default", max_length=100)
-    steps: int = Field(ge=1, description="environment steps per seed")
+    steps: int = Field(ge=1, le=10**12, description="environment steps per seed")
     seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=1000, description="as many as --seeds takes")
     task_settings: dict[str, Any] = Field(default_factory=dict)
     algorithm_settings: dict[str, Any] = Field(default_factory=dict)
@@ -95,7 +96,7 @@ def resolve_config(
             del sections["network"][name]
 
     task_settings = resolve_task_settings(task, sections["task"])
-    algorithm_settings = _validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
+    algorithm_settings = validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
     values = {
         "task": task,
         "algorithm": algorithm,
@@ -104,12 +105,12 @@ def resolve_config(
         "seeds": tuple(seeds),
         "task_settings": task_settings,
         "algorithm_settings": algorithm_settings.model_dump(),
-        "network": _validated(network, sections["network"], "network", f"the network {network_name}"),
-        "prior": _validated(PriorConfig, sections["prior"], "prior"),
-        "evaluation": _validated(EvaluationConfig, sections["evaluation"], "evaluation"),
+        "network": validated(network, sections["network"], "network", f"the network {network_name}"),
+        "prior": validated(PriorConfig, sections["prior"], "prior"),
+        "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
     }
-    return _validated(RunConfig, values, "run")
+    return validated(RunConfig, values, "run")
 
 
 def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str, Any]:
@@ -118,7 +119,7 @@ def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str
     Raises:
         ValueError: an unknown task or setting, or a value out of range, in one sentence.
     """
-    return _validated(task_class(task).Settings, settings, "task").model_dump()
+    return validated(task_class(task).Settings, settings, "task").model_dump()
 
 
 def _read(value: object) -> object:
@@ -131,9 +132,32 @@ def _read(value: object) -> object:
         return value
 
 
-def _validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
-    """Build `model`, turning pydantic's report into one sentence."""
+def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
+    """Build `model`, turning pydantic's report into one sentence.
+
+    Raises:
+        ValueError: an unknown name, or a value of another kind, out of range or not finite.
+    """
     try:
-        return model(**values)
+        built = model(**values)
     except ValidationError as error:
         raise ValueError(one_sentence(error, model, section, owner)) from None
+    for name, value in values.items():
+        taken = list(_numbers(getattr(built, name)))
+        if any(isinstance(number, float) and not math.isfinite(number) for number in taken):
+            raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number")
+        # pydantic takes true for 1
+        if _count_flags(_numbers(value)) > _count_flags(taken):
+            raise ValueError(f"bad value {json.dumps(value)} for '{section}.{name}': it has to be a number")
+    return built
+
+
+def _numbers(value: object) -> Iterator[bool | int | float]:
+    """Yield the numbers and flags of a value, or of a list."""
+    for item in value if isinstance(value, list | tuple) else [value]:
+        if isinstance(item, bool | int | float):
+            yield item
+
+
+def _count_flags(numbers: Iterable[object]) -> int:
+    return sum(isinstance(number, bool) for number in numbers)

@@ -18,7 +18,7 @@ from esp_cli.files.documents import one_sentence
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import build_environment
-from esp_cli.training.config import RunConfig, resolve_task_settings
+from esp_cli.training.config import RunConfig, resolve_task_settings, validated
 from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
@@ -67,6 +67,7 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
     try:
         resolve_task_settings(config.task, config.task_settings)
+        validated(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm)
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from None
     return config

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import warnings
@@ -22,7 +23,19 @@ from esp_cli.training.policy_file import describe_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 
-CHECKPOINT_SECONDS = float(os.environ.get("ESP_CHECKPOINT_SECONDS", "30"))
+
+def _checkpoint_seconds() -> float:
+    text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 <= seconds < math.inf:
+        raise ValueError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
+    return seconds
+
+
+CHECKPOINT_SECONDS = _checkpoint_seconds()
 """Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
 CHECKPOINT_SPACING = 20
 """A checkpoint takes milliseconds, with a large replay seconds: the next waits for as many times as long as it took."""

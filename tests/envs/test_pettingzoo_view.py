@@ -70,6 +70,54 @@ def test_wrong_actions_are_refused() -> None:
         view.step({"agent_0": 0, "agent_1": 5, "agent_2": 0})
 
 
+@pytest.mark.parametrize("kind", [int, np.int64, np.int32, np.uint8, np.array, lambda k: np.array([k])])
+def test_integers_of_every_kind_are_one_action(kind) -> None:
+    seen = []
+    for make_action in (int, kind):
+        view = ParallelView("navigation", 0)
+        view.reset(seed=1)
+        seen.append(view.step({agent: make_action(k + 1) for k, agent in enumerate(view.agents)})[0]["agent_0"])
+    np.testing.assert_array_equal(*seen)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float16, list])
+def test_numbers_of_every_width_are_one_action(kind) -> None:
+    seen = []
+    for make_action in (np.float32, kind):
+        view = ParallelView("navigation", 0, actions="continuous")
+        view.reset(seed=1)
+        step = view.step({agent: make_action([0.5, -1.0]) for agent in view.agents})
+        seen.append(step[0]["agent_0"])
+    np.testing.assert_array_equal(*seen)
+
+
+@pytest.mark.parametrize(
+    ("actions", "action", "text"),
+    [
+        ("discrete", 5, "agent_1's action 5 is not an integer from 0 to 4"),
+        ("discrete", -1, "action -1 is not an integer"),
+        ("discrete", 1.0, "action 1.0 is not an integer"),
+        ("discrete", True, "action True is not an integer"),
+        ("discrete", None, "action None is not an integer"),
+        ("discrete", [1, 2], r"agent_1's action has shape \(2,\); give one integer"),
+        ("continuous", [0.5], r"has shape \(1,\); give an array of shape \(2,\)"),
+        ("continuous", 1, r"has shape \(\); give an array of shape \(2,\)"),
+        ("continuous", [[1], [2, 3]], r"has shape \(0,\); give an array of shape \(2,\)"),
+        ("continuous", [0.5, 1.5], "is not within -1 and 1"),
+        ("continuous", [0.5, float("nan")], "is not within -1 and 1"),
+        ("continuous", ["a", "b"], "is not within -1 and 1"),
+        ("continuous", np.array([-128, 0], np.int8), "is not within -1 and 1"),
+    ],
+)
+def test_a_wrong_shape_or_value_says_which(actions: str, action: object, text: str) -> None:
+    view = ParallelView("navigation", 0, actions=actions)
+    view.reset()
+    good = view.action_space("agent_0").sample()
+    with pytest.raises(ValueError, match=text):
+        view.step({"agent_0": good, "agent_1": action, "agent_2": good})
+    view.step({"agent_0": good, "agent_1": good, "agent_2": good})  # the refused step did not happen
+
+
 def test_it_renders_when_asked() -> None:
     view = ParallelView("predator-prey", 0, render_mode="rgb_array")
     view.reset()

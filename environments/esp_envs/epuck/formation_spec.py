@@ -42,7 +42,7 @@ class FormationSettings(TaskSettings):
     num_obstacles: int = Setting(2, ge=0, le=8, description="M, pillars on a ring around the middle")
     obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
     arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
-    horizon: int = Setting(300, ge=1, description="control steps of an episode")
+    horizon: int = Setting(300, ge=1, le=100_000, description="control steps of an episode")
     control_period_s: float = Setting(0.1, gt=0, le=1, description="time of a control step, s; a multiple of 0.01")
     sight: Literal["offset", "nearness"] | None = Setting(
         None,

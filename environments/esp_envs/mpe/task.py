@@ -35,7 +35,7 @@ class ParticleSettings(TaskSettings):
     actions: Literal["discrete", "continuous"] = Setting(
         "discrete", description="five moves, or a planar force in the unit disc"
     )
-    horizon: int = Setting(25, ge=1, description="steps of an episode (0.1 s each); 25 in MPE")
+    horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode (0.1 s each); 25 in MPE")
 
 
 class ParticleTask(Environment):

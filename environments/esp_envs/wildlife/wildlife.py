@@ -42,7 +42,7 @@ class WildlifeSettings(TaskSettings):
     num_agents: int = Setting(3, ge=2, le=16, description="N, drones; van der Pol: 3")
     width: int = Setting(7, ge=3, le=63, description="columns of the grid, an odd number; van der Pol: 7")
     height: int = Setting(7, ge=3, le=63, description="rows of the grid, an odd number")
-    horizon: int = Setting(100, ge=1, description="steps of an episode, at most")
+    horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode, at most")
     poacher_moves: float = Setting(0.8, ge=0, le=1, description="probability that the poacher moves in a step")
 
     @model_validator(mode="after")

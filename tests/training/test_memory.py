@@ -1,0 +1,50 @@
+"""A run that needs more memory than the machine has is refused before the memory is taken."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.training import memory
+from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.config import resolve_config
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "setting", "value"),
+    [
+        ("mappo", "mappo.num_envs", 10**9),
+        ("mappo", "mappo.num_steps", 10**10),
+        ("mappo", "evaluation.episodes", 10**12),
+        ("qmix", "qmix.replay_episodes", 10**9),
+        ("maddpg", "maddpg.batch_episodes", 10**9),
+    ],
+)
+def test_a_setting_that_asks_for_too_much_is_named_with_what_it_needs(algorithm, setting, value):
+    config = resolve_config("navigation", algorithm, overrides={setting: value})
+    with pytest.raises(ValueError, match=r"needs at least [\d,]+\.\d GB of memory, .* for '.*' with 1 seeds, but cpu"):
+        build_learner(config)
+
+
+def test_the_bound_counts_what_the_replay_holds():
+    config = resolve_config("navigation", "qmix", seeds=(0, 1))
+    learner = build_learner(config)
+    settings = ALGORITHMS["qmix"].config_class(**config.algorithm_settings)
+    counted = memory.least_bytes(config, settings, learner.spec)["qmix.replay_episodes"]
+    assert 0.8 * learner.replay.num_bytes < counted <= learner.replay.num_bytes
+
+
+def test_a_machine_with_less_memory_refuses_what_a_larger_one_takes(monkeypatch):
+    config = resolve_config("navigation")
+    build_learner(config)
+    monkeypatch.setattr(memory, "machine_bytes", lambda device: 10_000)
+    with pytest.raises(ValueError, match=r"but cpu has 0\.0 GB"):
+        build_learner(config)
+
+
+def test_every_seed_counts():
+    one, ten = (resolve_config("formation", seeds=range(count)) for count in (1, 10))
+    settings = ALGORITHMS["mappo"].config_class(**one.algorithm_settings)
+    spec = build_environment(one, 1, "shape").spec
+    needed = memory.least_bytes(one, settings, spec)
+    assert memory.least_bytes(ten, settings, spec) == {name: 10 * size for name, size in needed.items()}
