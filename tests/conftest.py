@@ -20,6 +20,15 @@ settings.register_profile("esp", deadline=None, derandomize=True, database=None)
 settings.load_profile("esp")
 
 
+@pytest.fixture(scope="session")
+def like_machine() -> None:
+    """Skip where the weights on file are out of reach."""
+    from tests.learning.golden import rounds_alike
+
+    if not rounds_alike():
+        pytest.skip("this processor, or its libraries, round otherwise than those that the weights on file come from")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs a GPU where there is none."""
     if torch.cuda.is_available():

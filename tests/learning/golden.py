@@ -124,11 +124,16 @@ _NO_WEIGHTS = ("optimiser.", "generators.", "collector.", "counters", "replay.")
 
 
 def train(case: str, folder: Path, *changes: str) -> str:
-    """Train one case in a new folder and return the hash of its networks, target networks and normalisers."""
+    """Train one case in a new folder and return the hash of its final weights."""
     arguments = ["train", *shlex.split(CASES[case]), *_QUIET, *changes, "--out", str(folder)]
     result = CliRunner().invoke(app, arguments)
     if result.exit_code:
         raise RuntimeError(f"esp {shlex.join(arguments)} ends with {result.exit_code}: {result.output}")
+    return final_weights(folder)
+
+
+def final_weights(folder: Path) -> str:
+    """Return the hash of the networks, target networks and normalisers that a finished run ends with."""
     (checkpoint,) = (folder / "checkpoints").iterdir()
     tensors = load_file(checkpoint)
     return digest({name: tensor for name, tensor in tensors.items() if not name.startswith(_NO_WEIGHTS)})
@@ -190,6 +195,11 @@ def _fall() -> Tensor:
         mujoco.mj_step(model, data)
         rows.append(torch.from_numpy(data.qpos.copy()))
     return torch.stack(rows)
+
+
+def rounds_alike() -> bool:
+    """Return whether this machine can reach the weights on file."""
+    return probe() == json.loads(HASHES.read_text())["probe"]
 
 
 def measure(cases: Iterable[str]) -> dict[str, str]:

@@ -8,16 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.learning.golden import CASES, HASHES, digest, probe, train
+from tests.learning.golden import CASES, HASHES, digest, train
 
 ON_FILE = json.loads(HASHES.read_text())
-
-
-@pytest.fixture(scope="module")
-def rounds_alike() -> None:
-    """Skip where the weights on file are out of reach."""
-    if probe() != ON_FILE["probe"]:
-        pytest.skip("this processor, or its libraries, round otherwise than those that the weights on file come from")
 
 
 def test_every_case_has_weights_on_file_and_no_two_are_equal() -> None:
@@ -26,7 +19,7 @@ def test_every_case_has_weights_on_file_and_no_two_are_equal() -> None:
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.usefixtures("rounds_alike")
+@pytest.mark.usefixtures("like_machine")
 def test_weights_are_those_on_file(case: str, tmp_path: Path) -> None:
     assert train(case, tmp_path / "run") == ON_FILE["weights"][case]
 
