@@ -90,6 +90,8 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
         if isinstance(factor, Group) and not isinstance(factor, FiniteGroup):
             raise ValueError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
         lists.append(factor.elements if isinstance(factor, FiniteGroup) else (factor,))
+    if len({type(element) for elements in lists for element in elements}) > 1:
+        raise ValueError(f"'{part}' multiplies transforms of several kinds; list them with commas, or choose one kind")
     size = reduce(lambda a, b: a * b, (len(x) for x in lists))
     if size > LISTED_LIMIT:
         raise ValueError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")

@@ -71,14 +71,15 @@ def resolve_config(
     """
     if algorithm not in ALGORITHMS:
         raise ValueError(f"unknown algorithm '{algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
-    if preset not in PRESETS[algorithm]:
-        raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(PRESETS[algorithm])}")
+    presets = PRESETS.get(algorithm, {"default": {}})
+    if preset not in presets:
+        raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(presets)}")
     names = {"task": "task", algorithm: algorithm, "network": "network", "prior": "prior", "evaluation": "evaluation"}
     sections: dict[str, dict[str, object]] = {name: {} for name in names}
     asked = ALGORITHMS[algorithm].task_settings
     sections["task"] = {name: asked[name] for name in asked if name in task_class(task).Settings.model_fields}
     tuned = TUNED.get(algorithm, {}).get(task, {}) if preset == "default" else {}
-    for layer in (PRESETS[algorithm][preset], tuned):
+    for layer in (presets[preset], tuned):
         for section, values in layer.items():
             sections[section].update(values)
     for dotted, value in (overrides or {}).items():
