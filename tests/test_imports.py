@@ -177,3 +177,22 @@ def test_an_allowed_import_is_let_through(tmp_path: Path, path: str, source: str
     (tmp_path / path).parent.mkdir(parents=True)
     (tmp_path / path).write_text(source)
     assert violations(tmp_path) == []
+
+
+def arrows(page: str) -> list[tuple[str, str]]:
+    """Return the arrows of the first picture of a page, between the names of its rooms."""
+    picture = page.split("```mermaid\n")[1].split("```")[0]
+    return re.findall(r"^ *(\w+)(?:\[.*?\])? --> (\w+)", picture, re.M)
+
+
+def test_the_picture_of_the_rooms_shows_every_room_and_points_down() -> None:
+    drawn = arrows((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
+    ranks = RANKS | {"tasks": -1, "spec": -2}  # both in esp_envs, which stands below all of esp_cli
+    assert [pair for pair in drawn if ranks[pair[0]] <= ranks[pair[1]]] == []
+    rooms = {path.parent.name for path in (ROOT / "esp_cli").glob("*/__init__.py")}
+    assert rooms <= {room for pair in drawn for room in pair}
+
+
+def test_an_arrow_that_points_up_is_seen() -> None:
+    assert arrows('```mermaid\nflowchart TD\n  prior["a: b"] --> training["c"]\n```') == [("prior", "training")]
+    assert RANKS["prior"] < RANKS["training"]
