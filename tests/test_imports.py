@@ -181,7 +181,7 @@ def test_an_allowed_import_is_let_through(tmp_path: Path, path: str, source: str
 
 def arrows(page: str) -> list[tuple[str, str]]:
     """Return the arrows of the first picture of a page, between the names of its rooms."""
-    picture = page.split("```mermaid\n")[1].split("```")[0]
+    picture = page.split("```mermaid\n")[1].split("```", maxsplit=1)[0]
     return re.findall(r"^ *(\w+)(?:\[.*?\])? --> (\w+)", picture, re.M)
 
 

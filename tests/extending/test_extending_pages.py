@@ -63,7 +63,7 @@ def test_the_algorithm_learns_and_the_prior_moves_it(tmp_path):
     returns = {}
     for prior in ("esp", "none"):
         run = tmp_path / prior
-        esp("train", "--algo", "reinforce", "--task", "navigation", "--prior", prior, "--steps", "40k", 
+        esp("train", "--algo", "reinforce", "--task", "navigation", "--prior", prior, "--steps", "40k",
             "--set", "evaluation.episodes=64", "--set", "evaluation.every_steps=1000000", "--out", run)  # fmt: skip
         returns[prior] = column(read_metrics(run / "metrics.jsonl"), "eval/return_stochastic")[1].ravel()
     assert all(values[-1] > values[0] + 5 for values in returns.values()), returns
