@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -95,19 +96,56 @@ def forbidden(module: str, imported: str) -> str | None:
     return None if RANKS[wanted] < RANKS[part] else f"{part} may not import {wanted}"
 
 
-def violations(root: Path) -> list[str]:
-    """Return one line per forbidden import under the source roots of `root`."""
-    found = []
+def modules(root: Path) -> Iterator[tuple[Path, str, bool]]:
+    """Yield path, dotted name and whether it is a package of every module under the source roots of `root`."""
     for source_root, package in ((root, "esp_cli"), (root / "environments", "esp_envs")):
         for path in sorted((source_root / package).rglob("*.py")):
             is_package = path.name == "__init__.py"
             parts = path.relative_to(source_root).with_suffix("").parts
-            module = ".".join(parts[:-1] if is_package else parts)
-            for line, imported in imports_of(path.read_text(encoding="utf-8"), module, is_package):
-                rule = forbidden(module, imported)
-                if rule:
-                    found.append(f"{path.relative_to(root)}:{line} imports {imported}: {rule}")
+            yield path, ".".join(parts[:-1] if is_package else parts), is_package
+
+
+def violations(root: Path) -> list[str]:
+    """Return one line per forbidden import under the source roots of `root`."""
+    found = []
+    for path, module, is_package in modules(root):
+        for line, imported in imports_of(path.read_text(encoding="utf-8"), module, is_package):
+            rule = forbidden(module, imported)
+            if rule:
+                found.append(f"{path.relative_to(root)}:{line} imports {imported}: {rule}")
     return found
+
+
+def circle(root: Path) -> list[str]:
+    """Return modules that import each other in a circle, lazily or not; none where there is no circle.
+
+    The package `esp_cli` itself is left out: all know its version, and it loads policies by a lazy import.
+    """
+    files = {module: (path, is_package) for path, module, is_package in modules(root) if module != "esp_cli"}
+    known = {}
+    for module, (path, is_package) in files.items():
+        names = [name for _, name in imports_of(path.read_text(encoding="utf-8"), module, is_package)]
+        wanted = {name if name in files else name.rpartition(".")[0] for name in names}
+        known[module] = wanted & set(files) - {module}
+    try:
+        TopologicalSorter(known).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    assert circle(ROOT) == []
+
+
+def test_a_lazy_circle_is_found(tmp_path: Path) -> None:
+    room = tmp_path / "environments" / "esp_envs"
+    room.mkdir(parents=True)
+    (room / "gl.py").write_text("def open():\n    from esp_envs.view import paint")
+    (room / "view.py").write_text("import esp_envs.base")
+    assert circle(tmp_path) == []
+    (room / "view.py").write_text("import esp_envs.gl")
+    assert set(circle(tmp_path)) == {"esp_envs.gl", "esp_envs.view"}
 
 
 def test_the_imports_keep_their_direction() -> None:

@@ -19,7 +19,7 @@ def policies(
     json: JsonOption = None,
 ) -> None:
     """List the trained policies that come along, with what each scores and the command that trains such a run."""
-    from esp_cli.deploy.bundled import bundled_folder, read_bundled
+    from esp_cli.deploy.manifest import bundled_folder, read_bundled
 
     found = [entry for entry in read_bundled() if task in (None, entry.task)]
     if not found:

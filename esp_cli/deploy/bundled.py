@@ -7,105 +7,16 @@ name (`formation-mappo-esp`) or by its task, and then by algorithm and prior.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.files.documents import DocumentFormat, shortened
-from esp_cli.training.config import RunConfig
+from esp_cli.deploy import manifest
+from esp_cli.deploy.manifest import Entry, read_bundled
+from esp_cli.files.documents import shortened
 from esp_cli.training.loading import TrainedPolicy, load_policy
 from esp_envs.registry import task_names
 
-MANIFEST_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
-MANIFEST = "manifest.json"
-_FOLDER = "checkpoints"
-_NAME = r"[a-z0-9]+(-[a-z0-9]+)*"
 _PRIORS = ("esp", "none", "augment", "consistency")
 """In the order in which a task's policies are preferred; algorithms are in that of their registry."""
-
-
-class Score(BaseModel):
-    """How well the policy does greedily; mean, s.e.m. and interval are over episodes, as there is one seed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    mean: float
-    sem: float
-    ci95: tuple[float, float]
-    episodes: int = Field(ge=2)
-
-
-class Entry(BaseModel):
-    """One bundled policy, as the manifest describes it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: str = Field(pattern=f"^{_NAME}$", max_length=100)
-    file: str = Field(pattern=rf"^{_NAME}\.safetensors$", max_length=120)
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-    task: str
-    task_version: int
-    convention: str
-    algorithm: str
-    prior: Literal["esp", "augment", "consistency", "none"]
-    seed: int
-    chosen_from: int = Field(ge=1, description="seeds of the run, of which this one did best")
-    step: int = Field(ge=0, description="environment steps behind it")
-    score: Score
-    metrics: dict[str, float]
-    command: str = Field(description="that trains such a run")
-    esp_version: str
-    config: dict[str, Any]
-
-    @property
-    def is_standard(self) -> bool:
-        """Whether it goes by the name that its task, algorithm and prior give, and not by one of its own."""
-        return self.name == standard_name(self.task, self.algorithm, self.prior)
-
-
-class Manifest(BaseModel):
-    """What a manifest lists."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    policies: tuple[Entry, ...]
-
-
-def standard_name(task: str, algorithm: str, prior: str) -> str:
-    """Return the default name of a bundled policy."""
-    return f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
-
-
-def bundled_folder() -> Path:
-    """Return the folder of the bundled policies: beside the packages in a checkout, else inside `esp_cli`."""
-    package = Path(__file__).parents[1]
-    inside = package / _FOLDER
-    return inside if inside.is_dir() else package.parent / _FOLDER
-
-
-def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
-    """Return what the manifest lists; nothing where there is no manifest.
-
-    Args:
-        folder: of the manifest; by default that of this installation.
-
-    Raises:
-        ValueError: the manifest is damaged or of a newer version.
-    """
-    file = (folder or bundled_folder()) / MANIFEST
-    if not file.is_file():
-        return ()
-    entries = MANIFEST_FORMAT.parse(file, Manifest).policies
-    if len({entry.name for entry in entries}) < len(entries):
-        raise ValueError(f"{file} is damaged: it names a policy twice")
-    return entries
-
-
-def write_bundled(folder: Path, entries: tuple[Entry, ...]) -> None:
-    """Write a manifest, sorted by name."""
-    listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
-    MANIFEST_FORMAT.write(folder / MANIFEST, {"policies": listed})
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None, folder: Path | None = None) -> Entry:
@@ -174,13 +85,8 @@ def load_entry(entry: Entry, folder: Path | None = None) -> TrainedPolicy:
     Raises:
         ValueError: its file is missing, another than the manifest names, or of another version.
     """
-    trained = load_policy((folder or bundled_folder()) / entry.file, entry.sha256)
+    trained = load_policy((folder or manifest.bundled_folder()) / entry.file, entry.sha256)
     described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
     if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
         raise ValueError(f"{trained.source} holds another policy than its manifest says; get both anew")
     return trained
-
-
-def config_of(entry: Entry) -> RunConfig:
-    """Return the configuration of the run that an entry was chosen from."""
-    return RunConfig.model_validate(entry.config)

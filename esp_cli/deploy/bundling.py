@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from esp_cli import __version__
-from esp_cli.deploy.bundled import Entry, Score, read_bundled, standard_name, write_bundled
+from esp_cli.deploy.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.training.config import RunConfig, resolve_config
@@ -66,7 +66,7 @@ def bundle(
     """
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
-    if not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name) or len(name) > 100:
+    if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
         raise ValueError(f"'{name}' is no name for a policy; write words of a-z and 0-9 with - between them")
     alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
     played = play_greedily(alone, episodes)

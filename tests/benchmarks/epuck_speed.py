@@ -27,7 +27,8 @@ from rich.table import Table
 
 from esp_envs import make
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import Bodies, engine_names, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
+from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
 
 ARENA = Arena(side_m=2.0, num_robots=8, num_pillars=2, pillar_radius_m=0.1)
@@ -124,7 +125,7 @@ def show(records: list[dict[str, object]], title: str) -> None:
 def main() -> None:
     """Parse the command line, measure, print, and write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--engine", action="append", choices=engine_names(), help="may be given several times")
+    parser.add_argument("--engine", action="append", choices=ENGINES, help="may be given several times")
     parser.add_argument("--subject", action="append", choices=tuple(SUBJECTS), help="may be given several times")
     parser.add_argument("--worlds", type=int, default=320)
     parser.add_argument("--threads", action="append", type=int, help="may be given several times; default: 1 and all")
@@ -133,7 +134,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the records to this file")
     args = parser.parse_args()
     threads = args.threads or sorted({1, os.cpu_count() or 1})
-    engines, subjects = args.engine or list(engine_names()), args.subject or list(SUBJECTS)
+    engines, subjects = args.engine or list(ENGINES), args.subject or list(SUBJECTS)
     records = measure(engines, subjects, args.worlds, threads, args.seconds, args.runs)
     show(records, f"e-pucks, {args.worlds} worlds of {ARENA.num_robots} robots and {ARENA.num_pillars} pillars")
     if args.json:

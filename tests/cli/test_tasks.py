@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 from esp_envs.registry import make, task_names
 from tests.cli.running import esp, refused
@@ -50,3 +54,22 @@ def test_a_card_as_json() -> None:
 
 def test_an_unknown_task_is_told_in_one_sentence() -> None:
     assert refused("tasks", "chess") == f"unknown task 'chess'; the tasks are {', '.join(task_names())}"
+
+
+@pytest.mark.parametrize(
+    ("words", "absent"),
+    [
+        (["policies"], {"torch", "mujoco", "pymunk", "matplotlib", "jinja2"}),
+        (["tasks", "navigation"], {"mujoco", "pymunk", "matplotlib", "jinja2"}),
+        (["train", "--help"], {"torch", "mujoco", "pymunk", "matplotlib", "jinja2"}),
+    ],
+)
+def test_a_command_imports_no_heavy_library_that_it_does_not_use(words: list[str], absent: set[str]) -> None:
+    code = (
+        "import atexit, sys\n"
+        f"atexit.register(lambda: print('MODULES', *({absent!r} & set(sys.modules))))\n"
+        f"sys.argv = ['esp', *{words!r}]\n"
+        "from esp_cli.app import main\nmain()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.splitlines()[-1].split() == ["MODULES"]

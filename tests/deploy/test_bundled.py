@@ -12,20 +12,12 @@ from pathlib import Path
 import pytest
 
 from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
-from esp_cli.deploy import bundled
-from esp_cli.deploy.bundled import (
-    MANIFEST,
-    Entry,
-    bundled_folder,
-    config_of,
-    find,
-    load_entry,
-    open_policy,
-    read_bundled,
-)
+from esp_cli.deploy import manifest
+from esp_cli.deploy.bundled import find, load_entry, open_policy
 from esp_cli.deploy.bundling import best_seed, bundle, command_of, play_greedily, score_of
+from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled
 from esp_cli.evaluation.final import evaluate
-from esp_cli.training.config import resolve_config
+from esp_cli.training.config import RunConfig, resolve_config
 from tests.deploy.policies import drawn_policy
 
 ENTRIES = read_bundled()
@@ -51,7 +43,7 @@ def test_a_policy_does_what_its_manifest_says(entry: Entry) -> None:
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)
 def test_the_command_of_a_manifest_resolves_to_its_configuration(entry: Entry) -> None:
-    config = config_of(entry)
+    config = RunConfig.model_validate(entry.config)
     words = shlex.split(entry.command)
     assert words[:2] == ["esp", "train"]
     options = list(zip(words[2::2], words[3::2], strict=True))
@@ -87,7 +79,7 @@ def test_the_box_is_beside_the_packages_or_in_the_wheel(tmp_path: Path, monkeypa
     assert bundled_folder() == Path(__file__).parents[2] / "checkpoints"
     package = tmp_path / "site-packages" / "esp_cli"
     (package / "deploy").mkdir(parents=True)
-    monkeypatch.setattr(bundled, "__file__", str(package / "deploy" / "bundled.py"))
+    monkeypatch.setattr(manifest, "__file__", str(package / "deploy" / "manifest.py"))
     assert bundled_folder() == tmp_path / "site-packages" / "checkpoints"
     shutil.copytree(Path(__file__).parents[2] / "checkpoints", package / "checkpoints")
     assert bundled_folder() == package / "checkpoints"
@@ -121,7 +113,7 @@ def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
     assert best == max(with_seed, key=with_seed.__getitem__)
     for seed in (3, 7):
         (small / f"seed-{seed}.safetensors").unlink()
-    bundled.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
+    manifest.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +176,7 @@ def test_a_file_that_is_not_the_manifests_is_refused(small: Path, tmp_path: Path
 def test_a_manifest_that_says_something_else_of_a_file_is_refused(small: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small, tmp_path / "bundled"))
     entry = find("navigation", folder=folder)
-    bundled.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
+    manifest.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
     with pytest.raises(ValueError, match="holds another policy than its manifest says"):
         open_policy(Path("navigation"), folder=folder)
 

@@ -20,9 +20,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from esp_cli.deploy.bundled import MANIFEST, read_bundled, write_bundled
 from esp_cli.deploy.bundling import bundle
 from esp_cli.deploy.library import load_policy
+from esp_cli.deploy.manifest import MANIFEST, read_bundled, write_bundled
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.loading import load_policy as load_trained

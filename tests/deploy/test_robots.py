@@ -15,7 +15,8 @@ import torch
 from esp_cli.deploy.export import export
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
-from esp_envs.epuck.physics import Bodies, make_physics
+from esp_envs.epuck.engines import make_physics
+from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.deploy.policies import drawn_policy
 

@@ -193,8 +193,9 @@ ctypes.CDLL.__init__ = init
 _DRAW = """
 from esp_envs import Body, Scene
 from esp_envs.epuck import gl
+from esp_envs.epuck.painter import open_painter
 try:
-    with gl.space_painter(64) as painter:
+    with open_painter(64) as painter:
         picture = painter.draw(Scene((Body((0, 0), 0.5, "#ff0000", model="robot"),), (-1, 1, -1, 1)))
         print("drawn", picture[20, 32, 0] > 150 > picture[20, 32, 1], painter.note)
 except gl.NoGraphicsError as error:

@@ -24,7 +24,7 @@ from esp_cli.symmetry import (
 )
 from esp_cli.symmetry.maps import Dense
 from esp_envs import Environment, make
-from esp_envs.epuck.physics import engine_names
+from esp_envs.epuck.engines import ENGINES
 
 WORLDS = 6
 D4 = dihedral(4).elements[1:]
@@ -48,7 +48,7 @@ def jam(num_seeds: int, **settings: object) -> tuple[Environment, Tensor, list[T
     return env, state, actions
 
 
-@pytest.mark.parametrize("physics", engine_names())
+@pytest.mark.parametrize("physics", ENGINES)
 @pytest.mark.parametrize(
     "settings", [{}, {"actions": "discrete", "num_obstacles": 0, "sight": "nearness", "neighbours": 3}], ids=str
 )

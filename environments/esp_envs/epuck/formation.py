@@ -22,9 +22,10 @@ from esp_envs.base import (
     restore_generators,
 )
 from esp_envs.epuck import steering
+from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import LEVELS, WHEEL_PAIRS, FormationSettings, formation_spec
-from esp_envs.epuck.gl import space_painter
-from esp_envs.epuck.physics import Bodies, make_physics
+from esp_envs.epuck.painter import open_painter
+from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
 
 RISKY_GAP_M = 0.05
@@ -371,7 +372,7 @@ class Formation(Environment):
 
     def painter(self, size: int) -> AbstractContextManager[Painter]:
         """Open the view in space, with pictures `size` pixels wide."""
-        return space_painter(size)
+        return open_painter(size)
 
 
 def nearness(offset: Tensor, reach_m: float) -> Tensor:

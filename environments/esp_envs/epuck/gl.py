@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
-from esp_envs.base import Painter
-
 _LIBRARIES = {
     "osmesa": ("OSMesa", ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")),
     "egl": ("EGL", ("libEGL.so.1", "libEGL.so")),
@@ -31,7 +29,7 @@ class NoGraphicsError(ValueError):
 
 
 def is_installed(backend: str) -> bool:
-    """Say whether the library of "osmesa" or "egl" can be loaded; MuJoCo's own attempt would end in a riddle."""
+    """Say whether the library of "osmesa" or "egl" can be loaded; MuJoCo's own message does not name the library."""
     for name in _LIBRARIES[backend][1]:
         try:
             ctypes.CDLL(name)
@@ -50,25 +48,6 @@ def forget_missing_backend() -> None:
     named = os.environ.get(_VARIABLE, "").strip().lower()
     if named in _LIBRARIES and not is_installed(named):
         del os.environ[_VARIABLE]
-
-
-@contextmanager
-def space_painter(size: int) -> Iterator[Painter]:
-    """Open a painter of scenes in space (see `esp_envs.epuck.view`), importing MuJoCo only now.
-
-    Args:
-        size: width of a picture, pixels.
-
-    Raises:
-        NoGraphicsError: MuJoCo is not installed, or no library here can draw.
-    """
-    forget_missing_backend()
-    try:
-        view = import_module("esp_envs.epuck.view")
-    except ImportError as error:
-        raise NoGraphicsError(f"a view in space needs the package {error.name}; pip install {error.name}") from None
-    with view.space_painter(size) as painter:
-        yield painter
 
 
 @dataclass(frozen=True)

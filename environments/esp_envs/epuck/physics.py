@@ -1,25 +1,14 @@
-"""What a physics engine is to the tasks: robots are placed, driven by wheel speeds, and read back.
-
-Adding an engine is one module and one line in `_ENGINES`; it is imported when a task asks for it.
-"""
+"""The contract of physics engines: robots are placed, driven by wheel speeds, and read back."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from importlib import import_module
 
 import numpy as np
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.robot import Array
-
-_ENGINES = {
-    "mujoco": "esp_envs.epuck.mujoco_planar:MujocoPlanar",
-    "mujoco-3d": "esp_envs.epuck.mujoco_spatial:MujocoSpatial",
-    "pymunk": "esp_envs.epuck.pymunk_planar:PymunkPlanar",
-}
 
 
 @dataclass(frozen=True)
@@ -83,29 +72,6 @@ class Physics(ABC):
     @abstractmethod
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
         """Restore what `state_dict` of an engine of the same size returned."""
-
-
-def engine_names() -> tuple[str, ...]:
-    """Return the registered names."""
-    return tuple(_ENGINES)
-
-
-def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int = 1) -> Physics:
-    """Make W worlds in the engine `name`.
-
-    Raises:
-        ValueError: no such engine, or its library is not installed.
-    """
-    if name not in _ENGINES:
-        raise ValueError(f"unknown physics '{name}'; there are {', '.join(_ENGINES)}")
-    forget_missing_backend()
-    module, attribute = _ENGINES[name].split(":")
-    try:
-        engine: type[Physics] = getattr(import_module(module), attribute)
-    except ImportError as error:
-        package = (error.name or "").partition(".")[0]
-        raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
-    return engine(arena, num_worlds, control_period_s, num_threads)
 
 
 def num_substeps(control_period_s: float, timestep_s: float) -> int:

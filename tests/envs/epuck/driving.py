@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import Bodies, Physics, make_physics
+from esp_envs.epuck.engines import make_physics
+from esp_envs.epuck.physics import Bodies, Physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED, Array
 
 PERIOD_S = 0.1

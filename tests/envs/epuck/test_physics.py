@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import engine_names, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
 from esp_envs.epuck.robot import MAX_SPEED_M_S, Array
 from tests.envs.epuck.driving import PERIOD_S, engine
 
@@ -19,7 +19,7 @@ SPEED_TOLERANCE = {"mujoco": 1e-6, "mujoco-3d": 1e-6, "pymunk": 1e-12}
 ARC_TOLERANCE_M = {"mujoco": 3e-3, "mujoco-3d": 1e-3, "pymunk": 1e-4}
 """At the end of 0.18 m: the servo of the planar engine lags behind the turning heading by 0.017 rad."""
 
-every_engine = pytest.mark.parametrize("name", engine_names())
+every_engine = pytest.mark.parametrize("name", ENGINES)
 
 
 def run(
@@ -142,7 +142,7 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_engines_are_imported_when_they_are_asked_for() -> None:
-    code = "import sys, esp_envs.epuck.physics; print({'mujoco', 'pymunk'} & set(sys.modules))"
+    code = "import sys, esp_envs.epuck.engines; print({'mujoco', 'pymunk'} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; {code}"],
         capture_output=True,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import engine_names
+from esp_envs.epuck.engines import ENGINES
 from esp_envs.epuck.robot import BODY_RADIUS_M, MASS_KG, MAX_SPEED_M_S, MAX_WHEEL_SPEED, Array
 from tests.envs.epuck.driving import (
     PERIOD_S,
@@ -23,7 +23,7 @@ DEEPEST_M = 3e-3
 """No two things ever overlap by more."""
 CROWD = Arena(2.0, 8, 2, 0.1)
 
-every_engine = pytest.mark.parametrize("name", engine_names())
+every_engine = pytest.mark.parametrize("name", ENGINES)
 
 
 def full_ahead(robots: int) -> Array:

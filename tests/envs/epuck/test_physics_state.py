@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import Physics, engine_names, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
+from esp_envs.epuck.physics import Physics
 from esp_envs.epuck.robot import Array
 from tests.envs.epuck.driving import PERIOD_S, at_posts, at_random, bodies, engine, gap_between_robots, to_the_middle
 
 ARENA = Arena(1.0, 8, 2, 0.06)
 WORLDS = 3
 
-every_engine = pytest.mark.parametrize("name", engine_names())
+every_engine = pytest.mark.parametrize("name", ENGINES)
 
 
 def made_of(rng: np.random.Generator) -> dict[str, Array]:

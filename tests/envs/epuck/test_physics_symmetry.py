@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import engine_names
+from esp_envs.epuck.engines import ENGINES
 from esp_envs.epuck.robot import Array
 from tests.envs.epuck.driving import (
     at_posts,
@@ -30,7 +30,7 @@ WORST_M = {"mujoco": 1e-9, "mujoco-3d": 1e-8, "pymunk": 1e-7}
 WORST_LOOSE_M = {"mujoco": 1e-10, "mujoco-3d": 1e-10, "pymunk": 1e-10}
 """In a crowd that jostles; the worst of six seeds were 2e-13, 2e-14 and 2e-12."""
 
-every_engine = pytest.mark.parametrize("name", engine_names())
+every_engine = pytest.mark.parametrize("name", ENGINES)
 
 
 def moved(points: Array, quarters: int, mirrored: bool) -> Array:

@@ -1,0 +1,33 @@
+"""The physics engines by name. Adding one is one module and one line in `ENGINES`; it is imported when it is used."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.gl import forget_missing_backend
+from esp_envs.epuck.physics import Physics
+
+ENGINES = {
+    "mujoco": "esp_envs.epuck.mujoco_planar:MujocoPlanar",
+    "mujoco-3d": "esp_envs.epuck.mujoco_spatial:MujocoSpatial",
+    "pymunk": "esp_envs.epuck.pymunk_planar:PymunkPlanar",
+}
+
+
+def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int = 1) -> Physics:
+    """Make W worlds in the engine `name`.
+
+    Raises:
+        ValueError: no such engine, or its library is not installed.
+    """
+    if name not in ENGINES:
+        raise ValueError(f"unknown physics '{name}'; there are {', '.join(ENGINES)}")
+    forget_missing_backend()
+    module, attribute = ENGINES[name].split(":")
+    try:
+        engine: type[Physics] = getattr(import_module(module), attribute)
+    except ImportError as error:
+        package = (error.name or "").partition(".")[0]
+        raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
+    return engine(arena, num_worlds, control_period_s, num_threads)
