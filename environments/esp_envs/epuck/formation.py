@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import (
-    Body,
     Environment,
     Observation,
     Painter,
@@ -27,15 +26,12 @@ from esp_envs.epuck.formation_spec import LEVELS, WHEEL_PAIRS, FormationSettings
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
+from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness
 
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
 CONTACT_GAP_M = 0.001
 """Gap below which two bodies count as touching."""
-FADING_M = 0.2
-"""Gap over which the sight `nearness` of a body fades to 1/e."""
-_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
-_PILLAR_COLOR = "#707070"
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
@@ -248,9 +244,9 @@ class Formation(Environment):
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
         heading, offsets = self._heading, [self._to_goal.unsqueeze(2)]
         if pillars:
-            offsets.append(self._nearest(slice(robots, None), 1))
+            offsets.append(nearest(self._apart[..., robots:], self._ways[:, :, robots:], 1))
         if self.settings.seen_robots:
-            offsets.append(self._nearest(slice(robots), self.settings.seen_robots))
+            offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
         seen = torch.cat(offsets, 2)
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(heading, seen)
@@ -268,12 +264,6 @@ class Formation(Environment):
         direction = torch.stack([heading.cos(), heading.sin()], -1)
         rows = (direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
         return torch.cat([part.flatten(1) for part in rows], 1)
-
-    def _nearest(self, bodies: slice, count: int) -> Tensor:
-        """Return the offsets [W, N, count, 2] of the nearest of some bodies, nearest first."""
-        apart, ways = self._apart[..., bodies], self._ways[:, :, bodies]
-        index = apart.argmin(-1, keepdim=True) if count == 1 else apart.argsort(dim=-1, stable=True)[..., :count]
-        return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
 
     def _disturbed(self, heading: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
@@ -358,29 +348,8 @@ class Formation(Environment):
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return goals, pillars and robots of one world (seed index, world index)."""
         w = world[0] * self.num_envs + world[1]
-        bodies = []
-        for i, goal in enumerate(self._goals[w].tolist()):
-            bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal"))
-        pillars = self._pillars[w].tolist()
-        bodies += [Body(tuple(p), self.settings.obstacle_radius_m, _PILLAR_COLOR, model="pillar") for p in pillars]
-        poses = zip(self._position[w].tolist(), self._heading[w].tolist(), strict=True)
-        for i, (position, heading) in enumerate(poses):
-            color = _COLORS[i % len(_COLORS)]
-            bodies.append(Body(tuple(position), BODY_RADIUS_M, color, "disc", heading, trail=True, model="robot"))
-        half = self.arena.side_m / 2
-        return Scene(tuple(bodies), (-half, half, -half, half))
+        return formation_scene(self.settings, self._goals[w], self._pillars[w], self._position[w], self._heading[w])
 
     def painter(self, size: int) -> AbstractContextManager[Painter]:
         """Open the view in space, with pictures `size` pixels wide."""
         return open_painter(size)
-
-
-def nearness(offset: Tensor, reach_m: float) -> Tensor:
-    """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
-
-    Args:
-        offset: [..., 2] between the centres, m.
-        reach_m: distance of the centres where the bodies touch.
-    """
-    distance = offset.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    return offset / distance * torch.exp(-(distance - reach_m).clamp(min=0) / FADING_M)

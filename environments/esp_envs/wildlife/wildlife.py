@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
-from pydantic import Field as Setting
-from pydantic import model_validator
 from torch import Tensor
 
 from esp_envs.base import (
@@ -16,45 +14,15 @@ from esp_envs.base import (
     Observation,
     Scene,
     Step,
-    TaskSettings,
     generator_states,
     restore_generators,
 )
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
-from esp_envs.wildlife.pictures import PIXELS, all_pictures, cell_index
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP
+from esp_envs.wildlife.pictures import all_pictures, cell_index
+from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec
 
-REST = (0.0, 0.0)
-MOVES = Discrete(Kind.VECTOR, (REST, UP, RIGHT, DOWN, LEFT), ("rest", "up", "right", "down", "left"))
-"""In the order of van der Pol's code; the meaning of each is the way to the next cell."""
-STEP_COST = 0.05
-"""What a step costs the whole team."""
 _COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _POACHER_COLOR = "#202020"
-
-
-class WildlifeSettings(TaskSettings):
-    """What a user may change of `wildlife`."""
-
-    convention: Literal["esp", "corrected"] = Setting(
-        "esp",
-        description="whose rules: 'esp' is van der Pol's code, which the paper used, 'corrected' has its quirks mended",
-    )
-    num_agents: int = Setting(3, ge=2, le=16, description="N, drones; van der Pol: 3")
-    width: int = Setting(7, ge=3, le=63, description="columns of the grid, an odd number; van der Pol: 7")
-    height: int = Setting(7, ge=3, le=63, description="rows of the grid, an odd number")
-    horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode, at most")
-    poacher_moves: float = Setting(0.8, ge=0, le=1, description="probability that the poacher moves in a step")
-
-    @model_validator(mode="after")
-    def _fits(self) -> WildlifeSettings:
-        if self.width % 2 == 0 or self.height % 2 == 0:
-            raise ValueError(
-                f"a grid of {self.width} x {self.height} cells has no cell in its middle; use odd numbers, so that a "
-                "drone can be in the middle of its picture"
-            )
-        if self.num_agents >= self.width * self.height:
-            raise ValueError(f"{self.num_agents} drones and a poacher do not fit on {self.width * self.height} cells")
-        return self
 
 
 class Wildlife(Environment):
@@ -110,7 +78,7 @@ class Wildlife(Environment):
 
     def __init__(self, settings: WildlifeSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
-        self.spec = _spec(settings)
+        self.spec = wildlife_spec(settings)
         agents, device = settings.num_agents, self.device
         self._size = torch.tensor([settings.width, settings.height], device=device)
         self._half = self._size // 2
@@ -285,30 +253,3 @@ class Wildlife(Environment):
             chosen.append(cell)
         index = torch.stack(chosen, -1)
         return torch.stack([index % width, index // width], -1) - self._half
-
-
-def _spec(settings: WildlifeSettings) -> TaskSpec:
-    """Return the spec that follows from the settings."""
-    agents, width, height = settings.num_agents, settings.width, settings.height
-    before = "before its move, no way round the torus" if settings.convention == "esp" else "after its move"
-    return TaskSpec(
-        name="wildlife",
-        version=1,
-        convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}",
-        num_agents=agents,
-        horizon=settings.horizon,
-        observation=layout(
-            Field("picture", Kind.PICTURE, 1, "shade", pixels=(PIXELS * height, PIXELS * width)),
-            Field("others", Kind.VECTOR, agents - 1, "cell", Items.OTHERS),
-        ),
-        state=layout(
-            Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS),
-            Field("poacher", Kind.VECTOR, 1, "cell"),
-        ),
-        action=MOVES,
-        symmetry="d4" if width == height else "d2",
-        control_period_s=0.25,
-        totals=("captures", "lone_landings", "collisions", "steps"),
-        terminates=True,
-        settings=settings.model_dump(),
-    )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_envs import make
-from esp_envs.epuck import formation, formation_spec, steering
+from esp_envs.epuck import formation_spec, sight, steering
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.formation import Formation
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S
@@ -119,7 +119,7 @@ def test_observation_by_hand() -> None:
 def test_nearness_by_hand() -> None:
     # touching bodies have length 1; a gap of 0.2 m has 1/e; the direction stays
     offset = torch.tensor([[0.074, 0.0], [0.0, -0.274]], dtype=torch.float64)
-    seen = formation.nearness(offset, 2 * BODY_RADIUS_M)
+    seen = sight.nearness(offset, 2 * BODY_RADIUS_M)
     torch.testing.assert_close(seen, torch.tensor([[1.0, 0.0], [0.0, -math.exp(-1)]], dtype=torch.float64))
     env = world([(0.0, 0.0), (0.0, 0.274)], [(0.9, 0.0)] * 2, sight="nearness")
     obs = env.step(torch.zeros(1, 1, 2, 2)).next.obs[0, 0, 0]

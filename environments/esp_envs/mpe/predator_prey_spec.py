@@ -1,0 +1,95 @@
+"""What a user may change of predator-prey, and the spec that follows."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field as Setting
+from pydantic import model_validator
+
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
+from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
+
+
+class PredatorPreySettings(ParticleSettings):
+    """What a user may change of `predator-prey`."""
+
+    num_predators: int = Setting(3, ge=1, le=8, description="predators; 3 in the paper")
+    num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
+    control: Literal["predators", "prey"] = Setting(
+        "predators", description="who learns; with 'prey' the predators follow the greedy heuristic"
+    )
+    prey: Literal["random", "fleeing", "still", "policy"] = Setting(
+        "random", description="who drives the prey while the predators learn"
+    )
+    prey_policy: str | None = Setting(
+        None, max_length=255, description="safetensors policy file, for prey 'policy' only"
+    )
+    prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
+
+    @model_validator(mode="after")
+    def _policy_goes_with_its_file(self) -> PredatorPreySettings:
+        if self.control == "prey" and self.prey != "random":
+            raise ValueError("with control 'prey' the prey is the learner; leave the setting prey out")
+        if (self.prey == "policy") != (self.prey_policy is not None):
+            raise ValueError("prey 'policy' and the file prey_policy go together; give both or neither")
+        return self
+
+
+def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
+    """Return the spec that follows from the settings."""
+    prey_learns, discrete = settings.control == "prey", settings.actions == "discrete"
+    order = "velocity first" if settings.convention == "esp" else "position first"
+    reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
+    opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
+    return TaskSpec(
+        name="predator-prey",
+        version=1,
+        convention=f"{settings.convention}: {reward}, {opponent}, {order}",
+        num_agents=1 if prey_learns else settings.num_predators,
+        horizon=settings.horizon,
+        observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
+        state=_state_layout(settings),
+        action=MOVES if discrete else FORCE,
+        symmetry="d4" if discrete or prey_learns else "o2",
+        shared_reward=True,
+        settings=settings.model_dump(),
+    )
+
+
+def _predator_layout(settings: PredatorPreySettings) -> Layout:
+    return _fields(
+        Field("velocity", Kind.VECTOR, 1, "length/s"),
+        Field("position", Kind.VECTOR, 1, "length"),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("predators", Kind.VECTOR, settings.num_predators - 1, "length", Items.OTHERS),
+        Field("prey", Kind.VECTOR, 1, "length"),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s"),
+    )
+
+
+def prey_layout(settings: PredatorPreySettings) -> Layout:
+    """Return what a prey observes."""
+    return _fields(
+        Field("velocity", Kind.VECTOR, 1, "length/s"),
+        Field("position", Kind.VECTOR, 1, "length"),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("predators", Kind.VECTOR, settings.num_predators, "length"),
+    )
+
+
+def _state_layout(settings: PredatorPreySettings) -> Layout:
+    predators = settings.num_predators
+    hunters, hunted = (Items.FIXED, Items.AGENTS) if settings.control == "prey" else (Items.AGENTS, Items.FIXED)
+    return _fields(
+        Field("velocity", Kind.VECTOR, predators, "length/s", hunters),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted),
+        Field("position", Kind.VECTOR, predators, "length", hunters),
+        Field("prey_position", Kind.VECTOR, 1, "length", hunted),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+    )
+
+
+def _fields(*fields: Field) -> Layout:
+    """Build a layout without its empty fields."""
+    return layout(*(f for f in fields if f.count))
