@@ -25,13 +25,13 @@ def test_the_tables_are_computed_from_the_committed_files(page: Path) -> None:
 def test_a_file_is_small_and_says_what_made_it(file: Path) -> None:
     found = read_results(file)
     assert file.stat().st_size < LARGEST_BYTES
-    assert found["command"].startswith("esp ")
-    for cell in found["cells"]:
-        if cell["status"] != "finished":
+    assert found.command.startswith("esp ")
+    for cell in found.cells:
+        if cell.status != "finished":
             continue
-        assert {**found["config"], **cell["config"]}["task"]
-        assert cell["esp_version"]
-        assert all(len(values) == len(cell["seeds"]) for values in cell["returns"].values())
+        assert {**found.config, **cell.config}["task"]
+        assert cell.esp_version
+        assert all(len(values) == len(cell.seeds) for values in cell.returns.values())
 
 
 def test_the_results_page_is_among_them() -> None:

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -14,8 +14,8 @@ from esp_cli import console
 from esp_cli.commands.options import JsonOption, parse_count
 
 if TYPE_CHECKING:
-    from esp_cli.reporting.curves import RunCurve
-    from esp_cli.reporting.page import Material
+    from esp_cli.reporting.collect import Material
+    from esp_cli.reporting.results import Results
 
 EPILOG = """Examples:\n
     esp report runs/table1\n
@@ -23,6 +23,8 @@ EPILOG = """Examples:\n
     esp report runs/cn-mappo runs/cn-mappo-esp\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --at 500k --at 3M --threshold -125 --plot curves.png\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --out comparison"""
+
+Mode = Literal["greedy", "stochastic"]
 
 
 def report(
@@ -46,7 +48,10 @@ def report(
         typer.Option("--fill", help="Compute the tables of this Markdown page from its results files.", metavar="PAGE"),
     ] = None,
     at: Annotated[
-        list[str] | None, typer.Option("--at", help="Runs: state returns at this step.", metavar="STEPS")
+        list[str] | None,
+        typer.Option(
+            "--at", help="Runs: compare them at this step; by default the last that all reached.", metavar="STEPS"
+        ),
     ] = None,
     threshold: Annotated[
         list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
@@ -55,7 +60,9 @@ def report(
         list[str] | None,
         typer.Option("--reference", help="Runs: draw a line at somebody else's number.", metavar="NAME=VALUE"),
     ] = None,
-    mode: Annotated[Literal["greedy", "stochastic"], typer.Option("--mode", help="Which evaluations.")] = "greedy",
+    mode: Annotated[
+        Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
+    ] = None,
     view: Annotated[
         tuple[float, float] | None, typer.Option("--view", help="Lowest and highest return in the picture.")
     ] = None,
@@ -63,6 +70,7 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
+    from esp_cli.reporting import collect, loose
     from esp_cli.studies.study import StudyFolder
 
     if fill is not None:
@@ -71,106 +79,39 @@ def report(
         if fill is None:
             raise ValueError("there is nothing to report; name a study folder or run folders")
         return
-    if StudyFolder.is_one(Path(runs[0])):
+    limits, lines = threshold or [], _references(reference or [])
+    is_study = StudyFolder.is_one(Path(runs[0]))
+    if is_study:
         if len(runs) > 1 or at or reference or plot or view:
             raise ValueError(
                 "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --view"
             )
-        _report_study(Path(runs[0]), out, mode, threshold or [], films, results, json)
-        return
-    _report_runs(runs, out, mode, threshold or [], films, results, json, at or [], reference or [], plot, view)
-
-
-def _report_study(
-    path: Path,
-    out: Path | None,
-    mode: Literal["greedy", "stochastic"],
-    thresholds: Sequence[float],
-    films: bool,
-    small: Path | None,
-    json: str | None,
-) -> None:
-    """Print the tables of a study and write its page."""
-    from esp_cli.reporting.page import Material
-    from esp_cli.reporting.results import collect, read_curve_of
-    from esp_cli.studies.study import StudyFolder
-
-    folder = StudyFolder.open(path)
-    cells = folder.study.cells
-    found = collect(folder, mode, thresholds)
-    curves = {cell.name: read_curve_of(folder.run_path(cell), cell, mode) for cell in cells}
-    begun = {name: curve for name, curve in curves.items() if curve is not None}
-    material = Material(folder.study, found, begun, {cell.name: folder.run_path(cell) for cell in cells})
+        material = collect.collect(StudyFolder.open(Path(runs[0])), mode, limits)
+        out = out or Path(runs[0]) / "report"
+        document = material.results.document()
+    else:
+        command = _command(runs, at or [], limits, mode, out)
+        steps = [parse_count(text) for text in at or []]
+        material = loose.read_runs([_labelled(text) for text in runs], command, mode or "greedy", steps, limits)
+        document = loose.comparison(material, limits).document()
     if json != "-":
-        print_tables(found)
+        print_tables(material.results)
     if json is not None:
-        console.write_json(json, found)
-    _write(material, out or path / "report", films, small)
-
-
-def _report_runs(
-    runs: Sequence[str],
-    out: Path | None,
-    mode: Literal["greedy", "stochastic"],
-    thresholds: Sequence[float],
-    films: bool,
-    small: Path | None,
-    json: str | None,
-    at: Sequence[str],
-    reference: Sequence[str],
-    plot: Path | None,
-    view: tuple[float, float] | None,
-) -> None:
-    """Compare runs put together by hand."""
-    from esp_cli.reporting import curves as comparison
-
-    steps = [parse_count(text) for text in at]
-    lines = _references(reference)
-    places = [_labelled(text) for text in runs]
-    curves = [comparison.read_curve(path, label, mode) for label, path in places]
-    result = comparison.compare(curves, steps, thresholds)
-    if json != "-":
-        _print(result)
-    if json is not None:
-        console.write_json(json, result)
+        console.write_json(json, document)
     if plot is not None:
-        for file in comparison.plot(curves, plot, result["convention"], mode, lines, view):
+        for file in loose.plot(material, plot, lines, view):
             console.note(f"curves -> {file}")
-    if out is not None or small is not None or films:
-        command = shlex.join(["esp", "report", *runs])
-        material = _material(curves, [path for _, path in places], command, mode, thresholds)
-        _write(material, out, films, small)
+    _write(material, out, films, results)
 
 
-def _material(
-    curves: Sequence[RunCurve],
-    paths: Sequence[Path],
-    command: str,
-    mode: Literal["greedy", "stochastic"],
-    thresholds: Sequence[float],
-) -> Material:
-    """Return runs put together by hand as a study, the first of which the others are held against."""
-    from esp_cli.reporting.page import Material
-    from esp_cli.reporting.results import of_runs
-    from esp_cli.studies.study import Cell, Study
-
-    names = [f"{k}-{curve.label}" for k, curve in enumerate(curves)]
-    cells = [
-        Cell(
-            name=name,
-            panel=curve.config.task,
-            variant=curve.label,
-            config=curve.config,
-            reference=names[0] if name != names[0] else None,
-        )
-        for name, curve in zip(names, curves, strict=True)
-    ]
-    title = f"{' and '.join(curve.label for curve in curves)} on {curves[0].config.task}"
-    episodes = curves[0].config.evaluation.episodes
-    study = Study(kind="runs", title=title, command=command, episodes=episodes, rows="variants", cells=tuple(cells))
-    by_name = dict(zip(names, curves, strict=True))
-    results = of_runs(study, by_name, mode, thresholds)
-    return Material(study, results, by_name, dict(zip(names, paths, strict=True)))
+def _command(
+    runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: str | None, out: Path | None
+) -> str:
+    """Return the command line that gives the same report of the same runs."""
+    words = ["esp", "report", *runs, *(word for text in at for word in ("--at", text))]
+    words += [word for limit in thresholds for word in ("--threshold", f"{limit:g}")]
+    words += ["--mode", mode] if mode else []
+    return shlex.join(words + (["--out", str(out)] if out else []))
 
 
 def _write(material: Material, out: Path | None, films: bool, small: Path | None) -> None:
@@ -180,13 +121,13 @@ def _write(material: Material, out: Path | None, films: bool, small: Path | None
     if films:
         with console.TrainingProgress(len(material.runs), description="draw") as progress:
             draw_films(material.runs, progress.update)
-    if out is not None and (material.curves or material.study.kind == "runs"):
+    if out is not None and material.curves:
         for file in write_report(material, out):
             console.note(f"report -> {file}")
     elif out is not None:
         console.note("no run has an evaluation yet, so there is nothing to draw")
     if small is not None:
-        console.write_json(small, material.results)
+        console.write_json(small, material.results.document())
         console.note(f"results -> {small}")
 
 
@@ -198,7 +139,7 @@ def _fill(page: Path) -> None:
     console.note(f"tables -> {page}")
 
 
-def print_tables(results: dict[str, Any]) -> None:
+def print_tables(results: Results) -> None:
     """Print every table of a study's results."""
     from esp_cli.reporting.tables import all_tables
 
@@ -225,35 +166,3 @@ def _references(items: Sequence[str]) -> dict[str, float]:
         if not name or not math.isfinite(out[name]):
             raise ValueError(f"--reference {item} is no line to draw; write --reference NAME=VALUE")
     return out
-
-
-def _print(result: dict[str, Any]) -> None:
-    rows = []
-    for run in result["runs"]:
-        for step, verdict in run["returns"].items():
-            seeds = sum(x is not None for x in verdict["per_seed"]) if verdict else 0
-            rows.append((run["label"], console.format_count(int(step)), seeds, *_cells(verdict)))
-    episodes = console.format_span({run["config"]["evaluation"]["episodes"] for run in result["runs"]})
-    title = f"{result['task']} version {result['task_version']}, {episodes} episodes a seed"
-    caption = f"convention {result['convention']}; mean ± s.e.m. over seeds; difference from the first run"
-    headings = ("run", "steps>", "seeds>", "return>", "95 % interval>", "difference>", "95 % interval>")
-    console.table(headings, rows, title=title, caption=caption)
-    limits = [
-        (run["label"], limit, passed["mean"]) for run in result["runs"] for limit, passed in run["steps_to"].items()
-    ]
-    if limits:
-        cells = [
-            (label, limit, console.format_count(step) if step is not None else "-") for label, limit, step in limits
-        ]
-        console.table(("run", "return>", "first reached at>"), cells)
-
-
-def _cells(verdict: dict[str, Any] | None) -> tuple[str, str, str, str]:
-    if verdict is None or verdict["mean"] is None:
-        return ("-",) * 4
-    interval = console.format_interval(verdict["ci95"]) if verdict["ci95"] else "-"
-    gap = verdict.get("difference")
-    if gap is None:
-        return console.format_mean(verdict["mean"], verdict["sem"]), interval, "", ""
-    gap_interval = console.format_interval(gap["ci95"]) if gap["ci95"] else "-"
-    return console.format_mean(verdict["mean"], verdict["sem"]), interval, f"{gap['mean']:+.2f}", gap_interval

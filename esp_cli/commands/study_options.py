@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -136,28 +136,31 @@ class StudyChoices:
 
     def _options(self) -> list[str]:
         """Return the options that decide what is run, in the form in which they are written."""
+        from esp_cli.training.config import seeds_text
+
         words: list[str] = []
         for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
             names = parse_names(items)
             words += [flag, ",".join(names)] if names else []
-        whole = self.seeds == tuple(range(len(self.seeds)))
-        if self.seeds != DEFAULT_SEEDS:
-            words += ["--seeds", str(len(self.seeds)) if whole else ",".join(map(str, self.seeds)) + ","]
+        words += ["--seeds", seeds_text(self.seeds)] if self.seeds != DEFAULT_SEEDS else []
         words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
         return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])
 
 
-def study_command(command: Callable[[Any, StudyChoices], None]) -> Callable[..., None]:
-    """Give a command of an argument and `StudyChoices` the options of these, where typer looks for them."""
-    argument = next(iter(inspect.signature(command, eval_str=True).parameters.values()))
-    options = inspect.signature(StudyChoices, eval_str=True).parameters.values()
+def study_command(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them."""
+    own = dict(inspect.signature(command, eval_str=True).parameters)
+    del own["choices"]
+    parameters = [*own.values(), *inspect.signature(StudyChoices, eval_str=True).parameters.values()]
+    parameters.sort(key=lambda parameter: parameter.default is not parameter.empty)
 
     @functools.wraps(command)
-    def with_options(**given: Any) -> None:
-        command(given.pop(argument.name), StudyChoices(**given))
+    def with_options(**given: object) -> None:
+        arguments = {name: given.pop(name) for name in own}
+        command(choices=StudyChoices(**given), **arguments)  # type: ignore[arg-type]
 
-    with_options.__signature__ = inspect.Signature([argument, *options])  # type: ignore[attr-defined]
-    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in (argument, *options)}
+    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return with_options

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +18,7 @@ from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 
 if TYPE_CHECKING:
+    from esp_cli.evaluation.final import Mode
     from esp_cli.studies.forecast import Forecast
     from esp_cli.studies.scheduler import Snapshot
     from esp_cli.studies.study import StudyFolder
@@ -23,13 +26,27 @@ if TYPE_CHECKING:
 _MEBIBYTE = 2**20
 
 
-def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
+def run_study(
+    kind: str,
+    words: Sequence[str],
+    choices: StudyChoices,
+    settings: Mapping[str, object] | None = None,
+    variants: Sequence[str] | None = None,
+    group: str = "c4",
+    mode: Mode | None = None,
+    thresholds: Sequence[float] = (),
+) -> None:
     """Plan a study and run it, or with --dry-run say what it would cost.
 
     Args:
-        kind: of the catalogue.
-        words: the command without its options.
+        kind: of `studies.kinds`.
+        words: the command without the options of all studies.
         choices: of the user.
+        settings: of all runs, under those of the user.
+        variants: of the study; by default all.
+        group: whose symmetry a study of networks is about.
+        mode: which evaluations the tables state; by default those of this kind of study.
+        thresholds: returns whose first passing the tables state, likewise.
 
     Raises:
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
@@ -41,7 +58,9 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
     from esp_cli.training.build import build_learner
 
     out = choices.out or Path("runs") / kind
-    study = plan(kind, choices.request(words, out))
+    request = choices.request(words, out)
+    overrides = {**(settings or {}), **request.overrides}
+    study = plan(kind, replace(request, overrides=overrides, variants=variants, group=group))
     others = [StudyFolder.open(path) for path in choices.reuse or ()]
     jobs = choices.jobs or (1 if study.cells[0].config.device == "cuda" else available_cores())
     if choices.dry_run:
@@ -76,7 +95,7 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
         console.note(f"stopped; go on with: {study.command}")
         raise typer.Exit(130)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
-    _report(folder, choices.json)
+    _report(folder, choices.json, mode, thresholds)
     failed = [run.cell.name for run in scheduler.runs if run.status == "failed"]
     if failed:
         raise ValueError(
@@ -85,17 +104,17 @@ def run_study(kind: str, words: Sequence[str], choices: StudyChoices) -> None:
         )
 
 
-def _report(folder: StudyFolder, json: str | None) -> None:
+def _report(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
     """Print the table of a study and say what to do next."""
     from esp_cli.commands.report import print_tables
-    from esp_cli.reporting.results import collect
+    from esp_cli.reporting.collect import collect
 
-    results = collect(folder)
+    results = collect(folder, mode, thresholds).results
     if json != "-":
         print_tables(results)
     if json is not None:
-        console.write_json(json, results)
-    console.note(f"next: esp report {folder.path}")
+        console.write_json(json, results.document())
+    console.note(f"next: {shlex.join(['esp', 'report', str(folder.path)])}")
 
 
 def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
@@ -105,7 +124,7 @@ def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json
     with console.TrainingProgress(len(folder.study.cells), description="measure") as progress:
         found = forecast(folder, others, jobs, progress.update)
     if json is not None:
-        console.write_json(json, found.as_json())
+        console.write_json(json, found)
     if json != "-":
         _print_forecast(found)
 

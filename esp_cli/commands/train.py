@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -137,7 +138,8 @@ def train_folder(folder: RunFolder, tensorboard: bool) -> None:
             complete = trainer.run(listen)
     if not complete:
         console.note(
-            f"stopped at {console.format_count(trainer.step)} steps; go on with: esp train --resume {folder.path}"
+            f"stopped at {console.format_count(trainer.step)} steps; go on with: "
+            f"{shlex.join(['esp', 'train', '--resume', str(folder.path)])}"
         )
         raise typer.Exit(130)
     _report(trainer, folder)
@@ -177,4 +179,5 @@ def _report(trainer: Trainer, folder: RunFolder) -> None:
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
-    console.note(f"next: esp eval {folder.path}    esp render {folder.path} -o out.gif")
+    path = shlex.quote(str(folder.path))
+    console.note(f"next: esp eval {path}    esp render {path} -o out.gif")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,13 +12,9 @@ from esp_cli import __version__
 from esp_cli.deploy.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
-from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import Episodes, PolicyController
 from esp_cli.training.policy_file import describe_policy, write_policy
-
-_SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
-_OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
 
 
 def best_seed(trained: TrainedPolicy, episodes: int) -> int:
@@ -90,34 +84,9 @@ def bundle(
         step=alone.step,
         score=score,
         metrics={key: float(value.mean()) for key, value in played.metrics.items()},
-        command=command_of(config),
+        command=config.command(),
         esp_version=__version__,
         config=config.model_dump(mode="json"),
     )
     write_bundled(folder, (*others, entry))
     return entry
-
-
-def command_of(config: RunConfig) -> str:
-    """Return the command line that trains a run of this configuration: what is not a default of its preset is set."""
-    plain = resolve_config(
-        config.task, config.algorithm, config.preset, config.steps, config.seeds, config.device
-    ).model_dump(mode="json")
-    own = config.model_dump(mode="json")
-    words = ["esp train", f"--task {config.task}", f"--algo {config.algorithm}"]
-    words += [f"--preset {config.preset}"] if config.preset != "default" else []
-    seeds = config.seeds
-    counted = seeds == tuple(range(len(seeds)))
-    words += [f"--seeds {len(seeds) if counted else ','.join(map(str, seeds)) + ','}", f"--steps {config.steps}"]
-    words += [f"--device {config.device}"] if config.device != "cpu" else []
-    for section, key in ({config.algorithm: "algorithm_settings"} | _SECTIONS).items():
-        words += [
-            _assignment(f"{section}.{name}", value) for name, value in own[key].items() if value != plain[key].get(name)
-        ]
-    return " ".join(words)
-
-
-def _assignment(name: str, value: Any) -> str:
-    """Write one setting as an option."""
-    text = value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
-    return f"{_OPTIONS[name]} {text}" if name in _OPTIONS else f"--set {name}={text}"

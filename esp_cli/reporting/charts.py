@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.evaluation.curve_statistics import curve_band
 from esp_cli.formatting import format_count
@@ -18,7 +17,7 @@ from esp_cli.reporting.plots import appearance
 
 WIDTH, HEIGHT = 640, 320
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 12, 36
-_DASHES = {"-": "", "--": "7 4", "-.": "7 3 2 3"}
+_DASHES, _LONG_DASHES = {"-": "", "--": "7 4", "-.": "7 3 2 3"}, "7 3 2 3 2 3"
 Floats = NDArray[np.float64]
 _MAX_POINTS = 200
 """Of a curve on a page; longer ones are thinned out."""
@@ -38,64 +37,91 @@ class _Scale:
         return round(self.start + share * (self.end - self.start), 2)
 
 
-def chart(panel: Panel, labels: Sequence[str]) -> dict[str, Any]:
-    """Return one panel as the template wants it.
+@dataclass(frozen=True)
+class ChartCurve:
+    """One curve: its line and band as SVG paths, and points [x, mean, low, high, step, y] for the script."""
+
+    label: str
+    colour: str
+    dashes: str
+    line: str
+    band: str
+    points: list[tuple[float, float, int, float, float, float]]
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A line across the picture at a place, with its text."""
+
+    at: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One panel as the template draws it."""
+
+    title: str
+    x_ticks: list[Tick]
+    y_ticks: list[Tick]
+    anchors: list[Tick]
+    curves: list[ChartCurve]
+    width: int = WIDTH
+    height: int = HEIGHT
+    left: int = _LEFT
+    right: int = WIDTH - _RIGHT
+    top: int = _TOP
+    bottom: int = HEIGHT - _BOTTOM
+
+
+def chart(panel: Panel, labels: Sequence[str]) -> Chart:
+    """Return one panel as the template draws it.
 
     Args:
         panel: at least one curve with a finite value.
         labels: of all panels; the place of a label is its colour.
-
-    Returns:
-        title, size, ticks of both axes, and by curve its colour, dashes, line and band as SVG paths, and points for
-        the script: [x, mean, low, high, step, y] each.
     """
     drawn = [(curve.label, _thinned(curve.steps, curve.values)) for curve in panel.curves]
     edges = np.concatenate([np.concatenate([low, high]) for _, (_, _, low, high) in drawn])
     edges = edges[np.isfinite(edges)]
     bottom, top = (float(edges.min()), float(edges.max())) if edges.size else (0.0, 1.0)
     margin = 0.04 * (top - bottom or 1.0)
+    bottom, top = bottom - margin, top + margin
     last = max(float(steps[-1]) for _, (steps, _, _, _) in drawn) or 1.0
     x = _Scale(0.0, last, _LEFT, WIDTH - _RIGHT)
-    y = _Scale(bottom - margin, top + margin, HEIGHT - _BOTTOM, _TOP)
-    curves = []
-    for label, (steps, mean, low, high) in drawn:
-        colour, style = appearance(labels.index(label))
-        places = [(x(s), y(m), y(a), y(b)) for s, m, a, b in zip(steps, mean, low, high, strict=True)]
-        whole = [place for place in places if all(map(math.isfinite, place))]
-        curves.append(
-            {
-                "label": label,
-                "colour": colour,
-                "dashes": _DASHES.get(style, "7 3 2 3 2 3") if isinstance(style, str) else "7 3 2 3 2 3",
-                "line": _path([(px, py) for px, py, _, _ in whole]),
-                "band": _path([(px, b) for px, _, _, b in whole] + [(px, a) for px, _, a, _ in reversed(whole)]),
-                "points": [
-                    [x(s), y(m), int(s), round(float(m), 2), round(float(a), 2), round(float(b), 2)]
-                    for s, m, a, b in zip(steps, mean, low, high, strict=True)
-                    if math.isfinite(m)
-                ],
-            }
-        )
-    return {
-        "title": panel.title,
-        "width": WIDTH,
-        "height": HEIGHT,
-        "left": _LEFT,
-        "right": WIDTH - _RIGHT,
-        "top": _TOP,
-        "bottom": HEIGHT - _BOTTOM,
-        "x_ticks": [(x(tick), format_count(tick)) for tick in _ticks(0.0, last)],
-        "y_ticks": [(y(tick), f"{tick:g}") for tick in _ticks(bottom - margin, top + margin)],
-        "anchors": [
-            {"name": name, "y": y(value), "value": round(value, 2)}
+    y = _Scale(bottom, top, HEIGHT - _BOTTOM, _TOP)
+    return Chart(
+        panel.title,
+        x_ticks=[Tick(x(tick), format_count(tick)) for tick in _ticks(0.0, last)],
+        y_ticks=[Tick(y(tick), f"{tick:g}") for tick in _ticks(bottom, top)],
+        anchors=[
+            Tick(y(value), f"{name} {round(value, 2)}")
             for name, value in panel.anchors.items()
-            if bottom - margin <= value <= top + margin
+            if bottom <= value <= top
         ],
-        "curves": curves,
-    }
+        curves=[_curve(label, labels.index(label), numbers, x, y) for label, numbers in drawn],
+    )
 
 
-def _thinned(steps: Any, values: Any) -> tuple[Floats, Floats, Floats, Floats]:
+def stroke(index: int) -> tuple[str, str]:
+    """Return the colour and the dashes of the curve with this index."""
+    colour, style = appearance(index)
+    return colour, _DASHES.get(style, _LONG_DASHES) if isinstance(style, str) else _LONG_DASHES
+
+
+def _curve(label: str, index: int, numbers: tuple[Floats, Floats, Floats, Floats], x: _Scale, y: _Scale) -> ChartCurve:
+    whole = [row for row in zip(*map(np.ndarray.tolist, numbers), strict=True) if all(map(math.isfinite, row))]
+    upper, lower = [(x(s), y(high)) for s, _, _, high in whole], [(x(s), y(low)) for s, _, low, _ in whole]
+    return ChartCurve(
+        label,
+        *stroke(index),
+        line=_path([(x(s), y(mean)) for s, mean, _, _ in whole]),
+        band=_path([*upper, *reversed(lower)]),
+        points=[(x(s), y(m), int(s), round(m, 2), round(low, 2), round(high, 2)) for s, m, low, high in whole],
+    )
+
+
+def _thinned(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats, Floats, Floats]:
     """Return steps, means and band of a curve, every so-many-th with the last among them."""
     at, numbers = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
     every = math.ceil(len(at) / _MAX_POINTS)

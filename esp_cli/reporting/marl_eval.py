@@ -8,33 +8,29 @@ evaluation's episodes; `absolute_metrics` are those of the final evaluation of t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 from esp_cli.formatting import format_count
+from esp_cli.reporting.collect import Material
 from esp_cli.reporting.curves import RunCurve
-from esp_cli.studies.study import Cell, Study
+from esp_cli.studies.study import Cell
 from esp_envs.registry import task_class
 
+SeedRun = dict[str, dict[str, int | list[float]]]
+"""Step, or "absolute_metrics" -> metric -> numbers."""
+MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]
+"""Environment -> task -> algorithm -> seed."""
 
-def marl_eval(study: Study, curves: Mapping[str, RunCurve], results: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the finished runs of a study.
 
-    Runs of which a seed stopped are left out, as the tool has no place for them.
-
-    Args:
-        study: the runs.
-        curves: by name of the cell.
-        results: as `results.collect` returns them.
-    """
-    out: dict[str, Any] = {}
-    entries = {entry["name"]: entry for entry in results["cells"]}
-    for cell in study.cells:
-        entry, curve = entries[cell.name], curves.get(cell.name)
-        finals = (entry.get("returns") or {}).get(results["mode"])
-        if curve is None or finals is None or not all(map(math.isfinite, curve.values.ravel())) or None in finals:
+def marl_eval(material: Material) -> MarlEval:
+    """Return the finished runs of a study; the tool has no place for those of which a seed stopped."""
+    out: MarlEval = {}
+    entries = {entry.name: entry for entry in material.results.cells}
+    for cell in material.study.cells:
+        finals = entries[cell.name].returns.get(material.results.mode, ())
+        curve, whole = material.curves.get(cell.name), [x for x in finals if x is not None]
+        if curve is None or not whole or len(whole) < len(finals) or not all(map(math.isfinite, curve.values.ravel())):
             continue
-        runs = {f"seed_{seed}": _run(curve, k, finals[k]) for k, seed in enumerate(cell.config.seeds)}
+        runs = {f"seed_{seed}": _run(curve, k, whole[k]) for k, seed in enumerate(cell.config.seeds)}
         task = "_".join(cell.panel.replace(",", " ").replace("=", " ").split())
         algorithm = "_".join(cell.variant.replace(",", " ").replace("=", " ").split())
         out.setdefault(_environment(cell), {}).setdefault(task, {})[algorithm] = runs
@@ -43,12 +39,13 @@ def marl_eval(study: Study, curves: Mapping[str, RunCurve], results: Mapping[str
 
 def _environment(cell: Cell) -> str:
     """Return the family of the task and the number of steps: "mpe_500k"."""
-    family = task_class(cell.config.task).__module__.split(".")[1]
+    package, *inner = task_class(cell.config.task).__module__.split(".")
+    family = inner[0] if package == "esp_envs" and inner else package
     return f"{family}_{format_count(cell.config.steps)}"
 
 
-def _run(curve: RunCurve, seed: int, final: float) -> dict[str, Any]:
-    steps = {
+def _run(curve: RunCurve, seed: int, final: float) -> SeedRun:
+    steps: SeedRun = {
         f"step_{k}": {"step_count": int(step), "return": [float(value)]}
         for k, (step, value) in enumerate(zip(curve.steps, curve.values[:, seed], strict=True), start=1)
     }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from jinja2 import Environment, FileSystemLoader
 
@@ -15,15 +15,15 @@ from esp_cli import __version__
 from esp_cli.drawing.rendering import default_episodes, open_painter, record, shots, stride, write_film
 from esp_cli.files.documents import encode
 from esp_cli.files.writing import replace_file
-from esp_cli.reporting.charts import chart
-from esp_cli.reporting.curves import RunCurve
+from esp_cli.reporting.charts import chart, stroke
+from esp_cli.reporting.collect import Material
 from esp_cli.reporting.marl_eval import marl_eval
 from esp_cli.reporting.panels import Panel, Sensitivity, curve_panels, sensitivity
 from esp_cli.reporting.plots import Bar, Curve, bars
-from esp_cli.reporting.recipes import command_of
-from esp_cli.reporting.results import returns_of
-from esp_cli.reporting.tables import all_tables
-from esp_cli.studies.study import Cell, Study
+from esp_cli.reporting.results import RESULTS_FORMAT, CellResult
+from esp_cli.reporting.summary import floats
+from esp_cli.reporting.tables import all_tables, markdown_text
+from esp_cli.studies.kinds import KINDS
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import load_policy
 
@@ -32,23 +32,17 @@ _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
 _FILM_SECONDS = 15.0
 """A film is sped up to last no longer."""
+Pictures = list[tuple[Path, Path]]
+"""Each as PNG and SVG."""
 
 
 @dataclass(frozen=True)
-class Material:
-    """All that a report is made from.
+class RunText:
+    """A run by itself: its name, the command that trains it, and its configuration as JSON."""
 
-    Attributes:
-        study: what was planned.
-        results: what came out, see `results.collect`.
-        curves: by name of the cell, those that have begun.
-        runs: run folders by name of the cell.
-    """
-
-    study: Study
-    results: Mapping[str, Any]
-    curves: Mapping[str, RunCurve]
-    runs: Mapping[str, Path] = field(default_factory=dict)
+    name: str
+    command: str
+    config: str
 
 
 def write_report(material: Material, out: Path) -> list[Path]:
@@ -69,9 +63,8 @@ def write_report(material: Material, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     panels = _panels(material)
     pictures = _pictures(material, panels, out)
-    scores = marl_eval(material.study, material.curves, material.results)
-    for path, content in ((out / RESULTS, material.results), (out / MARL_EVAL, scores)):
-        replace_file(path, encode(content, path))
+    RESULTS_FORMAT.write(out / RESULTS, material.results.content())
+    replace_file(out / MARL_EVAL, encode(marl_eval(material), out / MARL_EVAL))
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
@@ -82,10 +75,10 @@ def write_report(material: Material, out: Path) -> list[Path]:
         "command": material.study.command,
         "tables": all_tables(material.results),
         "charts": [chart(panel, labels) for panel in panels],
-        "legend": [(label, *_legend(labels, label)) for label in labels],
+        "legend": [(label, *stroke(index)) for index, label in enumerate(labels)],
         "pictures": [(png.stem, _data_uri(svg, "image/svg+xml")) for png, svg in pictures[1:]],  # curves are charts
-        "films": [(name, _data_uri(path, "image/gif")) for name, path in _films(material)],
-        "runs": [_run(cell) for cell in material.study.cells],
+        "films": [(name, _data_uri(path, "image/gif")) for path, name in _films(material).items()],
+        "runs": _runs(material),
     }
     page, markdown = out / PAGE, out / MARKDOWN
     replace_file(page, environment.get_template("report.html").render(content).encode())
@@ -115,79 +108,90 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
 
 
 def _panels(material: Material) -> list[Panel]:
-    """Return the learning curves by panel, with the anchors of a judged run."""
-    entries = {entry["name"]: entry for entry in material.results["cells"]}
-    panels = []
+    """Return the learning curves by panel, with the anchors of a run that has its final evaluation.
+
+    Runs that are compared at several steps have the same curves at each, which are drawn once.
+    """
+    entries = {entry.name: entry for entry in material.results.cells}
+    kind = KINDS.get(material.study.kind)
+    panels: dict[tuple[int, ...], Panel] = {}
     for name in material.study.panels:
         cells = [cell for cell in material.study.cells if cell.panel == name and cell.name in material.curves]
-        curves = [Curve(cell.variant, *_evaluations(material.curves[cell.name])) for cell in cells]
-        anchors: dict[str, float] = next((a for cell in cells if (a := entries[cell.name].get("anchors"))), {})
-        if curves:
-            panels.append(Panel(name, curves, anchors))
-    return panels
+        found = [material.curves[cell.name] for cell in cells]
+        lines: dict[str, float] = next((dict(a) for cell in cells if (a := entries[cell.name].anchors)), {})
+        if kind is not None and kind.network_cost:
+            own = (entries[cell.name] for cell in cells)
+            lines |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
+        if found:
+            title = cells[0].config.task if entries[cells[0].name].at is not None else name
+            curves = [Curve(cell.variant, c.steps, c.values) for cell, c in zip(cells, found, strict=True)]
+            panels.setdefault(tuple(map(id, found)), Panel(title, curves, lines))
+    return list(panels.values())
 
 
-def _evaluations(curve: RunCurve) -> tuple[Any, Any]:
-    return curve.steps, curve.values
-
-
-def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> list[tuple[Path, Path]]:
-    """Draw the curves, and for an ablation its bars or its coefficient; each as PNG and SVG."""
-    results, kind = material.results, material.study.kind
-    pictures = [curve_panels(panels, out / "curves", f"{results['mode']} return")]
-    finished = [
-        cell for cell in results["cells"] if cell.get("returns") and None not in cell["returns"][results["mode"]]
-    ]
-    if kind == "ablate-coefficient" and finished:
-        names = list(dict.fromkeys(cell["panel"] for cell in finished))
+def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Pictures:
+    """Draw the curves, and for variants their bars, or the returns over their coefficient."""
+    results = material.results
+    label = f"{results.mode} return"
+    pictures = [curve_panels(panels, out / "curves", label)]
+    if results.rows == "panels":
+        return pictures
+    finished: dict[str, dict[str, CellResult]] = {}
+    for cell in results.cells:
+        if cell.returns and None not in cell.returns[results.mode]:
+            finished.setdefault(cell.panel, {})[cell.variant] = cell
+    values = {
+        panel: {variant: floats(cell.returns[results.mode]) for variant, cell in own.items()}
+        for panel, own in finished.items()
+    }
+    if results.kind == "ablate-coefficient":
         lines = [
-            Sensitivity(
-                name,
-                {c["variant"]: returns_of(c, results["mode"]) for c in finished if c["panel"] == name},
-                {c["variant"]: c["paper"][0] for c in finished if c["panel"] == name and c["paper"]},
-            )
-            for name in names
+            Sensitivity(panel, values[panel], {v: c.paper[0] for v, c in own.items() if c.paper})
+            for panel, own in finished.items()
         ]
-        title = "Return over the weight of the consistency loss"
-        weights, label = [cell["variant"] for cell in results["cells"]], f"{results['mode']} return"
-        pictures.append(sensitivity(lines, out / "coefficient", title, "weight", label, weights))
-    elif results["rows"] == "variants":
-        for k, name in enumerate(dict.fromkeys(cell["panel"] for cell in finished)):
-            own = [cell for cell in finished if cell["panel"] == name]
-            groups = [Bar(cell["variant"], returns_of(cell, results["mode"])) for cell in own]
-            anchors = {key: round(value, 1) for key, value in (own[0].get("anchors") or {}).items()}
-            label = f"{results['mode']} return"
-            baseline = anchors.get("random", 0.0)
-            pictures.append(bars(groups, out / f"bars-{k + 1}", name, label, baseline, anchors))
+        title, weights = "Return over the weight of the consistency loss", [cell.variant for cell in results.cells]
+        return [
+            *pictures,
+            *([sensitivity(lines, out / "coefficient", title, "weight", label, weights)] if lines else []),
+        ]
+    for k, (panel, own) in enumerate(finished.items()):
+        groups = [Bar(variant, numbers) for variant, numbers in values[panel].items()]
+        anchors = {key: round(value, 1) for key, value in next(iter(own.values())).anchors.items()}
+        pictures.append(bars(groups, out / f"bars-{k + 1}", panel, label, anchors.get("random", 0.0), anchors))
     return pictures
 
 
-def _legend(labels: Sequence[str], label: str) -> tuple[str, str]:
-    """Return the colour and dashes of a label as the charts have them."""
-    own = chart(Panel("", [Curve(label, [0, 1], [[0.0], [1.0]])]), labels)["curves"][0]
-    return own["colour"], own["dashes"]
-
-
-def _films(material: Material) -> list[tuple[str, Path]]:
+def _films(material: Material) -> dict[Path, str]:
     titles = {cell.name: f"{cell.panel}: {cell.variant}" for cell in material.study.cells}
-    return [(titles[name], run / FILM) for name, run in material.runs.items() if (run / FILM).is_file()]
+    return {run / FILM: titles[name] for name, run in material.runs.items() if (run / FILM).is_file()}
 
 
-def _run(cell: Cell) -> dict[str, str]:
-    return {
-        "name": f"{cell.panel}: {cell.variant}",
-        "command": command_of(cell.config),
-        "config": json.dumps(cell.config.model_dump(mode="json"), indent=1),
-    }
+def _runs(material: Material) -> list[RunText]:
+    """Return every run once, whatever the number of steps at which it is compared."""
+    cells = {material.runs.get(cell.name, cell.name): cell for cell in material.study.cells}
+    return [
+        RunText(
+            f"{cell.panel}: {cell.variant}",
+            cell.config.command(),
+            json.dumps(cell.config.model_dump(mode="json"), indent=1),
+        )
+        for cell in cells.values()
+    ]
 
 
 def _data_uri(path: Path, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
-def _markdown(material: Material, pictures: Sequence[tuple[Path, Path]]) -> str:
-    parts = [f"# {material.study.title}", f"```sh\n{material.study.command}\n```"]
+def _markdown(material: Material, pictures: Pictures) -> str:
+    parts = [f"# {markdown_text(material.study.title)}", _fenced(material.study.command)]
     parts += [f"## {table.title}\n\n{table.markdown()}" for table in all_tables(material.results)]
     parts += [f"![{png.stem}]({png.name})" for png, _ in pictures]
-    commands = "\n".join(command_of(cell.config) for cell in material.study.cells)
-    return "\n\n".join([*parts, "## Each run by itself", f"```sh\n{commands}\n```"]) + "\n"
+    commands = "\n".join(run.command for run in _runs(material))
+    return "\n\n".join([*parts, "## Each run by itself", _fenced(commands)]) + "\n"
+
+
+def _fenced(command: str) -> str:
+    """Return a block of shell commands, in a fence that is longer than any row of backticks in it."""
+    fence = "`" * max(3, *(len(row) + 1 for row in re.findall("`+", command)), 0)
+    return f"{fence}sh\n{command}\n{fence}"

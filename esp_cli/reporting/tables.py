@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-from esp_cli.evaluation.statistics import Estimate
-from esp_cli.formatting import format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.reporting.results import aggregates, verdict
+from esp_cli.evaluation.statistics import Estimate, SeedSummary
+from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.reporting.results import CellResult, Passing, Results
+from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell
 from esp_cli.studies import paper
 from esp_cli.studies.catalogue import paper_cells
 
-NOTHING = "-"
-NOT_RUN = "not run"
+NOT_RUN, _STOPPED = "not run", "every seed stopped"
 _AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", None: NOTHING}
 _LEADER = {"first": "ours", "second": "paper", "neither": "not told apart", None: NOTHING}
+_COMPARED = ("return>", "95 % interval>", "minus reference>", "P(improvement)>", "ahead of reference")
+_PAPER_SIDE = ("paper>", "ours or paper ahead")
+_MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
+
+
+def markdown_text(text: str) -> str:
+    """Return a text that Markdown shows as it is, in a cell of a table too."""
+    return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))
 
 
 @dataclass(frozen=True)
@@ -38,28 +46,29 @@ class Table:
         """Return the table as Markdown, without its title."""
         names = [heading.removesuffix(">") for heading in self.headings]
         rule = ["---:" if heading.endswith(">") else "---" for heading in self.headings]
-        lines = [f"| {' | '.join(cells)} |" for cells in (names, rule, *self.rows)]
-        return "\n".join([*lines, *(["", self.caption] if self.caption else [])])
+        rows = [[markdown_text(cell) for cell in row] for row in (names, *self.rows)]
+        lines = [f"| {' | '.join(cells)} |" for cells in (rows[0], rule, *rows[1:])]
+        return "\n".join([*lines, *(["", markdown_text(self.caption)] if self.caption else [])])
 
 
-def returns_table(results: Mapping[str, Any], whole: bool = False) -> Table:
+def returns_table(results: Results, whole: bool = False) -> Table:
     """Return the study in its own layout, ours above the paper's.
 
     Args:
-        results: as `results.collect` returns them.
+        results: of the study.
         whole: with all that the paper's table has; what we did not run is marked so.
     """
-    cells = {(cell["panel"], cell["variant"]): cell for cell in results["cells"]}
-    most = max(len(cell["seeds"]) for cell in results["cells"])
+    cells = {(cell.panel, cell.variant): cell for cell in results.cells}
+    most = max(len(cell.seeds) for cell in results.cells)
     entries = {place: _short(results, cell) + _fewer_seeds(cell, most) for place, cell in cells.items()}
-    theirs = {place: cell["paper"] for place, cell in cells.items() if cell["paper"]}
+    theirs = {place: cell.paper for place, cell in cells.items() if cell.paper}
     if whole:
-        listed = {(panel, variant): paper.reported(key) for panel, variant, key in paper_cells(results["kind"])}
+        listed = {(panel, variant): paper.reported(key) for panel, variant, key in paper_cells(results.kind)}
         entries = dict.fromkeys(listed, NOT_RUN) | entries
-        theirs = {place: [n.mean, n.sem] for place, n in listed.items() if n is not None} | theirs
+        theirs = {place: (n.mean, n.sem) for place, n in listed.items() if n is not None} | theirs
     panels = list(dict.fromkeys(panel for panel, _ in entries))
     variants = list(dict.fromkeys(variant for _, variant in entries))
-    by_panel = results["rows"] == "panels"
+    by_panel = results.rows == "panels"
     rows, columns = (panels, variants) if by_panel else (variants, panels)
     lines: list[tuple[str, ...]] = []
     for row in rows:
@@ -69,19 +78,20 @@ def returns_table(results: Mapping[str, Any], whole: bool = False) -> Table:
             numbers = [theirs.get(place) for place in places]
             lines.append(("", "paper", *(format_mean(*number) if number else NOTHING for number in numbers)))
     headings = ("", *([""] if theirs else []), *(f"{column}>" for column in columns))
-    return Table(results["title"], headings, tuple(lines), _caption(results))
+    return Table(results.title, headings, tuple(lines), _caption(results))
 
 
-def comparison_table(results: Mapping[str, Any]) -> Table:
+def comparison_table(results: Results) -> Table:
     """Return each cell beside its reference and the paper's number: intervals, and who is ahead."""
     rows = []
-    columns = _COMPARED + (_PAPER_SIDE if any(cell["paper"] for cell in results["cells"]) else ())
-    for cell in results["cells"]:
-        texts = {"return>": _short(results, cell)}
-        found = verdict(results, cell)
-        if found is not None and found["mean"] is not None:
-            texts = _compared(cell, found)
-        rows.append((cell["panel"], cell["variant"], *(texts.get(heading, NOTHING) for heading in columns)))
+    columns = _COMPARED + (_PAPER_SIDE if any(cell.paper for cell in results.cells) else ())
+    columns = ("trained to>", *columns) if any(cell.at is not None for cell in results.cells) else columns
+    for cell in results.cells:
+        found = summarise_cell(results, cell)
+        texts = {"trained to>": format_count(cell.step), "return>": _short(results, cell)}
+        if found is not None and found.returns.mean is not None:
+            texts |= _compared(cell, found)
+        rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
     caption = (
         "The reference is the plain learner (the first run) of the same panel, compared seed by seed; ahead: the 95 % "
         "interval of the difference lies above 0. Ours and the paper's means are compared by Welch's test at 5 %."
@@ -89,54 +99,41 @@ def comparison_table(results: Mapping[str, Any]) -> Table:
     return Table("Beside the reference and the paper", ("panel", "run", *columns), tuple(rows), caption)
 
 
-def statistics_table(results: Mapping[str, Any]) -> Table:
-    """Return what else can be said of each cell: robust mean, scale, and the way there."""
+def statistics_table(results: Results) -> Table:
+    """Return what else can be said of each cell: robust mean, scale, and how fast it learned."""
     rows = []
-    for cell in results["cells"]:
-        found = verdict(results, cell)
-        if found is None or found["mean"] is None:
+    for cell in results.cells:
+        found = summarise_cell(results, cell)
+        if found is None or found.returns.mean is None:
             continue
-        seeds = sum(x is not None for x in found["per_seed"])
-        duration = format_duration(cell["seconds"]) if "seconds" in cell else NOTHING
-        texts = (_estimate(found["iqm"]), _mean_of(found["normalised"]), _steps_to(cell), _mean_of(found["area"]))
-        rows.append((cell["panel"], cell["variant"], str(seeds), *texts, duration))
+        seeds = sum(x is not None for x in found.returns.per_seed)
+        duration = NOTHING if cell.seconds is None else format_duration(cell.seconds)
+        passings = "; ".join(map(_passing, cell.steps_to)) or NOTHING
+        texts = (_estimate(found.iqm), _mean_of(found.normalised), passings, _mean_of(found.area))
+        rows.append((cell.panel, cell.variant, str(seeds), *texts, duration))
     caption = (
         "IQM: mean of the middle half of the seeds. Normalised: 0 is the random policy, 1 the task's heuristic. Steps "
         "to: when the mean curve first reaches what the reference ended with. Mean over the run: area under the curve."
     )
     headings = ("panel", "run", "seeds>", "IQM>", "normalised>", "steps to>", "mean over the run>", "training>")
-    return Table("Seeds, scale and the way there", headings, tuple(rows), caption)
+    return Table("Seeds, scale and speed of learning", headings, tuple(rows), caption)
 
 
-_COMPARED = ("return>", "95 % interval>", "minus reference>", "P(improvement)>", "ahead of reference")
-_PAPER_SIDE = ("paper>", "ours or paper ahead")
+def networks_table(results: Results) -> Table | None:
+    """Return the sizes of the networks, or None where no cell states them."""
+    rows = tuple(
+        (cell.panel, cell.variant, format_count(cell.parameters["policy"]), format_count(cell.flops_per_action))
+        for cell in results.cells
+        if cell.parameters and cell.flops_per_action is not None
+    )
+    caption = "Weights of the policy of one seed, and operations of its matrix products for one agent's action."
+    return Table("Networks", ("panel", "run", "weights>", "FLOPs an action>"), rows, caption) if rows else None
 
 
-def _compared(cell: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, str]:
-    """Return the texts of a finished cell by heading."""
-    texts = {"return>": format_mean(found["mean"], found["sem"]), "95 % interval>": _interval(found["ci95"])}
-    if cell["reference"] is None:
-        texts |= {"minus reference>": "", "P(improvement)>": "", "ahead of reference": ""}
-    elif "difference" in found:
-        gap, chance = found["difference"], found["probability_of_improvement"]
-        texts["minus reference>"] = f"{gap['mean']:+.2f} {_interval(gap['ci95'])}"
-        texts["P(improvement)>"] = _estimate({"value": chance, "ci95": found["probability_of_improvement_ci95"]})
-        texts["ahead of reference"] = _AHEAD[found["ahead"]]
-    if found["paper"]:
-        texts["paper>"] = format_mean(found["paper"]["mean"], found["paper"]["sem"])
-        texts["ours or paper ahead"] = _LEADER[found["paper"]["ahead"]]
-    return texts
-
-
-def aggregates_table(results: Mapping[str, Any]) -> Table | None:
+def aggregates_table(results: Results) -> Table | None:
     """Return the numbers over all panels, or None where no variant is finished in two."""
     rows = tuple(
-        (
-            variant,
-            _value(found["iqm"]),
-            _value(found["mean"]),
-            _value(found["improvement"]) if "improvement" in found else NOTHING,
-        )
+        (variant, _estimate(found.iqm), _estimate(found.mean), _estimate(found.improvement))
         for variant, found in aggregates(results).items()
     )
     caption = "Of normalised returns over all panels; 95 % intervals by a bootstrap that is stratified by panel."
@@ -144,82 +141,85 @@ def aggregates_table(results: Mapping[str, Any]) -> Table | None:
     return Table("Over all panels", headings, rows, caption) if rows else None
 
 
-def times_table(results: Mapping[str, Any]) -> Table:
+def times_table(results: Results) -> Table:
     """Return what was run, by which version, and how long it took."""
-    done = [cell for cell in results["cells"] if "seconds" in cell]
-    total = sum(cell["seconds"] for cell in done)
-    versions = sorted({cell["esp_version"] for cell in done if cell.get("esp_version")}) or [results["esp_version"]]
+    done = [cell for cell in results.cells if cell.seconds is not None]
+    total = sum({(c.variant, str(c.config)): c.seconds or 0.0 for c in done}.values())  # each run once
+    versions = sorted({cell.esp_version for cell in done if cell.esp_version}) or [results.esp_version]
     rows = (
-        ("command", "; ".join(results["command"].splitlines())),
+        ("command", "; ".join(results.command.splitlines())),
         ("version of esp", ", ".join(versions)),
-        ("runs finished", f"{sum(c['status'] == 'finished' for c in results['cells'])} of {len(results['cells'])}"),
+        ("runs finished", f"{sum(c.status == 'finished' for c in results.cells)} of {len(results.cells)}"),
         ("training", f"{format_duration(total)}, all runs added up"),
     )
     return Table("Provenance", ("", ""), rows)
 
 
-TABLES: dict[str, Callable[[Mapping[str, Any]], Table | None]] = {
+TABLES: dict[str, Callable[[Results], Table | None]] = {
     "returns": returns_table,
     "paper": lambda results: returns_table(results, whole=True),
     "comparison": comparison_table,
     "statistics": statistics_table,
+    "networks": networks_table,
     "aggregates": aggregates_table,
     "provenance": times_table,
 }
 """By the name that a page asks for."""
 
 
-def all_tables(results: Mapping[str, Any]) -> list[Table]:
+def all_tables(results: Results) -> list[Table]:
     """Return every table that has something to say, each once."""
     made = [make(results) for name, make in TABLES.items() if name != "paper"]
     return [table for table in made if table is not None and table.rows]
 
 
-def _short(results: Mapping[str, Any], cell: Mapping[str, Any]) -> str:
+def _compared(cell: CellResult, found: CellSummary) -> dict[str, str]:
+    """Return the texts of a finished cell by heading."""
+    returns, gap = found.returns, found.gap
+    texts = {"return>": format_mean(returns.mean, returns.sem), "95 % interval>": format_interval(returns.ci95)}
+    if cell.reference is None:
+        texts |= {"minus reference>": "", "P(improvement)>": "", "ahead of reference": ""}
+    elif gap is not None:
+        texts["minus reference>"] = f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)}"
+        texts["P(improvement)>"] = _estimate(gap.probability)
+        texts["ahead of reference"] = _AHEAD[gap.ahead]
+    if found.paper:
+        texts["paper>"] = format_mean(found.paper.mean, found.paper.sem)
+        texts["ours or paper ahead"] = _LEADER[found.paper.ahead]
+    return texts
+
+
+def _short(results: Results, cell: CellResult) -> str:
     """Return the number of a cell, or how far it is."""
-    found = verdict(results, cell)
+    found = summarise_cell(results, cell)
     if found is not None:
-        return format_mean(found["mean"], found["sem"]) if found["mean"] is not None else "every seed stopped"
-    return NOT_RUN if cell["status"] == "not run" else f"at {format_count(cell['step'])}"
+        return format_mean(found.returns.mean, found.returns.sem) if found.returns.mean is not None else _STOPPED
+    return NOT_RUN if cell.status == "not run" else f"at {format_count(cell.step)}"
 
 
-def _fewer_seeds(cell: Mapping[str, Any], most: int) -> str:
+def _fewer_seeds(cell: CellResult, most: int) -> str:
     """Say how many seeds a finished cell has where others have more."""
-    count = len(cell["seeds"])
-    return f" (n = {count})" if count < most and cell["status"] == "finished" else ""
+    count = len(cell.seeds)
+    return f" (n = {count})" if count < most and cell.status == "finished" else ""
 
 
-def _caption(results: Mapping[str, Any]) -> str:
-    conventions = list(dict.fromkeys(cell["convention"] for cell in results["cells"] if "convention" in cell))
-    seeds = format_span({len(cell["seeds"]) for cell in results["cells"]})
-    episodes = format_span({cell.get("episodes", results["episodes"]) for cell in results["cells"]})
+def _caption(results: Results) -> str:
+    conventions = list(dict.fromkeys(cell.convention for cell in results.cells if cell.convention is not None))
+    seeds = format_span({len(cell.seeds) for cell in results.cells})
+    episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     said = f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
-    return (
-        f"Mean ± standard error over {seeds} seeds of the {results['mode']} return, {episodes} episodes a seed.{said}"
-    )
+    return f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed.{said}"
 
 
-def _steps_to(cell: Mapping[str, Any]) -> str:
-    def told(passed: Mapping[str, Any]) -> str:
-        when = NOTHING if passed["of_mean"] is None else format_count(passed["of_mean"])
-        return f"{passed['threshold']:.2f}: {when}"
-
-    return "; ".join(told(passed) for passed in cell.get("steps_to", [])) or NOTHING
+def _passing(passed: Passing) -> str:
+    return f"{passed.threshold:.2f}: {NOTHING if passed.of_mean is None else format_count(passed.of_mean)}"
 
 
-def _interval(interval: Sequence[float] | None) -> str:
-    return format_interval(interval) if interval else NOTHING
+def _mean_of(summary: SeedSummary | None) -> str:
+    return NOTHING if summary is None else format_mean(summary.mean, summary.sem)
 
 
-def _mean_of(summary: Mapping[str, Any] | None) -> str:
-    return format_mean(summary["mean"], summary["sem"]) if summary and summary["mean"] is not None else NOTHING
-
-
-def _estimate(found: Mapping[str, Any] | None) -> str:
+def _estimate(found: Estimate | None) -> str:
     if found is None:
         return NOTHING
-    return f"{found['value']:.2f}" + (f" {_interval(found['ci95'])}" if found["ci95"] else "")
-
-
-def _value(estimate: Estimate) -> str:
-    return _estimate({"value": estimate.value, "ci95": estimate.ci95})
+    return f"{found.value:.2f}" + (f" {format_interval(found.ci95)}" if found.ci95 else "")

@@ -1,47 +1,17 @@
-"""The studies of the paper, as lists of runs: table 1, the numbers of agents, and the three ablations."""
+"""Planning: a kind of study and what a user asks for give a list of runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.formatting import format_count
 from esp_cli.studies import paper
+from esp_cli.studies.kinds import GROUP, KINDS, Settings, StudyKind, Team
 from esp_cli.studies.study import Cell, Study
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_envs.registry import task_names
-
-ORDER = ("maddpg", "qmix", "mappo")
-"""The algorithms in the order of the paper's table."""
-PAPER_PRIOR: dict[str, object] = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
-"""What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
-TRANSFORM_CHOICES: dict[str, dict[str, object]] = {
-    "none": {"prior.kind": "none"},
-    "rot90": {"prior.transforms": "rot90"},
-    "rot90, rot180": {"prior.transforms": "rot90,rot180", "prior.copies": "all"},
-    "rot90, rot180, rot270": {"prior.transforms": "rot90,rot180,rot270", "prior.copies": "all"},
-    "rot90, flip": {"prior.transforms": "rot90,flip-x", "prior.copies": "all"},
-    "C4, drawn": {"prior.transforms": "c4", "prior.copies": "draw"},
-    "D4, drawn": {"prior.transforms": "d4", "prior.copies": "draw"},
-}
-"""Figures 5a and 5b, with a copy for every element; then two groups of which each minibatch draws one element."""
-COEFFICIENTS = (0.0, 0.01, 0.05, 0.1, 0.5, 1.0)
-MODULES = {"none": "none", "loss": "consistency", "augmentation": "augment", "both": "esp"}
-"""Figure 6a: how the paper calls it -> `prior.kind`."""
-ABLATIONS: dict[str, tuple[dict[str, object], dict[str, dict[str, object]]]] = {
-    "ablate-transforms": ({"prior.kind": "augment"}, TRANSFORM_CHOICES),
-    "ablate-coefficient": (
-        {"prior.kind": "consistency", **PAPER_PRIOR},
-        {f"c = {c:g}": {"prior.consistency_coef": c} for c in COEFFICIENTS},
-    ),
-    "ablate-modules": (PAPER_PRIOR, {name: {"prior.kind": value} for name, value in MODULES.items()}),
-}
-"""Study -> what all of its runs have in common, and its variants; the others are compared with the first."""
-TEAMS = ((2, None), (3, None), (4, None), (4, 3))
-"""Agents and landmarks of the supplement's table; None is the task's default. Its four agents fit four landmarks best,
-the authors' launcher says three."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +27,8 @@ class Request:
         overrides: dotted names to values; those of an algorithm or a task concern its runs alone.
         device: "cpu" or "cuda".
         episodes: per seed, of the final evaluation of a trained policy.
+        variants: names of the variants, in order; the others are compared with the first.
+        group: whose symmetry a study of networks is about.
         command: the command line behind it.
     """
 
@@ -65,138 +37,84 @@ class Request:
     steps: Sequence[tuple[str | None, int]] | None = None
     seeds: Sequence[int] = tuple(range(paper.NUM_SEEDS))
     preset: str = "default"
-    overrides: Mapping[str, object] = field(default_factory=dict)
+    overrides: Settings = field(default_factory=dict)
     device: str = "cpu"
     episodes: int = 320
+    variants: Sequence[str] | None = None
+    group: str = "c4"
     command: str = ""
 
 
-def plan(kind: str, request: Request) -> Study:
-    """Plan one of the studies.
+def plan(name: str, request: Request) -> Study:
+    """Plan a study.
 
     Args:
-        kind: of `KINDS`.
+        name: of `KINDS`.
         request: what the user asked for.
 
     Raises:
         ValueError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
     """
-    build, title, rows, own = KINDS[kind]
-    for name in request.overrides:
-        if name in own:
-            raise ValueError(f"--set {name} is what this study varies by itself; leave it out")
-    _refuse_unused(request, _tasks(kind, request), _algorithms(kind, request))
-    cells = tuple(build(kind, request))
+    kind = KINDS[name]
+    for setting in request.overrides:
+        if setting in kind.varies:
+            raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
+    variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
+    if not variants or len(set(variants)) < len(variants) or not set(variants) <= set(kind.variants):
+        raise ValueError(f"name each variant of this study once; they are {', '.join(kind.variants)}")
+    tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
+    _refuse_unused(kind, request, tasks, algorithms)
+    build = _pairs if kind.rows == "panels" else _variants
+    cells = tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
     return Study(
-        kind=kind, title=title, command=request.command, episodes=request.episodes, rows=rows, cells=tuple(cells)
+        kind=name, title=kind.title, command=request.command, episodes=request.episodes, rows=kind.rows, cells=cells
     )
 
 
-def _table1(kind: str, request: Request) -> Iterator[Cell]:
-    for task in _tasks(kind, request):
-        for steps in _steps(kind, task, request):
-            for algorithm in _algorithms(kind, request):
-                yield from _pair(task, task, steps, algorithm, request, {}, ("table1", task))
-
-
-def _agents(kind: str, request: Request) -> Iterator[Cell]:
-    (task,) = _tasks(kind, request)
-    if task != "navigation":
-        raise ValueError(f"the paper varies the number of agents on navigation alone, not on {task}; leave out --tasks")
-    for agents, landmarks in TEAMS:
-        label = f"N = {agents}" + (f", {landmarks} landmarks" if landmarks else "")
-        settings: dict[str, object] = {"task.num_agents": agents, "task.num_landmarks": landmarks}
-        place = ("table1", "navigation") if agents == 3 else ("agents", str(agents))
-        for steps in _steps(kind, task, request):
-            for algorithm in _algorithms(kind, request):
-                yield from _pair(task, label, steps, algorithm, request, settings, place)
-
-
-def _pair(
-    task: str,
-    label: str,
-    steps: int,
-    algorithm: str,
-    request: Request,
-    settings: Mapping[str, object],
-    place: tuple[str, ...],
+def _pairs(
+    kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
-    """Yield the plain learner and the one with the prior; the settings that both have are the cell's own."""
-    stem = f"{_slug(label)}-{_count(steps)}-{algorithm}"
-    for prior, suffix in (("none", ""), ("esp", "-ESP")):
-        config = _config(task, algorithm, steps, request, {**settings, "prior.kind": prior})
-        yield Cell(
-            name=f"{stem}-{'plain' if prior == 'none' else prior}",
-            panel=f"{label}, {_count(steps)}",
-            variant=f"{algorithm.upper()}{suffix}",
-            config=config,
-            reference=None if prior == "none" else f"{stem}-plain",
-            paper=(*place, str(steps), algorithm, prior) if _comparable(config, settings) else None,
-        )
+    """Yield each algorithm without the prior and with it, in the rows of the paper's table."""
+    teams = kind.teams or (Team(task, {}, ("table1", task)),)
+    for team, steps, algorithm in (
+        (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
+    ):
+        stem = f"{_slug(team.label)}-{_count(steps)}-{algorithm}"
+        for prior in variants:
+            settings = {**team.settings, **kind.variants[prior]}
+            config = _config(task, algorithm, steps, request, settings, kind.common)
+            yield Cell(
+                name=f"{stem}-{'plain' if prior == 'none' else prior}",
+                panel=f"{team.label}, {_count(steps)}",
+                variant=_paired_name(algorithm, prior),
+                config=config,
+                reference=None if prior == "none" else f"{stem}-plain",
+                paper=(*team.place, str(steps), algorithm, prior) if _comparable(config, team.settings) else None,
+            )
 
 
-def _ablation(kind: str, request: Request) -> Iterator[Cell]:
-    common, choices = ABLATIONS[kind]
-    first = next(iter(choices))
-    for task in _tasks(kind, request):
-        for algorithm in _algorithms(kind, request):
-            for steps in _steps(kind, task, request):
-                stem = f"{task}-{algorithm}-{_count(steps)}"
-                for label, choice in choices.items():
-                    config = _config(task, algorithm, steps, request, choice, common)
-                    key = None
-                    if kind == "ablate-coefficient" and _comparable(config, {}):
-                        coefficient = f"{choice['prior.consistency_coef']:g}"
-                        key = ("coefficient, read off figure 5c", task, str(steps), algorithm, coefficient)
-                    yield Cell(
-                        name=f"{stem}-{_slug(label)}",
-                        panel=f"{task}, {algorithm.upper()}, {_count(steps)}",
-                        variant=label,
-                        config=config,
-                        reference=None if label == first else f"{stem}-{_slug(first)}",
-                        paper=key if paper.reported(key) else None,
-                    )
+def _variants(
+    kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
+) -> Iterator[Cell]:
+    """Yield the variants of each algorithm, which are compared with the first of them."""
+    for algorithm, steps in ((a, s) for a in algorithms for s in _steps(kind, task, request)):
+        stem = f"{task}-{algorithm}-{_count(steps)}"
+        for variant in variants:
+            choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
+            config = _config(task, algorithm, steps, request, choice, kind.common)
+            fields = {"task": task, "steps": steps, "algorithm": algorithm, "value": variant.removeprefix("c = ")}
+            place = tuple(part.format(**fields) for part in kind.place)
+            yield Cell(
+                name=f"{stem}-{_slug(variant)}",
+                panel=f"{task}, {algorithm.upper()}, {_count(steps)}",
+                variant=variant,
+                config=config,
+                reference=None if variant == variants[0] else f"{stem}-{_slug(variants[0])}",
+                paper=place if paper.reported(place or None) and _comparable(config, {}) else None,
+            )
 
 
-KINDS: dict[str, tuple[Any, str, Any, frozenset[str]]] = {
-    "table1": (_table1, "Table 1 of the paper", "panels", frozenset({"prior.kind"})),
-    "agents": (
-        _agents,
-        "Cooperative navigation with 2, 3 and 4 agents, as in the paper's supplement",
-        "panels",
-        frozenset({"prior.kind", "task.num_agents", "task.num_landmarks"}),
-    ),
-    "ablate-transforms": (
-        _ablation,
-        "Number and type of transforms, augmentation alone (figures 5a and 5b)",
-        "variants",
-        frozenset({"prior.transforms", "prior.copies"}),
-    ),
-    "ablate-coefficient": (
-        _ablation,
-        "Coefficient of the consistency loss, loss alone (figure 5c)",
-        "variants",
-        frozenset({"prior.consistency_coef"}),
-    ),
-    "ablate-modules": (
-        _ablation,
-        "Consistency loss and augmentation, each alone and both (figure 6a)",
-        "variants",
-        frozenset({"prior.kind"}),
-    ),
-}
-"""Study -> its builder, its title, what the rows of its table are, and the settings that it varies by itself."""
-
-
-def _tasks(kind: str, request: Request) -> tuple[str, ...]:
-    return tuple(request.tasks or (paper.tasks() if kind == "table1" else ("navigation",)))
-
-
-def _algorithms(kind: str, request: Request) -> tuple[str, ...]:
-    return tuple(request.algorithms or (("maddpg",) if kind.startswith("ablate") else ORDER))
-
-
-def _steps(kind: str, task: str, request: Request) -> tuple[int, ...]:
+def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
     """Return the numbers of steps of a task.
 
     500k and 3M name the paper's two rows, which formation has at 200k and 1M; a number written for the task itself is
@@ -204,8 +122,7 @@ def _steps(kind: str, task: str, request: Request) -> tuple[int, ...]:
     """
     rows, names = paper.horizons(task), paper.horizons("navigation")
     if request.steps is None:
-        both = kind == "ablate-coefficient"  # figure 5c shows both rows
-        return (rows or names) if both else (rows or names)[:1]
+        return kind.steps or ((rows or names) if kind.all_rows else (rows or names)[:1])
     own = tuple(steps for name, steps in request.steps if name == task)
     if own:
         return own
@@ -213,16 +130,9 @@ def _steps(kind: str, task: str, request: Request) -> tuple[int, ...]:
     return tuple(row_of.get(steps, steps) for name, steps in request.steps if name is None)
 
 
-def _config(
-    task: str,
-    algorithm: str,
-    steps: int,
-    request: Request,
-    choice: Mapping[str, object],
-    common: Mapping[str, object] | None = None,
-) -> RunConfig:
+def _config(task: str, algorithm: str, steps: int, request: Request, choice: Settings, common: Settings) -> RunConfig:
     """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
-    settings = dict(common or {})
+    settings = dict(common)
     for name, value in request.overrides.items():
         section, _, rest = name.partition(".")
         if section == task:
@@ -234,7 +144,7 @@ def _config(
     return config.model_copy(update={"prior": config.prior.effective()})  # what trains the same is the same run
 
 
-def _comparable(config: RunConfig, settings: Mapping[str, object]) -> bool:
+def _comparable(config: RunConfig, settings: Settings) -> bool:
     """Return whether the task is the paper's, so that its numbers compare: nothing changed that decides the return."""
     own = {name.removeprefix("task."): value for name, value in settings.items()}
     if "actions" in config.task_settings:  # how the agents act is the algorithm's affair
@@ -242,8 +152,11 @@ def _comparable(config: RunConfig, settings: Mapping[str, object]) -> bool:
     return resolve_task_settings(config.task, own) == config.task_settings
 
 
-def _refuse_unused(request: Request, tasks: Sequence[str], algorithms: Sequence[str]) -> None:
-    """Refuse what would be passed over in silence."""
+def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algorithms: Sequence[str]) -> None:
+    """Refuse what would be ignored without a word."""
+    other = next((task for task in tasks if kind.only not in (None, task)), None)
+    if other is not None:
+        raise ValueError(f"this study is on {kind.only} alone, not on {other}; leave out --tasks")
     for name in request.overrides:
         section = name.partition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):
@@ -251,13 +164,18 @@ def _refuse_unused(request: Request, tasks: Sequence[str], algorithms: Sequence[
     for task, steps in request.steps or ():
         if task is not None and task not in tasks:
             raise ValueError(f"--steps {task}={steps} concerns no run of this study; its tasks are {', '.join(tasks)}")
-    unserved = [task for task in tasks if request.steps and not _steps("", task, request)]
+    unserved = [task for task in tasks if not _steps(kind, task, request)]
     if unserved:
         raise ValueError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
-    for given, kind in ((tasks, "task"), (algorithms, "algorithm")):
+    for given, noun in ((tasks, "task"), (algorithms, "algorithm")):
         twice = {name for name in given if given.count(name) > 1}
         if twice:
-            raise ValueError(f"the {kind} {twice.pop()} is named twice; name it once")
+            raise ValueError(f"the {noun} {twice.pop()} is named twice; name it once")
+
+
+def _paired_name(algorithm: str, prior: str) -> str:
+    """Return how the paper calls an algorithm without the prior and with it: "MADDPG", "MADDPG-ESP"."""
+    return algorithm.upper() + ("" if prior == "none" else "-ESP")
 
 
 def _slug(text: str) -> str:
@@ -271,17 +189,16 @@ def _count(steps: int) -> str:
     return format_count(steps) if float(f"{steps:.3g}") == steps else str(steps)
 
 
-def paper_cells(kind: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield panel, variant and place of every number that the paper's table of this kind has; none for ablations."""
-    labels = {"table1": [(task, task, ("table1", task)) for task in paper.tasks()]}
-    labels["agents"] = [
-        (f"N = {agents}", "navigation", ("table1", "navigation") if agents == 3 else ("agents", str(agents)))
-        for agents, landmarks in TEAMS
-        if landmarks is None
-    ]
-    for label, task, place in labels.get(kind, ()):
-        for steps in paper.horizons(task):
-            for algorithm in ORDER:
-                for prior, suffix in (("none", ""), ("esp", "-ESP")):
-                    key = (*place, str(steps), algorithm, prior)
-                    yield f"{label}, {_count(steps)}", f"{algorithm.upper()}{suffix}", key
+    kind = KINDS.get(name)
+    if kind is None or kind.rows == "variants":
+        return
+    for task in kind.tasks:
+        teams = [team for team in kind.teams if team.settings["task.num_landmarks"] is None]
+        for team in teams or (Team(task, {}, ("table1", task)),):
+            for steps in paper.horizons(task):
+                for algorithm in kind.algorithms:
+                    for prior in kind.variants:
+                        key = (*team.place, str(steps), algorithm, prior)
+                        yield f"{team.label}, {_count(steps)}", _paired_name(algorithm, prior), key

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from esp_cli.studies.cost import probe
 from esp_cli.studies.scheduler import Run, Status, makespan
@@ -47,6 +46,10 @@ class Forecast:
         title: of the study.
         out: its folder.
         jobs: runs side by side.
+        seconds: until the last run ends, where `jobs` run side by side and nothing else does.
+        core_seconds: of all runs added up.
+        disk_bytes: of the folder when all is done.
+        disk_peak_bytes: of the folder at most, where the `jobs` runs that need most on the way end together.
         runs: in the order in which they are begun.
     """
 
@@ -54,33 +57,11 @@ class Forecast:
     title: str
     out: Path
     jobs: int
+    seconds: float
+    core_seconds: float
+    disk_bytes: int
+    disk_peak_bytes: int
     runs: tuple[RunForecast, ...]
-
-    @property
-    def seconds(self) -> float:
-        """Seconds until the last run ends, where `jobs` run side by side and nothing else does."""
-        return makespan([], [run.seconds_left for run in self.runs if run.status != "finished"], self.jobs)
-
-    @property
-    def core_seconds(self) -> float:
-        """Seconds of all runs added up."""
-        return sum(run.seconds_left for run in self.runs)
-
-    @property
-    def disk_bytes(self) -> int:
-        """Bytes of the folder when all is done."""
-        return sum(run.disk_bytes for run in self.runs)
-
-    @property
-    def disk_peak_bytes(self) -> int:
-        """Bytes of the folder at most, where the `jobs` runs that need most on the way come together at the end."""
-        extra = sorted((run.peak_bytes - run.disk_bytes for run in self.runs), reverse=True)
-        return self.disk_bytes + sum(extra[: self.jobs])
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all of it, the sums too, as what `console.write_json` takes."""
-        names = ("kind", "title", "out", "jobs", "seconds", "core_seconds", "disk_bytes", "disk_peak_bytes", "runs")
-        return {name: getattr(self, name) for name in names}
 
 
 def forecast(
@@ -101,7 +82,19 @@ def forecast(
         twin = folder.run_path(cell) if run.status == "finished" else folder.find_twin(cell, others)
         found.append(_finished(run, twin) if twin is not None else _measured(run, study.episodes))
         listener(len(found))
-    return Forecast(study.kind, study.title, folder.path, jobs, tuple(found))
+    disk = sum(run.disk_bytes for run in found)
+    extra = sorted((run.peak_bytes - run.disk_bytes for run in found), reverse=True)
+    return Forecast(
+        kind=study.kind,
+        title=study.title,
+        out=folder.path,
+        jobs=jobs,
+        seconds=makespan([], [run.seconds_left for run in found if run.status != "finished"], jobs),
+        core_seconds=sum(run.seconds_left for run in found),
+        disk_bytes=disk,
+        disk_peak_bytes=disk + sum(extra[:jobs]),
+        runs=tuple(found),
+    )
 
 
 def _finished(run: Run, path: Path) -> RunForecast:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
@@ -16,6 +17,9 @@ from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class
+
+_SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
+_OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
 
 
 class EvaluationConfig(BaseModel):
@@ -43,6 +47,35 @@ class RunConfig(BaseModel):
     prior: PriorConfig = PriorConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     device: Literal["cpu", "cuda"] = "cpu"
+
+    def command(self) -> str:
+        """Return the `esp train` command line that resolves to this configuration, quoted for a shell.
+
+        What is the default of the command, or of the preset, is left out.
+        """
+        plain = resolve_config(self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device)
+        known, own = plain.model_dump(mode="json"), self.model_dump(mode="json")
+        words = ["esp", "train", "--task", self.task, "--algo", self.algorithm]
+        words += ["--preset", self.preset] if self.preset != "default" else []
+        words += ["--seeds", seeds_text(self.seeds), "--steps", str(self.steps)]
+        words += ["--device", self.device] if self.device != "cpu" else []
+        for section, key in ({self.algorithm: "algorithm_settings"} | _SECTIONS).items():
+            for name, value in own[key].items():
+                if known[key].get(name, ...) != value:
+                    words += _assignment(f"{section}.{name}", value)
+        return shlex.join(words)
+
+
+def seeds_text(seeds: Sequence[int]) -> str:
+    """Return seeds as `--seeds` reads them: (0, 1, 2) -> "3", (3, 7) -> "3,7,"."""
+    counted = tuple(seeds) == tuple(range(len(seeds)))
+    return str(len(seeds)) if counted else ",".join(map(str, seeds)) + ","
+
+
+def _assignment(name: str, value: object) -> list[str]:
+    """Return the words that set one setting; a text stands as it is unless it would be read as JSON."""
+    text = value if isinstance(value, str) and _read(value) == value else json.dumps(value, separators=(",", ":"))
+    return [_OPTIONS[name], text] if name in _OPTIONS else ["--set", f"{name}={text}"]
 
 
 def resolve_config(

@@ -7,10 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.reporting.homomorphic import CONTESTANTS, flops_per_action, plan
+from esp_cli.evaluation.network_cost import flops_per_action
+from esp_cli.studies.catalogue import Request, plan
+from esp_cli.studies.kinds import KINDS
+from esp_cli.studies.paper import reported
 from esp_cli.training.config import resolve_config
 from tests.cli.running import esp, refused
 
+METHODS = KINDS["homomorphic"].variants
 TINY = {
     "mappo.num_envs": 4,
     "mappo.num_steps": 8,
@@ -23,37 +27,47 @@ TINY = {
 OPTIONS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
 
 
-def test_all_contestants_are_trained_and_compared(tmp_path: Path) -> None:
-    out = tmp_path / "study"
-    command = ("compare-homomorphic", "--steps", 64, "--seeds", 2, "--grid", 3, "--drones", 2, "--out", out, *OPTIONS)
-    table = esp(*command).stdout
-    result = json.loads((out / "comparison.json").read_text())
-    assert [run["label"] for run in result["runs"]] == list(CONTESTANTS)
-    for run in result["runs"]:
-        assert run["label"] in table
-        assert len(run["returns"]["64"]["per_seed"]) == 2
-        assert min(run["flops_per_action"], run["parameters"]["policy"], run["parameters"]["critic"]) > 0
-        assert run["config"]["task_settings"]["num_agents"] == 2
-    assert result["runs"][1]["returns"]["64"]["difference"]["paired"]
-    assert [run["paper"] for run in result["runs"]] == [2.1, 2.4, 2.25, None]
-    assert (out / "curves.png").stat().st_size > 1000
-    metrics = (out / "empn" / "metrics.jsonl").read_bytes()
+def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> None:
+    out, file = tmp_path / "study", tmp_path / "results.json"
+    board = ("--grid", 3, "--drones", 2)
+    command = ("compare-homomorphic", "--steps", 64, "--seeds", 2, *board, "--out", out, *OPTIONS, "--jobs", 2)
+    first = esp(*command, "--json", file)
+    assert "4 runs, 0 of them finished, 2 side by side" in first.stderr
+    result = json.loads(file.read_text())
+    assert (result["kind"], result["mode"]) == ("homomorphic", "stochastic")
+    assert [cell["variant"] for cell in result["cells"]] == list(METHODS)
+    for cell in result["cells"]:
+        assert cell["variant"] in first.stdout
+        assert len(cell["returns"]["stochastic"]) == 2
+        assert min(cell["flops_per_action"], cell["parameters"]["policy"], cell["parameters"]["critic"]) > 0
+        assert [passed["threshold"] for passed in cell["steps_to"]] == [2.0]
+        assert {**result["config"], **cell["config"]}["task_settings.num_agents"] == 2
+    assert "FLOPs an action" in first.stdout
+    metrics = (out / "runs" / "wildlife-mappo-64-empn" / "metrics.jsonl").read_bytes()
     again = esp(*command)
-    assert table.endswith(again.stdout), "the second time, nothing but the last table: nothing is trained"
-    assert "is complete" in again.stderr
-    assert (out / "empn" / "metrics.jsonl").read_bytes() == metrics
-    message = refused(*command, "--group", "d4")
-    assert "holds a run of other settings" in message
+    assert again.stdout == first.stdout
+    assert "4 of them finished" in again.stderr
+    assert (out / "runs" / "wildlife-mappo-64-empn" / "metrics.jsonl").read_bytes() == metrics
+    assert "wildlife-mappo-64-mpn-esp differs" in refused(*command, "--group", "d4")
+    fewer = ("compare-homomorphic", "--methods", "empn,mpn", "--steps", 64, "--seeds", 2, *board, *OPTIONS)
+    reused = (*fewer, "--out", tmp_path / "copied", "--reuse", out)
+    assert "0 runs to do" in esp(*reused, "--dry-run").stdout
+    assert not (tmp_path / "copied").exists()
+    assert esp(*reused).stderr.count("taking over") == 2
+    report = esp("report", out)
+    assert "stochastic return" in report.stdout, "what this kind of study reports"
+    assert (out / "report" / "report.html").exists()
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--contestants", "mpn,cnn"], "name each contestant once; they are mpn, mpn-esp, empn, mpn-ensemble"),
-        (["--contestants", "mpn,mpn"], "name each contestant once"),
+        (["--methods", "mpn,cnn"], "name each variant of this study once; they are mpn, mpn-esp, empn, mpn-ensemble"),
+        (["--contestants", "mpn,mpn"], "name each variant of this study once"),
         (["--grid", "6"], "use odd numbers"),
         (["--group", "so2"], "so2 cannot act on wildlife"),
-        (["--set", "network.name=mlp"], "is what tells the contestants apart"),
+        (["--set", "network.name=mlp"], "is what this study varies by itself"),
+        (["--tasks", "navigation"], "this study is on wildlife alone"),
     ],
 )
 def test_what_cannot_be_compared_is_refused(tmp_path: Path, options, message) -> None:
@@ -61,8 +75,9 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, options, message) ->
     assert not (tmp_path / "study").exists()
 
 
-def test_contestants_differ_in_network_and_prior_alone() -> None:
-    configs = plan(list(CONTESTANTS), 100, (0, 1), 3, 7, "c4", {})
+def test_methods_differ_in_network_and_prior_alone() -> None:
+    study = plan("homomorphic", Request(steps=((None, 100),), seeds=(0, 1)))
+    configs = {cell.variant: cell.config for cell in study.cells}
     rest = {config.model_copy(update={"network": None, "prior": None}).model_dump_json() for config in configs.values()}
     assert len(rest) == 1
     assert configs["mpn-esp"].prior.kind == "esp"
@@ -73,6 +88,11 @@ def test_contestants_differ_in_network_and_prior_alone() -> None:
         "mpn-ensemble": "mpn",
     }
     assert configs["mpn-ensemble"].network.symmetrise == "c4"
+    paper = [reported(cell.paper) for cell in study.cells]
+    assert [number and number.mean for number in paper] == [2.1, 2.4, 2.25, None]
+    turned = plan("homomorphic", Request(variants=("empn", "mpn-esp"), group="d4"))
+    assert [cell.reference for cell in turned.cells] == [None, "wildlife-mappo-200k-empn"]
+    assert (turned.cells[0].config.network.group, turned.cells[1].config.prior.transforms) == ("d4", "d4")
 
 
 def test_flops_by_hand() -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
+from esp_cli.evaluation.statistics import mean_and_sem
+from esp_cli.formatting import format_mean
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 
@@ -42,17 +45,15 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
         "-0.5": {"mean": None, "per_seed": [None, None]},
     }
     table = [cells(line) for line in told.stdout.splitlines() if line.startswith("│")]
-    assert [row[:3] for row in table[:4]] == [
-        ["plain", "100", "2"],
-        ["plain", "150", "2"],
-        ["ESP", "100", "2"],
-        ["ESP", "150", "2"],
-    ]
-    assert [row[5] for row in table[:2]] == ["", ""]
-    assert table[3][5] == f"{second['returns']['150']['difference']['mean']:+.2f}"
-    assert table[4:] == [
-        [label, limit, at] for label in ("plain", "ESP") for limit, at in (("-1000.0", "0"), ("-0.5", "-"))
-    ]
+    panels = ["navigation, 100", "navigation, 150"]
+    compared = [row for row in table if row[0] in panels and row[2] == "150"]
+    assert [row[:2] for row in compared] == [[panel, label] for panel in panels for label in ("plain", "ESP")]
+    assert [row[5] for row in compared[::2]] == ["", ""]
+    assert compared[3][5].startswith(f"{second['returns']['150']['difference']['mean']:+.2f} [")
+    assert [row[6] for row in compared[1::2]] == ["-", "-"], "two seeds do not rank"
+    assert [run["step"] for run in result["runs"]] == [150, 150]
+    passed = [row[5] for row in table if row[0] in panels and row not in compared]
+    assert passed == ["-1000.00: 0; -0.50: -"] * 4
     assert result["convention"] in told.stdout
     with Image.open(picture) as image:
         assert image.format == "PNG"
@@ -67,16 +68,48 @@ def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_
     short = train_tiny(tmp_path / "short", "--seeds", "3,7", steps=100)
     result = json.loads(esp("report", finished, short, plain, "--json", "-").stdout)
     assert [list(run["returns"]) for run in result["runs"]] == [["100"]] * 3
+    assert [run["step"] for run in result["runs"]] == [150, 100, 150]
+
+
+def test_page_markdown_results_and_terminal_compare_at_the_same_step(
+    finished: Path, plain: Path, tmp_path: Path
+) -> None:
+    short = train_tiny(tmp_path / "a b", "--seeds", "3,7", "--prior", "none", steps=100)
+    out, small = tmp_path / "the page", tmp_path / "results.json"
+    told = esp("report", f"short={short}", f"ESP={finished}", "--out", out, "--results", small)
+    page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
+    cell = json.loads(small.read_text())["cells"][1]
+    assert (cell["step"], cell["at"], cell["panel"]) == (150, 100, "navigation, 100")
+    shown = format_mean(*mean_and_sem(cell["returns"]["greedy"]))
+    longer = json.loads(esp("report", finished, "--json", "-").stdout)["runs"][0]["returns"]["150"]
+    assert shown != format_mean(longer["mean"], longer["sem"])
+    for text in (told.stdout, page, markdown):
+        assert shown in text
+        assert "navigation, 100" in text
+    assert f"| navigation, 100 | ESP | 150 | {shown} |" in markdown
+    command = shlex.join(["esp", "report", f"short={short}", f"ESP={finished}", "--out", str(out)])
+    assert f"```sh\n{command}\n```" in markdown
+    assert "'" in command, "a path with a space is quoted"
+    at = esp("report", f"short={short}", f"ESP={finished}", "--at", "50", "--mode", "stochastic", "--out", out)
+    assert "navigation, 50" in at.stdout
+    assert "--at 50 --mode stochastic --out " in (out / "report.md").read_text()
+
+
+def test_two_runs_of_one_label_are_refused(finished: Path, tmp_path: Path) -> None:
+    assert "two runs are called 'a'; give each a label of its own" in refused(
+        "report", f"a={finished}", f"a={finished}", "--out", tmp_path / "page"
+    )
+    assert not (tmp_path / "page").exists()
 
 
 def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Path) -> None:
     one = train_tiny(tmp_path / "one", "--seeds", "3,", steps=50)
     told = esp("report", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
-    rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│")]
-    assert rows[0][2] == "1"
+    rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│ navigation, ")]
+    assert rows[0][:3] == ["navigation, 50", "one", "50"]
     assert "±" not in rows[0][3]
     assert rows[0][4] == "-"
-    assert rows[1] == ["one", "9k", "0", "-", "-", "-", "-"]
+    assert rows[2] == ["navigation, 9k", "one", "50", "at 50", "-", "-", "-", "-"]
     first, second = json.loads((tmp_path / "report.json").read_text())["runs"]
     assert (first["returns"]["50"]["sem"], first["returns"]["50"]["ci95"], first["returns"]["9000"]) == (
         None,

@@ -14,7 +14,7 @@ import pytest
 from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
 from esp_cli.deploy import manifest
 from esp_cli.deploy.bundled import find, load_entry, open_policy
-from esp_cli.deploy.bundling import best_seed, bundle, command_of, play_greedily, score_of
+from esp_cli.deploy.bundling import best_seed, bundle, play_greedily, score_of
 from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled
 from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import RunConfig, resolve_config
@@ -64,7 +64,7 @@ def test_the_command_of_a_manifest_resolves_to_its_configuration(entry: Entry) -
         overrides,
     )
     assert resolved == config
-    assert command_of(config) == entry.command
+    assert config.command() == entry.command
     assert entry.seed in config.seeds
     assert len(config.seeds) == entry.chosen_from
 

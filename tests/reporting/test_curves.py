@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from esp_cli.reporting.curves import RunCurve, compare, plot, read_curve
+from esp_cli.reporting.curves import RunCurve, read_curve
+from esp_cli.reporting.loose import comparison, plot, put_together
+from esp_cli.reporting.tables import TABLES
 from esp_cli.training.run_folder import RunFolder
 from tests.training.runs import tiny_config, tiny_folder
 
@@ -24,6 +26,17 @@ ESP = [[-9.0, -8.0, -10.0], [-5.0, -4.0, -6.0], [-3.0, -1.0, -5.0], [-1.0, -2.0,
 
 def curve(values, label="run", steps=STEPS, seeds=SEEDS, **choice) -> RunCurve:
     return RunCurve(label, tiny_config(seeds=seeds, **choice), np.array(steps), np.array(values, dtype=float), 12.5)
+
+
+def gathered(curves, at=(), thresholds=()):
+    """What a report of these runs is made from."""
+    return put_together(curves, [Path(c.label) for c in curves], "esp report", "greedy", at, thresholds)
+
+
+def compare(curves, at, thresholds) -> dict:
+    """The document that `esp report RUN... --json` writes."""
+    named = [c if c.label != "run" else replace(c, label=f"run {k}") for k, c in enumerate(curves)]
+    return comparison(gathered(named, at, thresholds), thresholds).document()
 
 
 def written(folder: Path, rows: list[dict], **choice) -> RunFolder:
@@ -66,7 +79,7 @@ def test_a_run_without_an_evaluation_or_with_other_seeds_is_refused(tmp_path):
 def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there():
     one = curve([[-9.0], [-7.0], [-5.0]], steps=(0, 800, 1600), seeds=(0,))
     assert one.config.evaluation.every_steps == 100
-    assert [one.at(step).tolist() for step in (0, 399, 401, 1100, 1600, 1700)] == [
+    assert [one.until(step).values[-1].tolist() for step in (0, 399, 401, 1100, 1600, 1700)] == [
         [-9.0],
         [-9.0],
         [-7.0],
@@ -74,7 +87,7 @@ def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there(
         [-5.0],
         [-5.0],
     ]
-    assert one.at(1701) is None, "more than an evaluation interval past the end"
+    assert one.until(1701) is None, "more than an evaluation interval past the end"
 
 
 def test_the_fewest_episodes_of_all_runs_are_stated():
@@ -91,7 +104,11 @@ def test_returns_differences_thresholds_and_areas_by_hand():
     assert (plain["label"], plain["seeds"], plain["seconds"]) == ("plain", [0, 1, 2], 12.5)
     # -6 -7 -8: mean -7, deviations 1 0 -1, variance 1, s.e.m. 1 / sqrt(3)
     at = plain["returns"]["100"]
-    assert (at["mean"], at["sem"], at["per_seed"]) == (-7.0, pytest.approx(1 / math.sqrt(3)), [-6.0, -7.0, -8.0])
+    assert (at["mean"], at["sem"], at["per_seed"]) == (
+        -7.0,
+        pytest.approx(1 / math.sqrt(3), abs=1e-4),
+        [-6.0, -7.0, -8.0],
+    )
     assert -8.0 <= at["ci95"][0] < -7.0 < at["ci95"][1] <= -6.0
     assert plain["returns"]["210"]["mean"] == -5.0
     # -5 -4 -6 less -6 -7 -8, seed by seed: 1 3 2
@@ -110,8 +127,8 @@ def test_returns_differences_thresholds_and_areas_by_hand():
     }
     assert esp["steps_to"]["-5.0"] == {"mean": 100, "per_seed": [100, 100, 200]}
     assert esp["steps_to"]["-2.0"] == {"mean": 300, "per_seed": [300, 200, None]}
-    # trapezoids of seed 0: (-9 - 6) / 2, (-6 - 4) / 2, (-4 - 3) / 2, over three intervals: -16 / 3
-    assert plain["area_under_curve"]["per_seed"][0] == pytest.approx(-16 / 3)
+    # seed 0 up to the last step compared: trapezoids (-9 - 6) / 2 and (-6 - 4) / 2, over two intervals
+    assert plain["area_under_curve"]["per_seed"][0] == pytest.approx(-6.25)
     assert json.loads(json.dumps(result, allow_nan=False))["runs"][1]["label"] == "ESP"
 
 
@@ -181,8 +198,37 @@ def test_a_run_of_a_gpu_is_compared_where_there_is_none():
 
 def test_the_picture_shows_the_curves_and_somebody_elses_number(tmp_path):
     curves = [curve(PLAIN, "plain"), curve(ESP, "ESP")]
-    png, svg = plot(curves, tmp_path / "curves.png", "by hand", "greedy", {"the paper": -2.5})
+    png, svg = plot(gathered(curves, [100, 200]), tmp_path / "curves.png", {"the paper": -2.5})
     with Image.open(png) as image:
         assert image.format == "PNG"
     text = svg.read_text()
-    assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (by hand)", "navigation"))
+    assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (esp: team sum", "navigation"))
+    assert text.count("<!-- plain") == 1, "one curve, whatever the number of steps"
+
+
+def test_two_runs_of_one_label_are_refused():
+    with pytest.raises(ValueError, match=r"two runs are called 'run'; give each a label of its own, as in plain=run"):
+        gathered([curve(PLAIN), curve(ESP)])
+
+
+def test_every_table_compares_at_the_last_step_that_all_runs_reached_and_says_where_each_stands():
+    material = gathered([curve(PLAIN, "plain"), curve(ESP[:3], "ESP", steps=STEPS[:3])])
+    table = TABLES["comparison"](material.results)
+    rows = [dict(zip(table.headings, row, strict=True)) for row in table.rows]
+    assert [row["panel"] for row in rows] == ["navigation, 200"] * 2
+    assert [row["trained to>"] for row in rows] == ["300", "200"]
+    # plain at 200, not at 300: -4 -6 -5
+    assert [row["return>"] for row in rows] == ["-5.00 ± 0.58", "-3.00 ± 1.15"]
+    assert rows[1]["minus reference>"].startswith("+2.00 [")
+    # mean height over the same 200 steps: means -9 -7 -5 and -9 -5 -3
+    areas = dict(row[1::5] for row in TABLES["statistics"](material.results).rows)
+    assert {name: text.split(" ± ")[0] for name, text in areas.items()} == {"plain": "-7.00", "ESP": "-5.50"}
+
+
+def test_each_step_asked_for_is_a_panel_and_a_run_that_did_not_get_there_says_where_it_is():
+    material = gathered([curve(PLAIN, "plain"), curve(ESP[:2], "ESP", steps=STEPS[:2])], at=[100, 300])
+    assert TABLES["returns"](material.results).rows == (
+        ("plain", "-7.00 ± 0.58", "-4.00 ± 0.58"),
+        ("ESP", "-5.00 ± 0.58", "at 100"),
+    )
+    assert [cell.status for cell in material.results.cells] == ["finished"] * 3 + ["unfinished"]

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+from esp_cli.reporting.collect import collect
 from esp_cli.reporting.pages import files_of, filled
-from esp_cli.reporting.results import collect
 from tests.studies.small_studies import small_study, write_study
 
 BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
@@ -16,7 +16,7 @@ BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
 @pytest.fixture
 def page(tmp_path):
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
-    found = collect(write_study(tmp_path / "s", small_study(), ends))
+    found = collect(write_study(tmp_path / "s", small_study(), ends)).results.document()
     (tmp_path / "measured").mkdir()
     (tmp_path / "measured" / "a.json").write_text(json.dumps(found))
     page = tmp_path / "page.md"
@@ -66,7 +66,7 @@ def test_a_table_or_file_that_is_not_there_is_told(page, old, new, sentence):
 def longer(page, seeds=(0, 1), **change):
     """Write the results of a second study, of more steps and fewer seeds, beside those of the page."""
     study = small_study(steps=((None, 400),), seeds=seeds)
-    found = collect(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})) | change
+    found = collect(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})).results.document() | change
     (page.parent / "measured" / "b.json").write_text(json.dumps(found))
     page.write_text("<!-- results: measured/a.json measured/b.json returns -->\n<!-- end of results -->\n")
 

@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from esp_cli.drawing.films import write_gif
-from esp_cli.reporting.page import Material, write_report
-from esp_cli.reporting.results import collect, read_curve_of
+from esp_cli.reporting.collect import Material, collect
+from esp_cli.reporting.page import write_report
+from esp_cli.reporting.tables import Table, markdown_text
 from tests.studies.small_studies import small_study, write_study
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -36,9 +37,7 @@ document.body.dataset.left = document.querySelector(".tip").hidden;
 def material(path: Path, command: str = "esp reproduce table1") -> Material:
     study = small_study(command=command)
     folder = write_study(path / "s", study, {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]})
-    cells = folder.study.cells
-    curves = {cell.name: read_curve_of(folder.run_path(cell), cell, "greedy") for cell in cells}
-    return Material(folder.study, collect(folder), curves, {cell.name: folder.run_path(cell) for cell in cells})
+    return collect(folder)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +82,7 @@ def test_tables_commands_configuration_and_films_are_on_the_page(page):
         "-150.00 ± 5.77",
         "navigation, 200",
         "MAPPO-ESP",
-        "--set",
+        "--prior none",
         "&#34;num_agents&#34;: 3",
         "data:image/gif",
     ):
@@ -97,6 +96,16 @@ def test_a_study_that_has_not_begun_has_no_report(tmp_path):
     made = material(tmp_path)
     with pytest.raises(ValueError, match="no run of this study has an evaluation yet"):
         write_report(Material(made.study, made.results, {}, {}), tmp_path / "out")
+
+
+def test_a_hostile_label_stays_text_in_markdown(tmp_path):
+    assert markdown_text("a|b <i>*c*</i> `d` [e](f)\ng") == r"a\|b \<i>\*c\*\</i> \`d\` [e\](f) g"
+    table = Table("t", ("a|b",), (("c|d",),), "e|f").markdown()
+    assert table == "| a\\|b |\n| --- |\n| c\\|d |\n\ne\\|f"
+    made = material(tmp_path, "esp report '```\n# heading'")
+    write_report(made, tmp_path / "out")
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert "````sh\nesp report '```\n# heading'\n````" in text
 
 
 def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProcess[str]:

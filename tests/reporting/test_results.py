@@ -8,7 +8,9 @@ import math
 import pytest
 
 from esp_cli.evaluation.statistics import average_improvement, leader
-from esp_cli.reporting.results import aggregates, collect, read_results, verdict
+from esp_cli.reporting.collect import collect
+from esp_cli.reporting.results import Passing, read_results
+from esp_cli.reporting.summary import aggregates, summarise_cell
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import StudyFolder
@@ -25,54 +27,62 @@ def column(results, name, heading):
 
 @pytest.fixture
 def results(tmp_path):
-    return collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    return collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
 
 
 def test_a_cell_by_hand(results):
-    plain, esp = (verdict(results, entry) for entry in results["cells"])
+    plain, esp = (summarise_cell(results, cell) for cell in results.cells)
     # -150 -160 -140: mean -150, s.e.m. 10 / sqrt(3); anchors -200 and -100 put -150 half way
-    assert (plain["mean"], plain["sem"]) == (-150.0, pytest.approx(10 / math.sqrt(3)))
-    assert plain["normalised"]["mean"] == pytest.approx(0.5)
-    assert (plain["ahead"], "difference" in plain) == (None, False)
+    assert (plain.returns.mean, plain.returns.sem) == (-150.0, pytest.approx(10 / math.sqrt(3)))
+    assert plain.normalised.mean == pytest.approx(0.5)
+    assert plain.gap is None
     # seed by seed +20 +40 0: mean 20; two wins and a tie of three
-    assert esp["difference"] == {"mean": 20.0, "ci95": (0.0, 40.0), "paired": True}
-    assert esp["probability_of_improvement"] == pytest.approx(2.5 / 3)
-    assert esp["ahead"] == "level", "the interval begins at 0"
+    assert (esp.gap.difference.value, esp.gap.difference.ci95, esp.gap.paired) == (20.0, (0.0, 40.0), True)
+    assert esp.gap.probability.value == pytest.approx(2.5 / 3)
+    assert esp.gap.ahead == "level", "the interval begins at 0"
     # three seeds: none is a quarter, so the middle half is all of them
-    assert plain["iqm"]["value"] == pytest.approx(-150.0)
+    assert plain.iqm.value == pytest.approx(-150.0)
     # evaluations at 0, 100, 200 are -40, -20, 0 from the end: mean height -20
-    assert plain["area"]["mean"] == pytest.approx(-170.0)
+    assert plain.area.mean == pytest.approx(-170.0)
 
 
 def test_steps_to_where_the_reference_ended(results):
-    plain, esp = results["cells"]
+    plain, esp = results.cells
     # plain's mean curve: -190 -170 -150; that with the prior: -170 -150 -130
-    assert plain["steps_to"] == [{"threshold": -150.0, "of_mean": 200, "per_seed": [200, None, 200]}]
-    assert esp["steps_to"] == [{"threshold": -150.0, "of_mean": 100, "per_seed": [100, 100, 200]}]
+    assert plain.steps_to == (Passing(threshold=-150.0, of_mean=200, per_seed=(200, None, 200)),)
+    assert esp.steps_to == (Passing(threshold=-150.0, of_mean=100, per_seed=(100, 100, 200)),)
     assert column(results, "statistics", "steps to>") == ["-150.00: 200", "-150.00: 100"]
+
+
+@pytest.mark.parametrize(("seeds", "shown"), [((0, 1), "-"), ((0, 1, 2), "1.00")])
+def test_a_probability_of_improvement_needs_three_shared_seeds(tmp_path, seeds, shown):
+    ends = {"MAPPO": PLAIN[: len(seeds)], "MAPPO-ESP": [x + 1.0 for x in PLAIN[: len(seeds)]]}
+    found = collect(write_study(tmp_path / "s", small_study(seeds=seeds), ends)).results
+    assert column(found, "comparison", "P(improvement)>") == ["", shown]
+    assert column(found, "comparison", "minus reference>")[1].startswith("+1.00")
 
 
 def test_other_thresholds_can_be_asked_for(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
-    plain = collect(folder, thresholds=[-180.0, 0.0])["cells"][0]
-    assert [(passed["threshold"], passed["of_mean"]) for passed in plain["steps_to"]] == [(-180.0, 100), (0.0, None)]
+    plain = collect(folder, thresholds=[-180.0, 0.0]).results.cells[0]
+    assert [(passed.threshold, passed.of_mean) for passed in plain.steps_to] == [(-180.0, 100), (0.0, None)]
 
 
 def test_ahead_and_behind_are_on_either_side_of_0(tmp_path):
     better = {"MAPPO": PLAIN, "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN)]}
     worse = {"MAPPO": PLAIN, "MAPPO-ESP": [x - 5 - k for k, x in enumerate(PLAIN)]}
     for name, ends, side, word in (("b", better, "ahead", "yes"), ("w", worse, "behind", "no")):
-        found = collect(write_study(tmp_path / name, small_study(), ends))
-        assert verdict(found, found["cells"][1])["ahead"] == side
+        found = collect(write_study(tmp_path / name, small_study(), ends)).results
+        assert summarise_cell(found, found.cells[1]).gap.ahead == side
         assert column(found, "comparison", "ahead of reference") == ["", word]
 
 
 def test_the_paper_stands_beside_a_cell_and_is_compared_by_the_errors_of_both(tmp_path):
     ends = {"MAPPO": [-133.0, -132.0, -131.0], "MAPPO-ESP": [-100.0, -101.0, -102.0]}
-    found = collect(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends))
+    found = collect(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends)).results
     assert column(found, "comparison", "paper>") == ["-132.65 ± 2.89", "-122.25 ± 1.62"]
     assert column(found, "comparison", "ours or paper ahead") == ["not told apart", "ours"]
-    assert found["cells"][0]["paper"] == [-132.65, 2.89]
+    assert found.cells[0].paper == (-132.65, 2.89)
 
 
 def test_who_leads_by_welch():
@@ -87,25 +97,30 @@ def test_who_leads_by_welch():
 
 def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     study = small_study(tasks=("navigation", "predator-prey"))
-    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     over = aggregates(found)
     assert list(over) == ["MAPPO", "MAPPO-ESP"]
-    assert over["MAPPO"]["mean"].value == pytest.approx(0.5)
+    assert over["MAPPO"].mean.value == pytest.approx(0.5)
     # 0.7 0.8 0.6 twice; a quarter of six is one at either end: 0.6 0.7 0.7 0.8
-    assert over["MAPPO-ESP"]["iqm"].value == pytest.approx(0.7)
-    assert over["MAPPO-ESP"]["improvement"].value == pytest.approx(2.5 / 3)
-    assert "improvement" not in over["MAPPO"]
-    one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    assert over["MAPPO-ESP"].iqm.value == pytest.approx(0.7)
+    assert over["MAPPO-ESP"].improvement.value == pytest.approx(2.5 / 3)
+    assert over["MAPPO"].improvement is None
+    one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     assert aggregates(one) == {}
     assert TABLES["aggregates"](one) is None
 
 
 def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
     ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
-    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends))
-    for cell in found["cells"][2:]:
-        cell["seeds"], cell["returns"] = cell["seeds"][:2], {"greedy": cell["returns"]["greedy"][:2]}
-    assert set(aggregates(found)["MAPPO-ESP"]) == {"iqm", "mean"}
+    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
+    assert aggregates(found)["MAPPO-ESP"].improvement is not None
+    fewer = [
+        cell.model_copy(update={"seeds": cell.seeds[:2], "returns": {"greedy": cell.returns["greedy"][:2]}})
+        for cell in found.cells[2:]
+    ]
+    found = found.model_copy(update={"cells": (*found.cells[:2], *fewer)})
+    assert aggregates(found)["MAPPO-ESP"].improvement is None
+    assert aggregates(found)["MAPPO-ESP"].mean.value == pytest.approx((0.7 * 3 + 0.75 * 2) / 5)
 
 
 def test_the_mean_probability_of_improvement_by_hand():
@@ -118,28 +133,30 @@ def test_the_mean_probability_of_improvement_by_hand():
 
 
 def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
-    found = collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": [-130.0, None, -140.0]}))
-    esp = verdict(found, found["cells"][1])
-    assert (esp["mean"], esp["per_seed"], "difference" in esp) == (-135.0, [-130.0, None, -140.0], False)
+    found = collect(
+        write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": [-130.0, None, -140.0]})
+    ).results
+    esp = summarise_cell(found, found.cells[1])
+    assert (esp.returns.mean, esp.returns.per_seed, esp.gap) == (-135.0, (-130.0, None, -140.0), None)
     assert column(found, "statistics", "seeds>") == ["3", "2"]
-    gone = collect(write_study(tmp_path / "t", small_study(), {"MAPPO": [None] * 3}))
+    gone = collect(write_study(tmp_path / "t", small_study(), {"MAPPO": [None] * 3})).results
     assert column(gone, "comparison", "return>")[0] == "every seed stopped"
 
 
 def test_what_is_unfinished_or_not_run_is_said(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
     folder.evaluation_path(folder.study.cells[0]).unlink()
-    found = collect(folder)
-    assert [cell["status"] for cell in found["cells"]] == ["unfinished", "not run"]
+    found = collect(folder).results
+    assert [cell.status for cell in found.cells] == ["unfinished", "not run"]
     assert column(found, "comparison", "return>") == ["at 200", "not run"]
     assert TABLES["statistics"](found).rows == ()
-    fresh = collect(StudyFolder.create(tmp_path / "fresh", small_study()))
+    fresh = collect(StudyFolder.create(tmp_path / "fresh", small_study())).results
     assert next(table.title for table in all_tables(fresh)) == "Table 1 of the paper"
 
 
 def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
     study = small_study(steps=((None, 500_000),))
-    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP}))
+    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     short, whole = returns_table(found), returns_table(found, whole=True)
     assert short.rows == (
         ("navigation, 500k", "ours", "-150.00 ± 5.77", "-130.00 ± 5.77"),
@@ -155,23 +172,47 @@ def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
 
 def test_a_results_file_holds_configuration_version_and_every_seed(results, tmp_path):
     file = tmp_path / "results.json"
-    file.write_text(json.dumps(results))
+    file.write_text(json.dumps(results.document()))
     again = read_results(file)
-    assert again == json.loads(json.dumps(results))
-    assert again["config"]["task"] == "navigation"
-    assert [cell["config"]["prior.kind"] for cell in again["cells"]] == ["none", "esp"]
-    assert {cell["esp_version"] for cell in again["cells"]} == {"0.0.1"}
-    assert again["cells"][1]["returns"]["greedy"] == ESP
+    assert again == results
+    assert again.config["task"] == "navigation"
+    assert [cell.config["prior.kind"] for cell in again.cells] == ["none", "esp"]
+    assert {cell.esp_version for cell in again.cells} == {"0.0.1"}
+    assert again.cells[1].returns["greedy"] == tuple(ESP)
     assert [table.rows for table in all_tables(again)] == [table.rows for table in all_tables(results)]
+
+
+def test_the_document_has_the_fields_that_it_always_had(results):
+    written = results.document()
+    head = [
+        "format",
+        "version",
+        "kind",
+        "title",
+        "command",
+        "esp_version",
+        "mode",
+        "rows",
+        "episodes",
+        "config",
+        "cells",
+    ]
+    assert list(written) == head
+    cell = written["cells"][0]
+    fields = ("name", "panel", "variant", "reference", "paper", "status", "step", "steps", "seeds", "config", "seconds")
+    fields += ("esp_version", "task_version", "convention", "returns", "anchors", "metrics", "evaluations", "steps_to")
+    assert set(cell) == {*fields, "area_under_curve"}
+    assert (cell["reference"], cell["paper"]) == (None, None)
 
 
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
         (None, "cannot read"),
-        ("{", "is not JSON"),
-        ("{}", "holds no results"),
-        ('{"format": "esp-results", "version": 99}', "another version"),
+        ("{", "is not valid JSON"),
+        ("{}", "is foreign: it is not the results of a study"),
+        ('{"format": "esp-results", "version": 99}', "was written by a newer esp"),
+        ('{"format": "esp-results", "version": 1}', "the setting 'kind' is missing"),
     ],
 )
 def test_what_is_no_results_file_is_told_in_one_sentence(tmp_path, content, sentence):
@@ -184,7 +225,7 @@ def test_what_is_no_results_file_is_told_in_one_sentence(tmp_path, content, sent
 
 def test_an_ablation_has_its_variants_as_rows(tmp_path):
     study = small_study("ablate-modules")
-    found = collect(write_study(tmp_path / "s", study, {"none": PLAIN, "both": ESP}))
+    found = collect(write_study(tmp_path / "s", study, {"none": PLAIN, "both": ESP})).results
     assert returns_table(found).rows == (
         ("none", "-150.00 ± 5.77"),
         ("loss", "not run"),

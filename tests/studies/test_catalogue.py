@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from esp_cli.prior import PriorConfig
-from esp_cli.studies.catalogue import KINDS, Request, paper_cells, plan
+from esp_cli.studies.catalogue import Request, paper_cells, plan
+from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import Reported, horizons, reported, tasks
 from esp_cli.symmetry import parse
 from tests.studies.small_studies import request, small_study

@@ -1,0 +1,53 @@
+"""What a network costs: its weights, and the work behind one action."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.config import RunConfig
+
+
+@dataclass(frozen=True)
+class NetworkCost:
+    """Sizes of the networks of one seed.
+
+    Attributes:
+        parameters: weights by name of the network, "policy" among them.
+        flops_per_action: floating-point operations of matrix products by which the policy chooses one agent's action.
+    """
+
+    parameters: dict[str, int]
+    flops_per_action: float
+
+
+def network_cost(config: RunConfig) -> NetworkCost:
+    """Build the networks of a run and count."""
+    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
+    modules = build_learner(config).modules
+    counts: dict[str, int] = {
+        name: sum(p.numel() for p in modules[name].parameters()) for name in ("policy", "critic") if name in modules
+    }
+    return NetworkCost(counts, flops_per_action(config))
+
+
+@torch.no_grad()
+def flops_per_action(config: RunConfig) -> float:
+    """Count the floating-point operations of matrix products by which a trained policy chooses one agent's action.
+
+    What is done once for any number of observations, such as putting constrained weights together, does not count; nor
+    does it count that equal pictures need to be encoded only once.
+    """
+    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
+    policy = build_learner(config).policy
+    worlds = 16  # many pictures, so that no odd number is rounded up
+    counts = []
+    for number in (worlds, 2 * worlds):
+        obs = torch.randn_like(build_environment(config, number, "shape").reset().obs)
+        with FlopCounterMode(display=False) as counter:
+            policy.act(obs, policy.initial_memory(number, obs))
+        counts.append(counter.get_total_flops())
+    return (counts[1] - counts[0]) / (worlds * policy.num_agents)

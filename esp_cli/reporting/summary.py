@@ -1,0 +1,181 @@
+"""What tables state of results: means with intervals, differences from the reference, numbers over all panels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from esp_cli.evaluation.final import Mode
+from esp_cli.evaluation.statistics import (
+    Estimate,
+    Floats,
+    SeedSummary,
+    aggregate,
+    average_improvement,
+    difference,
+    interquartile_mean,
+    leader,
+    normalise,
+    probability_of_improvement,
+    summarise,
+)
+from esp_cli.reporting.results import CellResult, Results
+from esp_cli.studies.paper import NUM_SEEDS
+
+Side = Literal["ahead", "behind", "level"]
+MIN_SEEDS_TO_RANK = 3
+"""Of either side; a probability of improvement of fewer seeds says nothing."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A run beside its reference.
+
+    Attributes:
+        difference: of the means.
+        paired: whether both have the same seeds, which are compared one by one.
+        probability: of improvement over the reference; None for fewer than three seeds.
+        ahead: by whether the interval of the difference holds 0; None where there is no interval.
+    """
+
+    difference: Estimate
+    paired: bool
+    probability: Estimate | None
+    ahead: Side | None
+
+
+@dataclass(frozen=True)
+class PaperGap:
+    """The paper's number of a cell, and whose mean is higher; None where that cannot be tested."""
+
+    mean: float
+    sem: float | None
+    ahead: Literal["first", "second", "neither"] | None
+
+
+@dataclass(frozen=True)
+class CellSummary:
+    """Everything that tables say about one cell; what cannot be said is None.
+
+    Attributes:
+        returns: over seeds.
+        iqm: interquartile mean.
+        normalised: 0 is the random policy, 1 the heuristic.
+        area: mean height of the learning curve.
+        gap: to the cell's reference.
+        paper: the paper's side.
+    """
+
+    returns: SeedSummary
+    iqm: Estimate | None = None
+    normalised: SeedSummary | None = None
+    area: SeedSummary | None = None
+    gap: Gap | None = None
+    paper: PaperGap | None = None
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """Numbers of one variant over all panels, of normalised returns.
+
+    Attributes:
+        iqm: interquartile mean.
+        mean: of all seeds of all panels.
+        improvement: mean probability of improvement over the panel's reference, where every panel has one.
+    """
+
+    iqm: Estimate
+    mean: Estimate
+    improvement: Estimate | None
+
+
+def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
+    """Return everything that tables say about one cell; None where it has no returns yet."""
+    values = returns_of(cell, results.mode)
+    if values is None:
+        return None
+    returns = summarise(values)
+    good = values[np.isfinite(values)]
+    if not good.size or returns.mean is None:
+        return CellSummary(returns)
+    scores, paper = _normalised(cell, good), None
+    if cell.paper is not None:
+        ahead = leader((returns.mean, returns.sem, good.size), (*cell.paper, NUM_SEEDS))
+        paper = PaperGap(*cell.paper, ahead)
+    return CellSummary(
+        returns,
+        iqm=interquartile_mean(good),
+        normalised=None if scores is None else summarise(scores),
+        area=None if cell.area_under_curve is None else summarise(floats(cell.area_under_curve)),
+        gap=_gap(results, cell, values),
+        paper=paper,
+    )
+
+
+def aggregates(results: Results) -> dict[str, Aggregate]:
+    """Return numbers over all panels by variant, with intervals whose bootstrap redraws seeds within each panel.
+
+    Only variants with two or more panels, all of them finished and with anchors.
+    """
+    out: dict[str, Aggregate] = {}
+    for variant in dict.fromkeys(cell.variant for cell in results.cells):
+        own = [cell for cell in results.cells if cell.variant == variant]
+        scores: dict[str, Floats] = {}
+        pairs: dict[str, tuple[Floats, Floats]] = {}
+        for cell in own:
+            values = returns_of(cell, results.mode)
+            normalised = None if values is None or not np.isfinite(values).all() else _normalised(cell, values)
+            if values is None or normalised is None:
+                break
+            scores[cell.panel] = normalised
+            other = results.reference_of(cell)
+            others = None if other is None or other.seeds != cell.seeds else returns_of(other, results.mode)
+            if others is not None and np.isfinite(others).all() and others.size >= MIN_SEEDS_TO_RANK:
+                pairs[cell.panel] = (values, others)
+        if len(scores) < max(2, len(own)):
+            continue
+        whole = len(pairs) == len(own) and len({x.size for x, _ in pairs.values()}) == 1
+        improvement = average_improvement(pairs) if whole else None
+        out[variant] = Aggregate(aggregate(scores, "iqm"), aggregate(scores, "mean"), improvement)
+    return out
+
+
+def returns_of(cell: CellResult, mode: Mode) -> Floats | None:
+    """Return the returns of a cell [S], NaN where a seed stopped; None where it has none."""
+    return floats(cell.returns[mode]) if mode in cell.returns else None
+
+
+def floats(values: Sequence[float | None]) -> Floats:
+    """Return numbers [S], NaN for None."""
+    return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
+    """Compare a cell with its reference; None where a seed of either stopped: the others are no fair sample."""
+    other = results.reference_of(cell)
+    others = None if other is None else returns_of(other, results.mode)
+    if other is None or others is None or not (np.isfinite(values).all() and np.isfinite(others).all()):
+        return None
+    paired = cell.seeds == other.seeds
+    found, chance = difference(values, others, paired), None
+    if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
+        chance = probability_of_improvement(values, others, paired)
+    return Gap(found, paired, chance, _side(found.ci95))
+
+
+def _side(interval: tuple[float, float] | None) -> Side | None:
+    if interval is None:
+        return None
+    low, high = interval
+    return "ahead" if low > 0 else "behind" if high < 0 else "level"
+
+
+def _normalised(cell: CellResult, values: Floats) -> Floats | None:
+    random, heuristic = cell.anchors.get("random"), cell.anchors.get("heuristic")
+    if random is None or heuristic is None or random == heuristic:
+        return None
+    return normalise(values, random, heuristic)

@@ -1,0 +1,164 @@
+"""The kinds of studies as data: what each of them runs, varies and holds fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from esp_cli.evaluation.final import Mode
+from esp_cli.studies import paper
+
+Settings = Mapping[str, object]
+"""Dotted names of settings -> values."""
+GROUP = "<group>"
+"""Stands for the group that the user chooses."""
+ALGORITHMS = ("maddpg", "qmix", "mappo")
+"""In the order of the paper's table."""
+PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
+"""What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
+PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
+COEFFICIENTS = (0.0, 0.01, 0.05, 0.1, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class Team:
+    """One row of a table of teams.
+
+    Attributes:
+        label: name of the row.
+        settings: of the task.
+        place: of the row in the paper's numbers.
+    """
+
+    label: str
+    settings: Settings
+    place: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class StudyKind:
+    """A kind of study: all that tells it from the others.
+
+    Attributes:
+        title: one line for people.
+        rows: what the rows of its table are. With "panels" each algorithm stands beside itself with the prior, as in
+            the paper's tables; with "variants" each panel is one algorithm, whose variants are compared with the first.
+        varies: settings that the study sets itself and a user cannot.
+        variants: name -> the settings that make it.
+        common: settings of all runs, under those of the user.
+        tasks: unless the user names others.
+        algorithms: unless the user names others.
+        steps: per seed, unless the user names others; empty for the rows of the paper's table.
+        all_rows: take every row of the paper's table, not only the first.
+        only: the one task that the study is about.
+        teams: rows beside the task itself.
+        place: of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none.
+        mode: evaluations that are reported, unless the user asks for others.
+        thresholds: returns whose first passing is reported; by default that which the reference ended with.
+        network_cost: whether to state the sizes of the networks, and to draw the paper's numbers as lines.
+    """
+
+    title: str
+    rows: Literal["panels", "variants"]
+    varies: frozenset[str]
+    variants: Mapping[str, Settings]
+    common: Settings = field(default_factory=dict)
+    tasks: tuple[str, ...] = ("navigation",)
+    algorithms: tuple[str, ...] = ("maddpg",)
+    steps: tuple[int, ...] = ()
+    all_rows: bool = False
+    only: str | None = None
+    teams: tuple[Team, ...] = ()
+    place: tuple[str, ...] = ()
+    mode: Mode = "greedy"
+    thresholds: tuple[float, ...] = ()
+    network_cost: bool = False
+
+
+def _team(agents: int, landmarks: int | None) -> Team:
+    label = f"N = {agents}" + (f", {landmarks} landmarks" if landmarks else "")
+    place = ("table1", "navigation") if agents == 3 else ("agents", str(agents))
+    return Team(label, {"task.num_agents": agents, "task.num_landmarks": landmarks}, place)
+
+
+KINDS: Mapping[str, StudyKind] = {
+    "table1": StudyKind(
+        "Table 1 of the paper",
+        rows="panels",
+        varies=frozenset({"prior.kind"}),
+        variants=PLAIN_AND_ESP,
+        tasks=paper.tasks(),
+        algorithms=ALGORITHMS,
+    ),
+    "agents": StudyKind(
+        "Cooperative navigation with 2, 3 and 4 agents, as in the paper's supplement",
+        rows="panels",
+        varies=frozenset({"prior.kind", "task.num_agents", "task.num_landmarks"}),
+        variants=PLAIN_AND_ESP,
+        algorithms=ALGORITHMS,
+        only="navigation",
+        # The task's default is as many landmarks as agents, which fits the paper's four agents best; the authors'
+        # launcher says three.
+        teams=(_team(2, None), _team(3, None), _team(4, None), _team(4, 3)),
+    ),
+    # figures 5a and 5b, with a copy for every element; then two groups of which each minibatch draws one element
+    "ablate-transforms": StudyKind(
+        "Number and type of transforms, augmentation alone (figures 5a and 5b)",
+        rows="variants",
+        varies=frozenset({"prior.transforms", "prior.copies"}),
+        common={"prior.kind": "augment"},
+        variants={
+            "none": {"prior.kind": "none"},
+            "rot90": {"prior.transforms": "rot90"},
+            "rot90, rot180": {"prior.transforms": "rot90,rot180", "prior.copies": "all"},
+            "rot90, rot180, rot270": {"prior.transforms": "rot90,rot180,rot270", "prior.copies": "all"},
+            "rot90, flip": {"prior.transforms": "rot90,flip-x", "prior.copies": "all"},
+            "C4, drawn": {"prior.transforms": "c4", "prior.copies": "draw"},
+            "D4, drawn": {"prior.transforms": "d4", "prior.copies": "draw"},
+        },
+    ),
+    "ablate-coefficient": StudyKind(
+        "Coefficient of the consistency loss, loss alone (figure 5c)",
+        rows="variants",
+        varies=frozenset({"prior.consistency_coef"}),
+        common={"prior.kind": "consistency", **PAPER_PRIOR},
+        variants={f"c = {c:g}": {"prior.consistency_coef": c} for c in COEFFICIENTS},
+        all_rows=True,
+        place=("coefficient, read off figure 5c", "{task}", "{steps}", "{algorithm}", "{value}"),
+    ),
+    "ablate-modules": StudyKind(
+        "Consistency loss and augmentation, each alone and both (figure 6a)",
+        rows="variants",
+        varies=frozenset({"prior.kind"}),
+        common=PAPER_PRIOR,
+        variants={
+            "none": {"prior.kind": "none"},
+            "loss": {"prior.kind": "consistency"},
+            "augmentation": {"prior.kind": "augment"},
+            "both": {"prior.kind": "esp"},
+        },
+    ),
+    # the standard network, the same with the prior, the equivariant one, and the standard one averaged over the group
+    "homomorphic": StudyKind(
+        "Symmetry in the network and symmetry in the prior (figure 6b)",
+        rows="variants",
+        varies=frozenset(
+            {"network.name", "network.group", "network.symmetrise", "prior.kind", "prior.transforms"},
+        ),
+        variants={
+            "mpn": {"network.name": "mpn", "prior.kind": "none"},
+            "mpn-esp": {"network.name": "mpn", "prior.kind": "esp", "prior.transforms": GROUP},
+            "empn": {"network.name": "empn", "prior.kind": "none", "network.group": GROUP},
+            "mpn-ensemble": {"network.name": "mpn", "prior.kind": "none", "network.symmetrise": GROUP},
+        },
+        tasks=("wildlife",),
+        algorithms=("mappo",),
+        steps=(200_000,),
+        only="wildlife",
+        place=("networks, read off figure 6b", "{task}", "{value}"),
+        mode="stochastic",
+        thresholds=(2.0,),
+        network_cost=True,
+    ),
+}
