@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
@@ -16,6 +17,19 @@ from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators
 from esp_envs.spec import TaskSpec
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """What one iteration of collecting and learning returns.
+
+    Attributes:
+        metrics: what is logged, by name, [S] each.
+        finite: [S] bool, whether each seed's losses and gradients are finite numbers; one that is not stops the seed.
+    """
+
+    metrics: dict[str, Tensor]
+    finite: Tensor
 
 
 class LearnerConfig(BaseModel):
@@ -109,12 +123,17 @@ class Learner(ABC):
         """Environment steps per seed of one iteration."""
 
     @abstractmethod
-    def iterate(self, progress: float) -> dict[str, Tensor]:
-        """Collect, learn, and return metrics, each [S].
+    def iterate(self, progress: float) -> Iteration:
+        """Collect, learn, and return what came out.
 
         Args:
             progress: share of the run that is done, 0 to 1, for schedules.
         """
+
+    def iteration(self, metrics: dict[str, Tensor], *watched: Tensor) -> Iteration:
+        """Return metrics with the flags that say in which seeds all the watched numbers, [S] each, are finite."""
+        seeds = torch.ones(len(self.generators["learner"]), device=self.device)
+        return Iteration(metrics, torch.stack([seeds, *watched]).isfinite().all(0))
 
     def anneal(self, remaining: float) -> None:
         """Set the learning rate of every optimiser to this share of what it was made with."""

@@ -53,6 +53,7 @@ class Maddpg(OffPolicyLearner):
     """
 
     config_class = MaddpgConfig
+    watched = ("td_loss", "policy_loss", "critic_grad_norm", "actor_grad_norm")
     config: MaddpgConfig
 
     def build(self, env: Environment, network: NetworkConfig) -> None:

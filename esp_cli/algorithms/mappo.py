@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.batch import Batch
-from esp_cli.algorithms.learner import Learner, LearnerConfig
+from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
 from esp_cli.algorithms.losses import (
     clip_gradients_per_seed,
     clipped_surrogate,
@@ -26,12 +26,12 @@ from esp_cli.algorithms.losses import (
     value_loss,
 )
 from esp_cli.algorithms.normalisation import ValueNormaliser
-from esp_cli.algorithms.rollout import Collector, Rollout
+from esp_cli.algorithms.rollout import Collector, Rollout, values_along
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic, CriticInput
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
-from esp_envs.base import Environment, Observation
+from esp_envs.base import Environment
 from esp_envs.spec import TaskSpec
 
 
@@ -67,6 +67,10 @@ class MappoConfig(LearnerConfig):
 
 PROBE_STEPS = 100
 """Environment steps per seed on which the symmetry errors are measured after every update."""
+
+
+WATCHED = ("policy_loss", "value_loss", "actor_grad_norm", "critic_grad_norm")
+"""Metrics that have to be finite for a seed to go on."""
 
 
 class Mappo(Learner):
@@ -126,18 +130,18 @@ class Mappo(Learner):
         """Environment steps per seed of one iteration."""
         return self.config.num_envs * self.config.num_steps
 
-    def iterate(self, progress: float) -> dict[str, Tensor]:
-        """Collect one rollout, learn from it, and return metrics, each [S].
+    def iterate(self, progress: float) -> Iteration:
+        """Collect one rollout, learn from it, and return what came out.
 
         Args:
             progress: share of the run that is done, 0 to 1, for annealing.
         """
         rollout = self.collector.collect(self.config.num_steps)
-        metrics = self.update(rollout, progress)
-        return {"train/return": self.collector.pop_mean_return(), **metrics}
+        metrics = {"train/return": self.collector.pop_mean_return(), **self.update(rollout, progress)}
+        return self.iteration(metrics, *(metrics[f"train/{name}"] for name in WATCHED))
 
     def update(self, rollout: Rollout, progress: float) -> dict[str, Tensor]:
-        """Learn from a rollout: epochs of minibatches, each one gradient step."""
+        """Learn from a rollout by epochs of minibatches, each one gradient step, and return metrics, [S] each."""
         config = self.config
         remaining = 1.0 - progress
         if config.anneal_learning_rate:
@@ -162,7 +166,7 @@ class Mappo(Learner):
         config = self.config
         reward = rollout.reward.mean(-1, keepdim=True) if self.num_values == 1 else rollout.reward
         with torch.no_grad():
-            raw_value, raw_next = self._values(rollout)
+            raw_value, raw_next = values_along(self.critic, rollout, self.spec.horizon if self.recurrent else None)
         value, next_value = self.normaliser.denormalise(raw_value), self.normaliser.denormalise(raw_next)
         ended = rollout.ended.unsqueeze(-1)
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
@@ -186,31 +190,6 @@ class Mappo(Learner):
         """Shape [S, E, T, ...] into [S, E * T, 1, ...], or into whole episodes [S, E * k, horizon, ...]."""
         length = self.spec.horizon if self.recurrent else 1
         return x.unflatten(2, (-1, length)).flatten(1, 2)
-
-    def _values(self, rollout: Rollout) -> tuple[Tensor, Tensor]:
-        """Return V(s_t) and V of what really followed, each [S, E, T, C], in normalised units."""
-        if self.recurrent:
-            finals = [rollout.finals[t] for t in sorted(rollout.finals)]
-            obs = self._episodes(rollout.obs, [final.obs for final in finals])
-            state = self._episodes(rollout.state, [final.state for final in finals])
-            values = self.critic.unroll(obs, state).unflatten(1, (rollout.obs.shape[1], -1))
-            return values[:, :, :, :-1].flatten(2, 3), values[:, :, :, 1:].flatten(2, 3)
-        value = self.critic.unroll(rollout.obs, rollout.state)
-        next_value = torch.cat([value[:, :, 1:], self._value_of(rollout.last).unsqueeze(2)], 2)
-        # behind an end of its own an episode has no value, so only cut ones are worth a look at what they ended in
-        cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist()
-        for t, final in rollout.finals.items():
-            if cut[t]:
-                next_value[:, :, t] = self._value_of(final)
-        return value, next_value
-
-    def _episodes(self, rows: Tensor, finals: list[Tensor]) -> Tensor:
-        """Cut [S, E, T, ...] into whole episodes, each with its final row behind it: [S, E * k, horizon + 1, ...]."""
-        episodes = rows.unflatten(2, (-1, self.spec.horizon))
-        return torch.cat([episodes, torch.stack(finals, 2).unsqueeze(3)], 3).flatten(1, 2)
-
-    def _value_of(self, observation: Observation) -> Tensor:
-        return self.critic.unroll(observation.obs.unsqueeze(2), observation.state.unsqueeze(2)).squeeze(2)
 
     def _remember_old_networks(self) -> None:
         """Keep the behaviour policy and the critic of the rollout where copies are evaluated anew under them."""

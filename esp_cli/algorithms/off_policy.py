@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from esp_cli.algorithms.episodes import EpisodeCollector
-from esp_cli.algorithms.learner import Learner, LearnerConfig, below
+from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
 from esp_cli.algorithms.losses import clip_gradients_per_seed, huber, td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
@@ -54,11 +54,15 @@ class OffPolicyLearner(Learner):
 
     Arguments as of `Learner`.
 
+    Attributes:
+        watched: names of what `update` returns that has to be finite for a seed to go on.
+
     Raises:
         ValueError: the replay cannot hold what one round collects.
     """
 
     replays = True
+    watched: ClassVar[tuple[str, ...]]
     config: OffPolicyConfig
     policy: HistoryPolicy
     collector: EpisodeCollector
@@ -90,8 +94,8 @@ class OffPolicyLearner(Learner):
         """Numbers that the critic or the mixer sees of a state."""
         return self.joint.width + self.config.critic_sees_time
 
-    def iterate(self, progress: float) -> dict[str, Tensor]:
-        """Collect episodes, learn from the replay, and return metrics, each [S]."""
+    def iterate(self, progress: float) -> Iteration:
+        """Collect episodes, learn from the replay, and return what came out."""
         config, sums, returns = self.config, dict[str, Tensor](), []
         if config.anneal_learning_rate:
             self.anneal(1.0 - progress)
@@ -115,7 +119,7 @@ class OffPolicyLearner(Learner):
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
             errors = self.prior.errors(batch.first(PROBE_EPISODES), self.answers)
             metrics |= {f"train/{name}": error for name, error in errors.items()} | self._condition(batch)
-        return metrics
+        return self.iteration(metrics, *(value for name, value in sums.items() if name in self.watched))
 
     @abstractmethod
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:

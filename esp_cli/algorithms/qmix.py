@@ -50,6 +50,7 @@ class Qmix(OffPolicyLearner):
     """
 
     config_class = QmixConfig
+    watched = ("td_loss", "grad_norm")
     config: QmixConfig
     task_settings = MappingProxyType({"actions": "discrete"})
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from esp_cli.networks.critic import Critic
 from esp_cli.networks.policy import StochasticPolicy
 from esp_envs.base import Environment, Observation
 
@@ -118,3 +119,37 @@ class Collector:
         self.observation = Observation(own["obs"], own["state"])
         self.memory, self.episode_return = own["memory"], own["episode_return"]
         self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
+
+
+def values_along(critic: Critic, rollout: Rollout, episode: int | None) -> tuple[Tensor, Tensor]:
+    """Return V(s_t) and V of what really followed, each [S, E, T, C], in the critic's units.
+
+    Args:
+        critic: the networks.
+        rollout: what they are asked about.
+        episode: steps of the whole episodes that a recurrent critic is unrolled over; None of one without memory.
+    """
+    if episode is not None:
+        finals = [rollout.finals[t] for t in sorted(rollout.finals)]
+        obs = _episodes(rollout.obs, [final.obs for final in finals], episode)
+        state = _episodes(rollout.state, [final.state for final in finals], episode)
+        values = critic.unroll(obs, state).unflatten(1, (rollout.obs.shape[1], -1))
+        return values[:, :, :, :-1].flatten(2, 3), values[:, :, :, 1:].flatten(2, 3)
+    value = critic.unroll(rollout.obs, rollout.state)
+    next_value = torch.cat([value[:, :, 1:], _value_of(critic, rollout.last).unsqueeze(2)], 2)
+    # An episode that terminated has no value behind its end: only truncated ones are worth a look at their last state.
+    cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist()
+    for t, final in rollout.finals.items():
+        if cut[t]:
+            next_value[:, :, t] = _value_of(critic, final)
+    return value, next_value
+
+
+def _episodes(rows: Tensor, finals: list[Tensor], length: int) -> Tensor:
+    """Cut [S, E, T, ...] into whole episodes, each with its final row behind it: [S, E * k, length + 1, ...]."""
+    episodes = rows.unflatten(2, (-1, length))
+    return torch.cat([episodes, torch.stack(finals, 2).unsqueeze(3)], 3).flatten(1, 2)
+
+
+def _value_of(critic: Critic, observation: Observation) -> Tensor:
+    return critic.unroll(observation.obs.unsqueeze(2), observation.state.unsqueeze(2)).squeeze(2)

@@ -67,12 +67,12 @@ def _probe(config: RunConfig, episodes: int) -> Cost:
     learner = build_learner(config)
     iterations = -(-config.steps // learner.steps_per_iteration)
     begun = time.monotonic()
-    metrics = learner.iterate(0.0)
+    metrics = learner.iterate(0.0).metrics
     per_iteration = time.monotonic() - begun
     if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
         done, begun = 0, time.monotonic()
         while done == 0 or (time.monotonic() - begun < PROBE_SECONDS and done < iterations):
-            metrics = learner.iterate(done / iterations)
+            metrics = learner.iterate(done / iterations).metrics
             done += 1
         per_iteration = (time.monotonic() - begun) / done
     per_episode = _seconds_per_episode(config, learner)

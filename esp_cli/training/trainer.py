@@ -125,8 +125,8 @@ class Trainer:
                 self._record(writer, self._evaluate(), listener)
             while not self.is_complete:
                 tick = time.monotonic()
-                row = self._iterate()
-                row["time/steps_per_second"] = self.learner.steps_per_iteration * len(self.config.seeds) / row.pop("_s")
+                row, seconds = self._iterate()
+                row["time/steps_per_second"] = self.learner.steps_per_iteration * len(self.config.seeds) / seconds
                 self.elapsed_s = time.monotonic() - started
                 row["time/elapsed_s"] = self.elapsed_s
                 going = self._record(writer, row, listener)
@@ -141,18 +141,18 @@ class Trainer:
         self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
         return True
 
-    def _iterate(self) -> dict[str, Any]:
-        """Collect, learn, freeze broken seeds, evaluate where it is time."""
+    def _iterate(self) -> tuple[dict[str, Any], float]:
+        """Collect, learn, freeze broken seeds, evaluate where it is time; return metrics and seconds of learning."""
         begun = time.monotonic()
         before = self.step // self.config.evaluation.every_steps
-        metrics = self.learner.iterate(self.iteration / self.total_iterations)
+        result = self.learner.iterate(self.iteration / self.total_iterations)
         self.iteration += 1
-        row: dict[str, Any] = {name: value.cpu() for name, value in metrics.items()}
-        self._stop_broken_seeds(row)
-        row["_s"] = time.monotonic() - begun
+        row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}
+        self._stop_broken_seeds(result.finite)
+        seconds = time.monotonic() - begun
         if self.step // self.config.evaluation.every_steps > before or self.is_complete:
             row |= self._evaluate()
-        return row
+        return row, seconds
 
     def _evaluate(self) -> dict[str, Tensor]:
         """Play greedy and stochastic episodes; every seed's worlds depend on its seed and the step alone."""
@@ -168,10 +168,8 @@ class Trainer:
                 row |= {f"eval/{name}": value.mean(1).cpu() for name, value in episodes.metrics.items()}
         return row
 
-    def _stop_broken_seeds(self, row: dict[str, Tensor]) -> None:
-        """Put a seed whose numbers are not finite back to its last good state, for the rest of the run."""
-        watched = [value for name, value in row.items() if "loss" in name or "grad_norm" in name]
-        finite = torch.stack([torch.ones(len(self.config.seeds)), *watched]).isfinite().all(0)
+    def _stop_broken_seeds(self, finite: Tensor) -> None:
+        """Put a seed whose numbers are not `finite` [S] back to its last good state, for the rest of the run."""
         for index in (~finite).nonzero().flatten().tolist():
             if index not in self.stopped_seeds:
                 self.stopped_seeds[index] = self.step

@@ -32,7 +32,7 @@ def networks(trained):
 
 def after(algorithm, iterations=2, **choice):
     trained = learner(algorithm, **choice)
-    metrics = [trained.iterate(0.0) for _ in range(iterations)]
+    metrics = [trained.iterate(0.0).metrics for _ in range(iterations)]
     return networks(trained), metrics
 
 

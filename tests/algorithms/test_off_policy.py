@@ -62,7 +62,7 @@ def test_a_learner_restored_between_iterations_goes_on_bit_for_bit_with_its_repl
     resumed = learner(algorithm, **choice)
     resumed.load_state_dict({name: tensor.clone() for name, tensor in halted.state_dict().items()})
     for _ in range(3):
-        ours, theirs = straight.iterate(0.0), resumed.iterate(0.0)
+        ours, theirs = straight.iterate(0.0).metrics, resumed.iterate(0.0).metrics
         assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     assert equal(straight.state_dict(), resumed.state_dict())
     assert (straight.episodes, straight.updates) == (24, 24)
@@ -94,7 +94,7 @@ def test_another_configuration_is_refused_in_one_sentence(algorithm):
 def test_random_episodes_come_first_and_epsilon_falls_linearly(algorithm):
     trained = learner(algorithm, algo__epsilon_steps=400, algo__epsilon_finish=0.2, algo__warmup_episodes=4)
     before = networks(trained)
-    seen = [trained.iterate(0.0)["train/epsilon"] for _ in range(6)]
+    seen = [trained.iterate(0.0).metrics["train/epsilon"] for _ in range(6)]
     # an iteration is two rounds of two episodes of 25 steps; logged is the epsilon of its second round
     shares = torch.stack([(torch.tensor(100.0 * k + 50) / 400).clamp(max=1) for k in range(6)])
     expected = 1 - 0.8 * shares
@@ -102,7 +102,7 @@ def test_random_episodes_come_first_and_epsilon_falls_linearly(algorithm):
     torch.testing.assert_close(torch.stack(seen), expected.unsqueeze(1).expand(6, 2))
     assert not equal(before, networks(trained))
     waiting = learner(algorithm, algo__warmup_episodes=100)
-    metrics = waiting.iterate(0.0)
+    metrics = waiting.iterate(0.0).metrics
     assert equal(
         {k: v for k, v in before.items() if "epsilon" not in k},
         {k: v for k, v in networks(waiting).items() if "epsilon" not in k},

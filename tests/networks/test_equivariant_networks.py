@@ -165,7 +165,7 @@ def test_equivariance_survives_training(task, network) -> None:
     learner = build_learner(resolve_config(task, seeds=(0, 1), overrides=overrides))
     before = [parameter.clone() for parameter in learner.policy.parameters()]
     for _ in range(2):
-        metrics = learner.iterate(0.0)
+        metrics = learner.iterate(0.0).metrics
     assert not any(torch.equal(a, b) for a, b in zip(before, learner.policy.parameters(), strict=True))
     spec, obs, _ = scene(task)
     memory = learner.policy.initial_memory(WORLDS, obs)
