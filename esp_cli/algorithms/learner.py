@@ -171,7 +171,7 @@ class Learner(ABC):
             for name, generators in self.generators.items():
                 restore_generators(generators, tensors[f"generators.{name}"])
             self.collector.load_state_dict(below(tensors, "collector"))
-        except (KeyError, RuntimeError, IndexError, TypeError) as error:
+        except (KeyError, RuntimeError, IndexError, TypeError, ValueError) as error:
             reason = str(error).split("\n")[0]
             raise ValueError(f"the checkpoint does not fit this configuration ({reason})") from None
 
@@ -191,8 +191,13 @@ def below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def _load_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     """Load flat entries "index.name" into an optimiser over the same parameters."""
-    state: dict[int, dict[str, Any]] = {}
+    state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         index, key = name.split(".")
         state.setdefault(int(index), {})[key] = tensor
+    parameters: list[Tensor] = [parameter for group in optimiser.param_groups for parameter in group["params"]]
+    for number, entry in state.items():
+        shape = parameters[number].shape
+        if {key: tensor.shape for key, tensor in entry.items()} != {"step": (), "exp_avg": shape, "exp_avg_sq": shape}:
+            raise KeyError(f"the moments of parameter {number}")
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})

@@ -107,6 +107,8 @@ class EpisodeReplay:
         Raises:
             ValueError: episodes of another task or another number of seeds, or more than fit.
         """
+        if tensors.keys() != {*vars(self._store), "cursor"} or tensors["obs"].dim() < 2:
+            raise ValueError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]
         for name, tensor in vars(self._store).items():
             saved = tensors[name]

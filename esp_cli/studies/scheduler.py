@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from esp_cli.files.failures import sentence
+from esp_cli.files.writing import remove_file
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.study import Cell, StudyFolder
 from esp_cli.training.locking import is_held
@@ -185,7 +187,12 @@ class Scheduler:
             arguments += ["--json", str(folder.evaluation_path(cell))]
         else:
             run.status, arguments = "training", ["train", "--resume", path]
-        run.job = self.engine.start(arguments, folder.log_path(cell))
+        try:
+            if run.status != "training":  # a damaged evaluation is made anew, and a link there is not followed
+                remove_file(folder.evaluation_path(cell))
+            run.job = self.engine.start(arguments, folder.log_path(cell))
+        except OSError as error:
+            run.status, run.message = "failed", sentence(error)
 
     def _follow(self, run: Run, going: bool) -> None:
         """Look at a run: how far it is, and whether its process has ended."""

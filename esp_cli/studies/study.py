@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -32,6 +33,7 @@ from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
 _STUDY, _RUNS, _LOCK, _LOG = "study.json", "runs", "study.lock", "log.txt"
+_FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _FINAL, _OLD_FINAL = "final-evaluation.json", "judgement.json"
 
 
@@ -110,6 +112,11 @@ class StudyFolder:
     """
 
     def __init__(self, path: Path, study: Study) -> None:
+        names = [cell.name for cell in study.cells]
+        for name in names:
+            # A name is that of a folder inside the study: nothing is written outside it.
+            if not _FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
+                raise StudyError(f"{path / _STUDY} is damaged: {name!r} is not the name of one run")
         self.path, self.study = path, study
 
     @staticmethod

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from esp_cli.training.build import build_environment, build_learner
@@ -24,7 +25,12 @@ from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 
 
-def _checkpoint_seconds() -> float:
+def checkpoint_seconds() -> float:
+    """Return what ESP_CHECKPOINT_SECONDS says, or its default.
+
+    Raises:
+        ValueError: it is not a number of seconds.
+    """
     text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
     try:
         seconds = float(text)
@@ -35,10 +41,22 @@ def _checkpoint_seconds() -> float:
     return seconds
 
 
-CHECKPOINT_SECONDS = _checkpoint_seconds()
+CHECKPOINT_SECONDS = checkpoint_seconds()
 """Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
 CHECKPOINT_SPACING = 20
 """A checkpoint takes milliseconds, with a large replay seconds: the next waits for as many times as long as it took."""
+
+
+class Standing(BaseModel):
+    """Where a run stands, as its checkpoint says; steps are per seed."""
+
+    model_config = ConfigDict(frozen=True)
+
+    step: int = Field(ge=0)
+    iteration: int = Field(ge=0)
+    elapsed_s: float = Field(ge=0, allow_inf_nan=False)
+    stopped_seeds: dict[int, int]
+    task_version: int
 
 
 @dataclass(frozen=True)
@@ -221,15 +239,48 @@ class Trainer:
         self.notes += [str(warning.message) for warning in caught]
         if found is not None:
             tensors, meta = found
-            self.learner.load_state_dict(tensors)
+            self._load(tensors)
             try:
-                self.iteration, self.elapsed_s = int(meta["iteration"]), float(meta["elapsed_s"])
-                self.stopped_seeds = {int(index): int(step) for index, step in meta["stopped_seeds"].items()}
-            except (KeyError, TypeError, ValueError, AttributeError):
+                stands = Standing.model_validate(meta)
+            except ValidationError:
                 raise ValueError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
+            self.iteration, self.elapsed_s, self.stopped_seeds = (
+                stands.iteration,
+                stands.elapsed_s,
+                stands.stopped_seeds,
+            )
+            if self.step != stands.step or not set(self.stopped_seeds) <= set(range(len(self.config.seeds))):
+                raise ValueError(f"the checkpoint in {self.folder.path} is of another run; train anew")
+            version = self.learner.spec.version
+            if stands.task_version != version:
+                raise ValueError(
+                    f"{self.folder.path} was trained on {self.config.task} version {stands.task_version}, but this is "
+                    f"version {version}; use the esp that it was begun with, or train anew"
+                )
         self.folder.truncate_metrics(self.step if found else -1)
+
+    def _load(self, tensors: dict[str, Tensor]) -> None:
+        """Load the state of the learner; refuse a checkpoint whose names, shapes or types are not the learner's."""
+        before = self.learner.state_dict()
+        self.learner.load_state_dict(tensors)
+        now, needed = self.learner.state_dict(), self.learner.state_dict(complete=True)
+        for name in sorted({*tensors, *needed}):
+            fits = name in now and name in tensors and _same(now[name], tensors[name])
+            if fits and name in before:
+                a, b = before[name], now[name]
+                # a replay has grown, and checks its shapes itself
+                fits = a.dtype == b.dtype and (a.shape == b.shape or name.startswith("replay."))
+            if not fits:
+                raise ValueError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")
 
     def _policy_meta(self) -> dict[str, Any]:
         """Describe the policy file so that it can be used without the run folder."""
         returns = self.final_returns()["greedy"].tolist()
         return describe_policy(self.config, self.learner.spec, self.step, returns)
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    """Return whether two tensors are equal bit for bit, NaN included."""
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return False
+    return torch.equal(a.cpu().reshape(-1).view(torch.uint8), b.cpu().reshape(-1).view(torch.uint8))

@@ -64,6 +64,36 @@ def test_what_is_finished_is_skipped_and_what_is_trained_is_only_evaluated(tmp_p
     ]
 
 
+@pytest.mark.parametrize("damage", [b"{}", b"[" * 200_000, b"[]", b"", b'{"greedy": 7}', "link"])
+def test_a_damaged_evaluation_is_made_anew(tmp_path, damage):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
+    cell = next(cell for cell in folder.study.cells if folder.is_finished(cell))
+    path, mine = folder.evaluation_path(cell), tmp_path / "mine.txt"
+    mine.write_text("mine")
+    path.unlink()
+    if damage == "link":
+        path.symlink_to(mine)
+    else:
+        path.write_bytes(damage)
+    assert not folder.is_finished(cell)
+    run(folder, 1)
+    assert f"eval {cell.name}" in trace(folder)
+    assert folder.is_finished(cell)
+    assert mine.read_text() == "mine"
+
+
+def test_a_run_whose_log_is_a_planted_link_fails_alone(folder, tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    bad = folder.study.cells[1]
+    folder.prepare(bad)
+    folder.log_path(bad).symlink_to(mine)
+    scheduler = run(folder)
+    assert statuses(scheduler) == ["finished", "failed", "finished", "finished"]
+    assert "no regular file is there; remove it" in scheduler.runs[1].message
+    assert mine.read_text() == "mine"
+
+
 def test_a_failed_run_is_reported_and_the_others_go_on_and_the_next_time_it_is_tried_again(folder):
     bad = folder.study.cells[1]
     (folder.path / f"fail-{bad.name}").touch()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import pytest
 
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.locking import LockError, is_held
 from tests.studies.small_studies import small_study, write_study
@@ -147,3 +149,39 @@ def test_a_run_of_version_0_1_0_whose_network_has_the_fields_of_all_is_gone_on_w
     stored = json.loads(file.read_text())
     file.write_text(json.dumps(stored | {"network": stored["network"] | {"group": "c4"}}))
     assert folder.prepare(cell).path == folder.run_path(cell)
+
+
+@pytest.mark.parametrize("name", ["../../x", "/tmp/x", "a/b", "..", ".x", "", "a\nb", "x" * 300])
+def test_a_study_whose_run_would_lie_outside_its_folder_is_refused(tmp_path, name):
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    text = (folder.path / "study.json").read_text()
+    content = json.loads(text)
+    content["cells"][0]["name"] = name
+    (folder.path / "study.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is not the name of one run"):
+        StudyFolder.open(folder.path)
+    (folder.path / "study.json").write_text(text)
+    StudyFolder.open(folder.path)  # negative control
+
+
+def test_a_study_that_names_a_run_twice_is_refused(tmp_path):
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    content = json.loads((folder.path / "study.json").read_text())
+    content["cells"].append(content["cells"][0])
+    (folder.path / "study.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is not the name of one run"):
+        StudyFolder.open(folder.path)
+
+
+def test_planted_links_at_the_lock_and_the_log_are_not_written_to(tmp_path):
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    (folder.path / "study.lock").symlink_to(mine)
+    with pytest.raises(LockError, match="no regular file is there; remove it"), folder.lock():
+        pass
+    log = tmp_path / "log.txt"
+    log.symlink_to(mine)
+    with pytest.raises(OSError, match="no regular file is there; remove it"):
+        LocalEngine([sys.executable, "-c", "pass"]).start(["x"], log)
+    assert mine.read_text() == "mine"

@@ -361,3 +361,26 @@ def test_a_run_killed_again_and_again_equals_one_that_ran_through(tmp_path):
     assert len(read_metrics(killed.metrics_path)) == last // 100
     assert torch.equal(killed.latest_checkpoint()[0]["x"], through.latest_checkpoint()[0]["x"])
     assert not list(killed.path.rglob(f"{TEMPORARY_PREFIX}*"))
+
+
+def test_planted_links_in_a_run_folder_lead_nowhere(folder, tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine\n")
+    for name in ("policy.safetensors", "checkpoints/step-000000000100.safetensors"):
+        (folder.path / name).symlink_to(mine)
+    write_checkpoints(folder, 100)
+    folder.write_policy(weights(1), {"task": "navigation"})
+    folder.lock_path.unlink()
+    folder.lock_path.symlink_to(mine)
+    with pytest.raises(RunFolderError, match="no regular file is there; remove it"), folder.lock():
+        pass
+    assert mine.read_text() == "mine\n"
+
+
+def test_a_full_disk_is_no_mistake_of_the_user(folder, full_disk):
+    with full_disk(), pytest.raises(OSError, match="File too large") as caught:
+        write_checkpoints(folder, 100)
+    assert caught.value.filename == str(folder.checkpoint_path(100))
+    assert folder.checkpoints() == []
+    write_checkpoints(folder, 100)
+    assert names(folder) == ["step-000000000100.safetensors"]

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.config import resolve_config
 from esp_cli.training.loading import load_policy, parse_config
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
-from esp_cli.training.trainer import Trainer
+from esp_cli.training.trainer import Trainer, checkpoint_seconds
 from tests.training.runs import tiny_config, tiny_folder
 
 ESP = "from esp_cli.app import main; main()"
@@ -39,6 +40,19 @@ def stop_after(iterations):
 def final_state(folder):
     tensors, meta = folder.latest_checkpoint()
     return tensors, meta["iteration"]
+
+
+def same_bits(a, b):
+    return a.shape == b.shape and a.dtype == b.dtype and a.numpy().tobytes() == b.numpy().tobytes()
+
+
+def small_config(algorithm):
+    """A run of any algorithm that learns in its second iteration."""
+    if algorithm == "mappo":
+        return tiny_config()
+    small = {f"{algorithm}.num_envs": 2, f"{algorithm}.batch_episodes": 2, f"{algorithm}.warmup_episodes": 0}
+    small |= {"network.hidden": [8], "evaluation.episodes": 2, f"{algorithm}.replay_episodes": 20}
+    return resolve_config("navigation", algorithm, steps=300, seeds=(0, 1), overrides=small)
 
 
 def same(a, b):
@@ -121,6 +135,67 @@ def test_another_configuration_cannot_continue_a_checkpoint(tmp_path):
     trainer(folder).run(stop_after(2))
     with pytest.raises(ValueError, match="does not fit this configuration"):
         Trainer(tiny_config(network__hidden=[9]), folder)
+
+
+FORGED = {
+    "a name is missing": lambda t, name: t.pop(name),
+    "a name is another": lambda t, name: t.update({f"{name}x": t.pop(name)}),
+    "a name is new": lambda t, name: t.update({f"{name}.new": t[name]}),
+    "a shape is another": lambda t, name: t.update({name: t[name].unsqueeze(0)}),
+    "an axis is cut": lambda t, name: t.update({name: t[name][:1]}),
+    "a type is another": lambda t, name: t.update({name: t[name].to(torch.int32)}),
+}
+
+
+@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_a_forged_checkpoint_with_a_valid_checksum_is_one_sentence(tmp_path, algorithm, forge):
+    config = small_config(algorithm)
+    folder = RunFolder.create(tmp_path / "run", config.model_dump(mode="json"))
+    trainer(folder).run(stop_after(2))
+    tensors, meta = folder.latest_checkpoint()
+    kinds = {name.rsplit(".", 1)[0]: name for name in tensors if tensors[name].dim()}
+    for name in kinds.values():  # one of every module, optimiser, generator and world
+        changed = dict(tensors)
+        forge(changed, name)
+        if changed.keys() == tensors.keys() and all(same_bits(changed[n], tensors[n]) for n in tensors):
+            continue  # such as the first of one
+        folder.write_checkpoint(meta["step"], changed, {k: v for k, v in meta.items() if k != "step"})
+        with pytest.raises(ValueError, match=r"does not fit|do not fit") as caught:
+            trainer(folder)
+        assert "\n" not in str(caught.value)
+    folder.write_checkpoint(meta["step"], tensors, {k: v for k, v in meta.items() if k != "step"})
+    assert trainer(folder).step == meta["step"]  # negative control: as it was, it loads
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"iteration": 3}, "is of another run"),
+        ({"iteration": -1}, "does not say where its run stands"),
+        ({"iteration": "many"}, "does not say where its run stands"),
+        ({"elapsed_s": -1.0}, "does not say where its run stands"),
+        ({"stopped_seeds": [1]}, "does not say where its run stands"),
+        ({"stopped_seeds": {"7": 50}}, "is of another run"),
+        ({"task_version": 99}, "was trained on navigation version 99, but this is version"),
+    ],
+)
+def test_a_checkpoint_that_says_something_else_of_its_run_is_one_sentence(tmp_path, change, sentence):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(stop_after(2))
+    tensors, meta = folder.latest_checkpoint()
+    folder.write_checkpoint(meta.pop("step"), tensors, meta | change)
+    with pytest.raises(ValueError, match=sentence):
+        trainer(folder)
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-1", "often", ""])
+def test_a_wrong_number_of_seconds_between_checkpoints_is_one_sentence(monkeypatch, text):
+    monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", text)
+    with pytest.raises(ValueError, match=f"^ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds"):
+        checkpoint_seconds()
+    monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0.5")
+    assert checkpoint_seconds() == 0.5
 
 
 def _start(folder):
