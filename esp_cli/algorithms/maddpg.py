@@ -1,7 +1,7 @@
 """MADDPG (Lowe et al., 2017), plain or with a symmetry prior.
 
-Agents share one deterministic actor that sees what an agent sees; a critic that sees everything values joint actions.
-The actor climbs the critic's gradient. Supplement eq. 19 is added to the critic's loss, Eq. 8 to the actor's.
+Agents share one deterministic actor, whose input is an agent's own observation. A centralised critic values joint
+actions, and the actor follows its gradient. Supplement eq. 19 is added to the critic's loss, Eq. 8 to the actor's.
 """
 
 from __future__ import annotations

@@ -192,16 +192,16 @@ class Mappo(Learner):
         return x.unflatten(2, (-1, length)).flatten(1, 2)
 
     def _remember_old_networks(self) -> None:
-        """Keep the behaviour policy and the critic of the rollout where copies are evaluated anew under them."""
+        """Keep the networks that collected the rollout, where copies are evaluated under them."""
         needed = self.prior.augments and (self.prior.recomputes or self.config.clip_value)
         self._old = (copy.deepcopy(self.policy), copy.deepcopy(self.critic)) if needed else None
 
     @torch.no_grad()
     def reevaluated(self, copied: Batch) -> Batch:
-        """Return copies with what the networks of the rollout say of them.
+        """Return copies with old log-probability and old value under the networks that collected the rollout.
 
-        The old log-probability is that of the original unless the prior recomputes it; the old value, which value
-        clipping alone reads, is always evaluated anew. Recurrent networks are unrolled over the transformed history.
+        The old log-probability stays that of the original unless the prior recomputes it. The old value, which only
+        value clipping reads, is always recomputed. Recurrent networks are unrolled over the transformed history.
         """
         if self._old is None:
             return copied

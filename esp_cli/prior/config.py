@@ -23,7 +23,7 @@ class PriorConfig(BaseModel):
     )
     consistency_coef: float = Field(0.1, ge=0, description="c of Eq. 10; paper: 0.5")
     old_log_prob: Literal["copy", "recompute"] = Field(
-        "copy", description="pi_old of a copied transition: that of the original, or evaluated anew on the copy (Eq. 7)"
+        "copy", description="pi_old of a copied transition: copied from the original, or recomputed on the copy (Eq. 7)"
     )
     terms: Literal["both", "policy", "value"] = Field(
         "both", description="consistency terms: S_pi and S_V (S_Q of an action-value critic), or one of them"
@@ -47,10 +47,10 @@ class PriorConfig(BaseModel):
         return self.consistency_coef if self.kind in ("esp", "consistency") else 0.0
 
     def effective(self) -> PriorConfig:
-        """Return this prior with every setting that has no effect beside the others at its default.
+        """Return this prior with every setting that has no effect set to its default.
 
-        Two priors with the same effective settings train the same, bit for bit: one without a coefficient is one
-        without consistency, and without either part the prior is none.
+        Two priors with the same effective settings train the same, bit for bit. With a coefficient of 0 there is no
+        consistency loss; without both parts the kind is "none".
         """
         loses = {
             "none": set(type(self).model_fields),

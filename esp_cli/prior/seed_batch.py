@@ -66,7 +66,7 @@ class SeedBatch:
 
     @classmethod
     def concatenate(cls: type[Rows], parts: Sequence[Rows]) -> Rows:
-        """Put batches behind each other along the batch axis."""
+        """Concatenate batches along the batch axis."""
         if len(parts) == 1:
             return parts[0]
         return cls(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})

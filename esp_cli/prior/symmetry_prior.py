@@ -61,7 +61,7 @@ class SymmetryPrior:
 
     @property
     def num_stored(self) -> int:
-        """Copies of every episode that are stored beside it."""
+        """Copies of every episode that a replay stores."""
         return self.num_copies if self._stores else 0
 
     @property
@@ -71,7 +71,7 @@ class SymmetryPrior:
 
     @property
     def recomputes(self) -> bool:
-        """Whether the old log-probability of a copy is evaluated anew (Eq. 7), not that of its original."""
+        """Whether a copy's old log-probability is recomputed instead of copied (Eq. 7)."""
         return self.augments and self.config.old_log_prob == "recompute"
 
     def copies(
@@ -88,7 +88,7 @@ class SymmetryPrior:
         return Copies(self.config, batch, self._draw(generators) if used else [], self.augments, adapt)
 
     def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
-        """Return the copies of new experience that belong beside it in a replay."""
+        """Return the copies of new experience that a replay stores with it."""
         return [batch.transformed(g) for g in self._draw(generators)] if self._stores else []
 
     @torch.no_grad()

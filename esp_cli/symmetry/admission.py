@@ -1,4 +1,4 @@
-"""Which transforms a task admits: its actions must carry them, and its dynamics and reward must not notice them."""
+"""Which transforms a task admits: its actions must carry them, and its dynamics and reward must be invariant."""
 
 from __future__ import annotations
 

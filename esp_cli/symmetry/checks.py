@@ -53,7 +53,7 @@ def environment_errors(
     Eq. 5: r(L_g s, K_g a) = r(s, a). Eq. 6: P(L_g s' | L_g s, K_g a) = P(s' | s, a).
 
     The worlds are put into `state` and take the actions, then into L_g state and take K_g of the actions; every
-    observation, state and reward of the second run is held against the transformed one of the first. A world counts
+    observation, state and reward of the second run is compared with the transformed one of the first. A world counts
     until its episode ends. Noise enters equally: both runs start from the same generator states.
 
     Args:

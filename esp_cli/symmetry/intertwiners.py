@@ -18,7 +18,7 @@ _INDEPENDENT = 1e-6
 
 @dataclass(frozen=True)
 class Block:
-    """So many numbers of one kind: copy after copy, each transforming alike.
+    """Equal runs of numbers, one after the other, which transform by the same matrices.
 
     Attributes:
         matrices: [G, d, d] how each element acts on one copy, orthogonal.
@@ -80,7 +80,8 @@ def intertwiners(inputs: Block, outputs: Block) -> Floats:
     """Return an orthonormal basis of all W with rho_in(g) x followed by W equal to x followed by W, then rho_out(g).
 
     Rows are vectors here, x W, so that the constraint reads W = rho_in(g) W rho_out(g)'. The average of any matrix over
-    the group satisfies it, and every solution is such an average; their number is that of the characters' product.
+    the group satisfies it, and every solution is such an average. The number of independent solutions is the mean over
+    the group of the product of both characters.
 
     Args:
         inputs: one copy of it counts.

@@ -56,7 +56,7 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
         raise ValueError(f"transforms '{text}' list a group that is sampled; let so2, o2 or a large group stand alone")
     unique = tuple(dict.fromkeys(e for item in listed for e in item if not e.is_identity))
     if not unique:
-        raise ValueError(f"transforms '{text}' hold nothing besides the identity; name one that moves something")
+        raise ValueError(f"transforms '{text}' hold only the identity; name one that moves something")
     return unique
 
 
@@ -69,12 +69,12 @@ def parse_group(text: str, num_agents: int) -> Group:
     factors = [_factor(part.strip(), text, num_agents) for part in text.lower().split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
     if len(groups) != len(factors) or len(groups) > 2:
-        raise ValueError(f"'{text}' names no group; write one such as c4, d4, o2, agents or d4*agents")
+        raise ValueError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
     if len(groups) == 1:
         return groups[0]
     plane, agents = groups
     if plane.name == "agents" or agents.name != "agents":
-        raise ValueError(f"'{text}' is no direct product; write a planar group, then agents, as in d4*agents")
+        raise ValueError(f"'{text}' is not a direct product; write a planar group, then agents, as in d4*agents")
     return direct_product(plane, agents)
 
 
@@ -141,5 +141,7 @@ def _permutation(word: str, num_agents: int) -> PlaneElement:
     sigma = tuple(int(x) for x in word.split("-")[1:])
     if sorted(sigma) != list(range(num_agents)):
         order = "-".join(map(str, (*range(1, num_agents), 0)))
-        raise ValueError(f"'{word}' is no order of {num_agents} agents; write each place once, as in agents-{order}")
+        raise ValueError(
+            f"'{word}' is not an order of {num_agents} agents; write each place once, as in agents-{order}"
+        )
     return PlaneElement(permutation=sigma)

@@ -123,7 +123,7 @@ class PlaneElement(Element):
         if sigma is None:
             return
         if sorted(sigma) != list(range(len(sigma))):
-            raise ValueError(f"{sigma} is no permutation; write each agent number from 0 to {len(sigma) - 1} once")
+            raise ValueError(f"{sigma} is not a permutation; write each agent number from 0 to {len(sigma) - 1} once")
         if sigma == tuple(range(len(sigma))):
             object.__setattr__(self, "permutation", None)
 

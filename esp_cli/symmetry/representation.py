@@ -56,7 +56,7 @@ def joint_matrix(layout: Layout, elements: Sequence[Element], places: Indices) -
 
 
 def rows_matrix(layout: Layout, elements: Sequence[Element], num_agents: int) -> Floats:
-    """Return `joint_matrix` where agents move, else `layout_matrix`, which acts on each agent's row alike."""
+    """Return `joint_matrix` where agents move, else `layout_matrix`, the same for every agent's row."""
     places = places_of(elements, num_agents)
     return layout_matrix(layout, elements) if places is None else joint_matrix(layout, elements, places)
 

@@ -2,7 +2,7 @@
 
 A `Transform` holds one element per seed as stacked maps, so that a batch of any size costs one matrix product or one
 gather for each space. Observations, states and actions are pushed forward (`obs`, `state`, `action`, `per_agent`); what
-a network returned on transformed inputs is pulled back (`pull_back`, `values`) to stand beside what it returns on the
+a network returns on transformed inputs is pulled back (`pull_back`, `values`) and compared with what it returns on the
 originals: an equivariant policy has pull_back(policy(obs(x))) == policy(x).
 
 Multiplying by a signed permutation matrix (every element of D4 and every agent permutation on scalars and vectors)
@@ -56,11 +56,6 @@ class Transform:
         """S, or 1 for a transform that is the same for all seeds."""
         return len(self.elements)
 
-    @property
-    def moves_agents(self) -> bool:
-        """Whether agents may change places."""
-        return self.agents is not None
-
     def select(self, indices: Sequence[int]) -> Transform:
         """Return the transform made of the elements at these positions, one per seed."""
         index = torch.tensor(indices, dtype=torch.int64)
@@ -100,7 +95,7 @@ class Transform:
         return self._move(x, self.agents.push, self.agents.width, agent_axis=-1)
 
     def pull_back(self, outputs: Tensor) -> Tensor:
-        """Bring what a policy says of actions at L_g s home, by K_g^-1, to stand beside what it says at s.
+        """Apply K_g^-1 to a policy's outputs at L_g s, so that they compare with its outputs at s.
 
         Logits and action values: out[..., n, a] = outputs[..., sigma(n), K_g a]. Continuous actions: K_g^-1 of each.
 
@@ -110,7 +105,7 @@ class Transform:
         return self._move(outputs, self.output_map.pull, self.output_map.width, agent_axis=-2)
 
     def values(self, values: Tensor) -> Tensor:
-        """Bring invariant values home: one per world [S, ..., 1] is left alone, one per agent [S, ..., N] goes back."""
+        """Return values per agent [S, ..., N] to their agents; one value per world [S, ..., 1] stays."""
         if self.agents is None or values.shape[-1] == 1:
             return values
         return self._move(values, self.agents.pull, self.agents.width, agent_axis=-1)

@@ -87,7 +87,7 @@ def test_names_of_other_elements(element: PlaneElement, name: str) -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(ValueError, match="is no permutation"):
+    with pytest.raises(ValueError, match="is not a permutation"):
         PlaneElement(permutation=(0, 0, 1))
     with pytest.raises(ValueError, match="of 2 and of 3 agents cannot be composed"):
         PlaneElement(permutation=(1, 0)) @ PlaneElement(permutation=(1, 0, 2))

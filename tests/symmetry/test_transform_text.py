@@ -66,13 +66,13 @@ def test_parse_group() -> None:
         ("rot1/0", "unknown transform 'rot1/0'"),
         ("c0", "'c0' is out of range"),
         ("c999", "'c999' is out of range"),
-        ("identity", "nothing besides the identity"),
-        ("rot360", "nothing besides the identity"),
+        ("identity", "only the identity"),
+        ("rot360", "only the identity"),
         ("so2,rot90", "list a group that is sampled"),
         ("flip-x*so2", "multiplies a sampled group"),
-        ("agents-0-1", "no order of 3 agents"),
-        ("agents-0-0-1", "no order of 3 agents"),
-        ("agents*agents", "no direct product"),
+        ("agents-0-1", "not an order of 3 agents"),
+        ("agents-0-0-1", "not an order of 3 agents"),
+        ("agents*agents", "not a direct product"),
         ("d100*d100", "40000 products"),
     ],
 )
@@ -84,5 +84,5 @@ def test_refusals(text: str, message: str) -> None:
 
 @pytest.mark.parametrize("text", ["rot90", "agents*d4", "d4*d4", "d4*agents*agents", "d4*rot90"])
 def test_what_is_no_group(text: str) -> None:
-    with pytest.raises(ValueError, match=r"names no group|no direct product"):
+    with pytest.raises(ValueError, match=r"is not a group|not a direct product"):
         parse_group(text, 3)
