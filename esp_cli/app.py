@@ -8,6 +8,8 @@ sentence too.
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
@@ -50,6 +52,7 @@ class LazyGroup(TyperGroup):
         """Run a command line; every failure that has a sentence becomes that sentence and its exit code."""
         extra["standalone_mode"] = False  # usage errors then come here instead of being printed in a box
         try:
+            _refuse_empty(sys.argv[1:] if args is None else args)
             code = super().main(args, prog_name or self.name, **extra)
         except Exception as failure:
             code = report(failure)
@@ -68,6 +71,14 @@ class LazyGroup(TyperGroup):
 
 class UserError(ValueError):
     """A mistake on the command line itself; the engine raises ValueError and its subclasses."""
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Refuse an argument without text, as a variable of the shell that is not set leaves one."""
+    for place, word in enumerate(words):
+        if not word or re.fullmatch(r"--[a-z-]+=", word):
+            where = f"'{word}'" if word else f"argument {place + 1}"
+            raise UserError(f"{where} is empty; write its value, or leave it out")
 
 
 def build_command(name: str, target: str) -> Any:

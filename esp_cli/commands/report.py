@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, parse_count
+from esp_cli.commands.options import JsonOption, check_finite, parse_count
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material
@@ -80,6 +80,10 @@ def report(
             raise ValueError("there is nothing to report; name a study folder or run folders")
         return
     limits, lines = threshold or [], _references(reference or [])
+    check_finite("--threshold", *limits)
+    check_finite("--view", *(view or ()))
+    if view is not None and view[0] >= view[1]:
+        raise ValueError(f"--view {view[0]:g} {view[1]:g} is empty; write the lowest return before the highest")
     is_study = StudyFolder.is_one(Path(runs[0]))
     if is_study:
         if len(runs) > 1 or at or reference or plot or view:

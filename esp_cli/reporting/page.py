@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from jinja2 import Environment, FileSystemLoader
 
@@ -62,7 +63,12 @@ def write_report(material: Material, out: Path) -> list[Path]:
         raise ValueError("no run of this study has an evaluation yet; run it first, or wait a little")
     out.mkdir(parents=True, exist_ok=True)
     panels = _panels(material)
-    pictures = _pictures(material, panels, out)
+    # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
+    with TemporaryDirectory() as scratch:
+        drawn = _pictures(material, panels, Path(scratch))
+        for file in (file for pair in drawn for file in pair):
+            replace_file(out / file.name, file.read_bytes())
+    pictures = [(out / png.name, out / svg.name) for png, svg in drawn]
     RESULTS_FORMAT.write(out / RESULTS, material.results.content())
     replace_file(out / MARL_EVAL, encode(marl_eval(material), out / MARL_EVAL))
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
@@ -100,10 +106,11 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
             period = trained.spec.control_period_s
             episodes = default_episodes(trained.spec)
             speed = max(1.0, episodes * trained.spec.horizon * period / _FILM_SECONDS)
-            with open_painter(env, "top", _FILM_PIXELS) as painter:
+            with open_painter(env, "top", _FILM_PIXELS) as painter, TemporaryDirectory() as scratch:
                 recorded = record(trained, env, trained.config.seeds[0], episodes)
                 taken = shots(recorded, stride(period, speed, _FILM_FRAMES_PER_SECOND))
-                write_film(run / FILM, painter, taken, period / speed, lambda _: None)
+                write_film(Path(scratch) / FILM, painter, taken, period / speed, lambda _: None)
+                replace_file(run / FILM, (Path(scratch) / FILM).read_bytes())
         watch(count)
 
 

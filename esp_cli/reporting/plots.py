@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
@@ -24,6 +25,8 @@ from numpy.typing import ArrayLike
 
 from esp_cli.evaluation.curve_statistics import Band, curve_band
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.files.failures import attempting
+from esp_cli.files.writing import write_file
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito, "Color Universal Design", 2008, without the yellow, which is too light for lines on white."""
@@ -259,12 +262,12 @@ def written_figure(
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         yield figure, (png, svg)
-        try:
-            # dates and versions would make every file differ from the last
-            figure.savefig(png, metadata={"Software": None})
-            figure.savefig(svg, metadata={"Date": None, "Creator": None})
-        except OSError as error:
-            raise ValueError(f"cannot write the figure {path}: {error.strerror or error}") from None
+        # dates and versions would make every file differ from the last
+        for file, metadata in ((png, {"Software": None}), (svg, {"Date": None, "Creator": None})):
+            content = BytesIO()
+            figure.savefig(content, format=file.suffix[1:], metadata=metadata)
+            with attempting("write the figure", file, ValueError):
+                write_file(file, content.getvalue())
 
 
 def _lines(anchors: Mapping[str, float] | None, references: Mapping[str, float] | None) -> list[_Line]:

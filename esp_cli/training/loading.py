@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
@@ -92,7 +93,7 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
         warnings.simplefilter("always", CheckpointWarning)
         found = folder.latest_checkpoint()
     if found is None:
-        raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {path}")
+        raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
     tensors, meta = found
     own = {name.removeprefix("policy."): t for name, t in tensors.items() if name.startswith("policy.")}
     notes = tuple(str(warning.message) for warning in caught)

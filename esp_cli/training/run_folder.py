@@ -21,6 +21,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from torch import Tensor
@@ -285,7 +286,9 @@ def _refuse_taken(path: Path, force: bool) -> None:
     """Refuse a folder that holds a run (unless forced) or files that no run has."""
     if (path / _CONFIG).exists():
         if not force:
-            raise RunFolderError(f"{path} exists: resume with esp train --resume {path} or choose another --out")
+            raise RunFolderError(
+                f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
+            )
         # forcing starts a run anew; it is no licence to write over somebody else's configuration
         RunFolder.open(path)
         return

@@ -148,7 +148,7 @@ def test_labels_are_pushed_apart_in_order():
         ),
         (lambda path: learning_curves([Curve("a", [1], [1.0])], path, "t", "y"), r"\[K, S\]"),
         (lambda path: bars([Bar("a", [math.nan])], path, "t", "x"), "not finite"),
-        (lambda path: bars(GROUPS, path / "no" / "a", "t", "x"), "cannot write the figure .*No such file"),
+        (lambda path: bars(GROUPS, "/dev/null/a", "t", "x"), "cannot write the figure .*(Not a directory|File exists)"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_sentence_and_no_file(tmp_path, draw, text):
