@@ -97,7 +97,7 @@ def report(
         command = _command(runs, at or [], limits, mode, out)
         steps = [parse_count(text) for text in at or []]
         material = loose.read_runs([_labelled(text) for text in runs], command, mode or "greedy", steps, limits)
-        document = loose.comparison(material, limits).document()
+        document = loose.comparison(material, limits)
     if json != "-":
         print_tables(material.results)
     if json is not None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 from scipy.integrate import trapezoid
 
 from esp_cli.evaluation.statistics import Floats, bootstrap
 
 _RESAMPLES = 2_000
-Band = Literal["ci95", "sem"]
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
     return np.asarray(trapezoid(curves, at, axis=0) / (at[-1] - at[0]), dtype=np.float64)
 
 
-def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, Floats]:
+def curve_band(values: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Return mean, lower and upper edge of a learning curve over seeds, each [K].
 
     The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
@@ -76,7 +73,6 @@ def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, 
 
     Args:
         values: [K, S].
-        band: 95 % bootstrap interval, or mean -+ one standard error.
 
     Raises:
         ValueError: values that are no [K, S].
@@ -89,12 +85,8 @@ def curve_band(values: ArrayLike, band: Band = "ci95") -> tuple[Floats, Floats, 
     mean[whole] = curves[whole].mean(axis=1)
     low, high = mean.copy(), mean.copy()
     if curves.shape[1] > 1 and whole.any():
-        if band == "sem":
-            sem = stats.sem(curves[whole], axis=1)
-            low[whole], high[whole] = mean[whole] - sem, mean[whole] + sem
-        else:
-            interval = bootstrap((curves[whole],), np.mean, _RESAMPLES)
-            low[whole], high[whole] = interval.low, interval.high
+        interval = bootstrap((curves[whole],), np.mean, _RESAMPLES)
+        low[whole], high[whole] = interval.low, interval.high
     return mean, low, high
 
 

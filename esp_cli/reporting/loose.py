@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, JsonValue
+from pydantic import JsonValue
 
 from esp_cli.evaluation.final import Mode
 from esp_cli.evaluation.statistics import Interval, SeedSummary, summarise
@@ -18,62 +18,6 @@ from esp_cli.reporting.summary import floats, summarise_cell
 from esp_cli.studies.study import Cell, Study
 
 KIND = "runs"
-
-
-class GapEntry(BaseModel):
-    """The difference from the first run."""
-
-    mean: float
-    ci95: Interval | None
-    paired: bool
-
-
-class ReturnEntry(BaseModel):
-    """The returns of a run at a step; the fields of the difference are missing where there is none."""
-
-    mean: float | None
-    sem: float | None
-    ci95: Interval | None
-    per_seed: tuple[float | None, ...]
-    difference: GapEntry | None = None
-    probability_of_improvement: float | None = None
-    probability_of_improvement_ci95: Interval | None = None
-
-
-class PassingEntry(BaseModel):
-    """When a return is first reached: environment steps per seed, None for never."""
-
-    mean: int | None
-    per_seed: tuple[int | None, ...]
-
-
-class RunEntry(BaseModel):
-    """One run: at which step it stands, and its returns by the step at which it is compared."""
-
-    label: str
-    seeds: tuple[int, ...]
-    seconds: float
-    step: int
-    returns: dict[int, ReturnEntry | None]
-    steps_to: dict[float, PassingEntry]
-    area_under_curve: SeedSummary | None
-    config: dict[str, JsonValue]
-
-
-class Comparison(BaseModel):
-    """Runs side by side, as `esp report RUN... --json` writes them."""
-
-    model_config = ConfigDict(frozen=True)
-
-    task: str
-    task_version: int
-    convention: str
-    episodes_per_evaluation: int
-    runs: tuple[RunEntry, ...]
-
-    def document(self) -> dict[str, JsonValue]:
-        """Return what is written."""
-        return self.model_dump(mode="json", exclude_unset=True)
 
 
 def read_runs(
@@ -147,42 +91,67 @@ def put_together(
     return Material(study, results_of(study, states, mode, thresholds), by_name, runs)
 
 
-def comparison(material: Material, thresholds: Sequence[float]) -> Comparison:
-    """Return runs side by side.
+def comparison(material: Material, thresholds: Sequence[float]) -> dict[str, JsonValue]:
+    """Return runs side by side, as `esp report RUN... --json` writes them.
 
     Args:
         material: of `read_runs`.
         thresholds: that the user asked for.
+
+    Returns:
+        A document: task, task_version, convention, episodes_per_evaluation, and by run its label, seeds, seconds, the
+        step at which it stands, returns by step (None where it did not get there), steps to thresholds, area under the
+        curve up to the last of these steps, and configuration.
     """
-    results, curves = material.results, material.curves
     by_run: dict[str, list[CellResult]] = {}
-    for cell in results.cells:
+    for cell in material.results.cells:
         by_run.setdefault(cell.variant, []).append(cell)
-    entries = []
+    runs: list[JsonValue] = []
     for label, cells in by_run.items():
-        last, curve = cells[-1], curves[cells[-1].name]
-        passed = {p.threshold: PassingEntry(mean=p.of_mean, per_seed=p.per_seed) for p in last.steps_to}
-        area = None if last.area_under_curve is None else summarise(floats(last.area_under_curve))
-        entries.append(
-            RunEntry(
-                label=label,
-                seeds=last.seeds,
-                seconds=curve.seconds,
-                step=last.step,
-                returns={cell.at or 0: _entry(material, cell) for cell in cells},
-                steps_to=passed if thresholds else {},
-                area_under_curve=area,
-                config=curve.config.model_dump(mode="json"),
-            )
+        last, curve = cells[-1], material.curves[cells[-1].name]
+        passed = last.steps_to if thresholds else ()
+        area = last.area_under_curve
+        runs.append(
+            {
+                "label": label,
+                "seeds": list(last.seeds),
+                "seconds": curve.seconds,
+                "step": last.step,
+                "returns": {str(cell.at): _returns(material, cell) for cell in cells},
+                "steps_to": {str(p.threshold): {"mean": p.of_mean, "per_seed": list(p.per_seed)} for p in passed},
+                "area_under_curve": None if area is None else _summary(summarise(floats(area))),
+                "config": curve.config.model_dump(mode="json"),
+            }
         )
-    first = next(iter(curves.values()))
-    return Comparison(
-        task=first.spec.name,
-        task_version=first.spec.version,
-        convention=first.spec.convention,
-        episodes_per_evaluation=min(curve.config.evaluation.episodes for curve in curves.values()),
-        runs=tuple(entries),
-    )
+    spec = next(iter(material.curves.values())).spec
+    return {
+        "task": spec.name,
+        "task_version": spec.version,
+        "convention": spec.convention,
+        "episodes_per_evaluation": min(curve.config.evaluation.episodes for curve in material.curves.values()),
+        "runs": runs,
+    }
+
+
+def _returns(material: Material, cell: CellResult) -> JsonValue:
+    found = summarise_cell(material.results, cell)
+    if found is None:
+        return None
+    out = _summary(found.returns)
+    if found.gap is not None:
+        gap, chance = found.gap.difference, found.gap.probability
+        out["difference"] = {"mean": gap.value, "ci95": _interval(gap.ci95), "paired": found.gap.paired}
+        out["probability_of_improvement"] = chance.value if chance else None
+        out["probability_of_improvement_ci95"] = _interval(chance.ci95) if chance else None
+    return out
+
+
+def _summary(of: SeedSummary) -> dict[str, JsonValue]:
+    return {"mean": of.mean, "sem": of.sem, "ci95": _interval(of.ci95), "per_seed": list(of.per_seed)}
+
+
+def _interval(interval: Interval | None) -> JsonValue:
+    return None if interval is None else list(interval)
 
 
 def plot(
@@ -201,19 +170,3 @@ def plot(
     lines = [Curve(label, curve.steps, curve.values) for label, curve in curves.items()]
     ylabel = f"{material.results.mode} return ({first.spec.convention})"
     return learning_curves(lines, path, first.config.task, ylabel, references=references, ylim=view)
-
-
-def _entry(material: Material, cell: CellResult) -> ReturnEntry | None:
-    found = summarise_cell(material.results, cell)
-    if found is None:
-        return None
-    own = found.returns
-    fields: dict[str, object] = {"mean": own.mean, "sem": own.sem, "ci95": own.ci95, "per_seed": own.per_seed}
-    if found.gap is not None:
-        gap, chance = found.gap, found.gap.probability
-        fields |= {
-            "difference": GapEntry(mean=gap.difference.value, ci95=gap.difference.ci95, paired=gap.paired),
-            "probability_of_improvement": chance.value if chance else None,
-            "probability_of_improvement_ci95": chance.ci95 if chance else None,
-        }
-    return ReturnEntry.model_validate(fields)

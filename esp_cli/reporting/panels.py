@@ -14,9 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.curve_statistics import Band
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
-from esp_cli.reporting.plots import Curve, appearance, draw_curve, written_figure
+from esp_cli.reporting.plots import CAPTION, Curve, appearance, draw_curve, written_figure
 
 _PANEL_INCHES = (4.0, 3.2)
 _LEGEND_INCHES = 0.8
@@ -59,16 +58,13 @@ class Sensitivity:
     paper: Mapping[str, float] = field(default_factory=dict)
 
 
-def curve_panels(
-    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, band: Band = "ci95"
-) -> tuple[Path, Path]:
+def curve_panels(panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str) -> tuple[Path, Path]:
     """Draw learning curves in panels side by side with one legend, as in figure 4 of the paper.
 
     Args:
         panels: at least one, each with at least one curve.
         path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         ylabel: what is plotted.
-        band: what the shade is.
 
     Returns:
         The PNG and the SVG file.
@@ -87,7 +83,7 @@ def curve_panels(
         handles: dict[str, Artist] = {}
         for axes, panel in zip(grid.flat, panels, strict=False):
             for curve in panel.curves:
-                draw_curve(axes, curve, labels.index(curve.label), band)
+                draw_curve(axes, curve, labels.index(curve.label))
                 handles.setdefault(curve.label, axes.lines[-1])
             _draw_anchors(axes, panel.anchors)
             axes.set_title(panel.title, loc="left", fontweight="bold")
@@ -97,13 +93,12 @@ def curve_panels(
             axes.set_visible(False)
         for row in grid:
             row[0].set_ylabel(ylabel)
-        shade = "95 % bootstrap interval" if band == "ci95" else "standard error"
         figure.legend(
             [handles[label] for label in labels],
             labels,
             loc="outside lower center",
             ncols=min(len(labels), 2 * columns),
-            title=f"mean and {shade} over seeds",
+            title=CAPTION,
         )
     return files
 
@@ -175,7 +170,7 @@ def sensitivity(
                 axes.plot(list(known), list(known.values()), "x", color=colour, markersize=8, label=label)
         axes.set_xticks(range(len(places)), list(places))
         axes.set_title(title, loc="left", fontweight="bold")
-        axes.set_xlabel(f"{xlabel}\nmean and 95 % bootstrap interval over seeds")
+        axes.set_xlabel(f"{xlabel}\n{CAPTION}")
         axes.set_ylabel(ylabel)
         figure.legend(loc="outside lower center", ncols=2)
     return files

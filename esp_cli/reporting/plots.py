@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.curve_statistics import Band, curve_band
+from esp_cli.evaluation.curve_statistics import curve_band
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.files.failures import attempting
 from esp_cli.files.writing import write_file
@@ -53,7 +53,7 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "esp",
 }
 _LABEL_GAP = 0.045  # of the height of the axes
-_BAND_NAMES = {"ci95": "95 % bootstrap interval", "sem": "standard error"}
+CAPTION = "mean and 95 % bootstrap interval over seeds"
 
 
 @dataclass(frozen=True)
@@ -84,36 +84,22 @@ class Bar:
     values: ArrayLike
 
 
-@dataclass(frozen=True)
-class _Line:
-    """A value drawn across the axes, dotted for an anchor, dashed for a reference."""
-
-    name: str
-    value: float
-    style: LineStyle
-    colour: str
-
-
 def learning_curves(
     curves: Sequence[Curve],
     path: str | os.PathLike[str],
     title: str,
     ylabel: str,
-    anchors: Mapping[str, float] | None = None,
     references: Mapping[str, float] | None = None,
-    band: Band = "ci95",
     ylim: tuple[float, float] | None = None,
 ) -> tuple[Path, Path]:
-    """Draw means over seeds with a band, beside horizontal lines for anchors and for numbers of others.
+    """Draw means over seeds with their 95 % bootstrap intervals, beside horizontal lines for numbers of others.
 
     Args:
         curves: at least one.
         path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         title: heading.
         ylabel: what is plotted, with its convention.
-        anchors: dotted lines: name -> value, as of the random and the heuristic policy.
         references: dashed lines: name -> value, as of a paper.
-        band: what the shade is.
         ylim: lowest and highest value in view; by default all of the curves and lines.
 
     Returns:
@@ -126,37 +112,33 @@ def learning_curves(
         raise ValueError("there is no curve to draw")
     with _figure(path, title) as (figure, axes, files):
         for index, curve in enumerate(curves):
-            draw_curve(axes, curve, index, band)
+            draw_curve(axes, curve, index)
         if ylim is not None:
             axes.set_ylim(*ylim)
-        lines = _lines(anchors, references)
-        for line in lines:
-            axes.axhline(line.value, linestyle=line.style, color=line.colour, linewidth=1.0, zorder=1)
-        _label_lines(axes, lines)
+        for value in (references or {}).values():
+            axes.axhline(value, linestyle=(0, (8, 4)), color="#333333", linewidth=1.0, zorder=1)
+        _label_lines(axes, references or {})
         axes.set_xlabel("environment steps per seed")
         axes.set_ylabel(fill(ylabel, _LABEL_CHARACTERS))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         # below the axes: inside, it would cover a curve sooner or later
         columns = 2 if len(curves) > 1 else 1
-        figure.legend(
-            loc="outside lower left", ncols=columns, title=_caption(band, [np.shape(c.values)[1] for c in curves])
-        )
+        figure.legend(loc="outside lower left", ncols=columns, title=_caption([np.shape(c.values)[1] for c in curves]))
     return files
 
 
-def draw_curve(axes: Axes, curve: Curve, index: int, band: Band) -> None:
+def draw_curve(axes: Axes, curve: Curve, index: int) -> None:
     """Draw a curve with its band into axes.
 
     Args:
         axes: where to.
         curve: the curve.
         index: which colour and line style it has.
-        band: what the shade is.
 
     Raises:
         ValueError: shapes that do not fit.
     """
-    mean, low, high = curve_band(curve.values, band)
+    mean, low, high = curve_band(curve.values)
     steps = np.asarray(curve.steps, dtype=np.float64)
     if steps.shape != mean.shape:
         raise ValueError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
@@ -181,8 +163,6 @@ def bars(
     xlabel: str,
     baseline: float = 0.0,
     anchors: Mapping[str, float] | None = None,
-    references: Mapping[str, float] | None = None,
-    band: Band = "ci95",
 ) -> tuple[Path, Path]:
     """Draw a horizontal bar per group with its interval and every seed as a dot.
 
@@ -193,8 +173,6 @@ def bars(
         xlabel: what is plotted, with its convention.
         baseline: where bars begin. The random policy's return makes a bar's length what was learned.
         anchors: dotted lines: name -> value.
-        references: dashed lines: name -> value.
-        band: what the whiskers are.
 
     Returns:
         The PNG and the SVG file.
@@ -208,26 +186,25 @@ def bars(
     with _figure(path, title, height) as (_, axes, files):
         for index, group in enumerate(groups):
             colour = PALETTE[index % len(PALETTE)]
-            mean, sem = mean_and_sem(group.values)
+            mean, _ = mean_and_sem(group.values)
             values = np.asarray(group.values, dtype=np.float64)
             axes.barh(index, mean - baseline, left=baseline, height=0.6, color=colour, alpha=0.55)
             # a fixed spread instead of a random one keeps the dots apart and the file the same
             spread = np.linspace(-0.18, 0.18, values.size) if values.size > 1 else np.zeros(1)
             axes.plot(values, index + spread, "o", color=colour, markersize=3.5, markeredgewidth=0)
-            interval = bootstrap_interval(values) if band == "ci95" else (mean - (sem or 0.0), mean + (sem or 0.0))
-            if interval is not None and values.size > 1:
+            interval = bootstrap_interval(values)
+            if interval is not None:
                 axes.plot(interval, [index, index], color="black", linewidth=1.6, marker="|", markersize=9)
         axes.set_yticks(range(len(groups)), [f"{group.label}\n({_seeds(np.size(group.values))})" for group in groups])
         axes.invert_yaxis()
         axes.grid(visible=False, axis="y")
-        for line in _lines(anchors, references):
-            label = f"{line.name} {line.value:g}"
-            axes.axvline(line.value, linestyle=line.style, color=line.colour, linewidth=1.2, label=label)
+        for name, value in (anchors or {}).items():
+            axes.axvline(value, linestyle=":", color="#777777", linewidth=1.2, label=f"{name} {value:g}")
         if baseline:
             axes.axvline(baseline, color="black", linewidth=0.8)
-        caption = _caption(band, [np.size(group.values) for group in groups])
+        caption = _caption([np.size(group.values) for group in groups])
         axes.set_xlabel(f"{xlabel}\n{caption}" if caption else xlabel)
-        if anchors or references:
+        if anchors:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return files
 
@@ -270,20 +247,14 @@ def written_figure(
                 write_file(file, content.getvalue())
 
 
-def _lines(anchors: Mapping[str, float] | None, references: Mapping[str, float] | None) -> list[_Line]:
-    dotted = [_Line(name, value, ":", "#777777") for name, value in (anchors or {}).items()]
-    dashed = [_Line(name, value, (0, (8, 4)), "#333333") for name, value in (references or {}).items()]
-    return dotted + dashed
-
-
-def _label_lines(axes: Axes, lines: Sequence[_Line]) -> None:
+def _label_lines(axes: Axes, lines: Mapping[str, float]) -> None:
     """Write the names of the horizontal lines in view at the right, pushed apart where values are close."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high)
-    shown = [line for line in lines if low <= line.value <= high]
-    heights = _spread([(line.value - low) / (high - low) for line in shown])
-    for line, height in zip(shown, heights, strict=True):
-        axes.text(1.01, height, f"{line.name} {line.value:g}", transform=axes.transAxes, va="center", fontsize=8)
+    shown = {name: value for name, value in lines.items() if low <= value <= high}
+    heights = _spread([(value - low) / (high - low) for value in shown.values()])
+    for (name, value), height in zip(shown.items(), heights, strict=True):
+        axes.text(1.01, height, f"{name} {value:g}", transform=axes.transAxes, va="center", fontsize=8)
 
 
 def _spread(heights: Sequence[float]) -> list[float]:
@@ -307,5 +278,5 @@ def _seeds(count: int) -> str:
     return f"{count} seed" if count == 1 else f"{count} seeds"
 
 
-def _caption(band: Band, seed_counts: Sequence[int]) -> str | None:
-    return f"mean and {_BAND_NAMES[band]} over seeds" if max(seed_counts) > 1 else None
+def _caption(seed_counts: Sequence[int]) -> str | None:
+    return CAPTION if max(seed_counts) > 1 else None

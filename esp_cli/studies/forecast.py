@@ -99,29 +99,13 @@ def forecast(
 
 def _finished(run: Run, path: Path) -> RunForecast:
     size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    return RunForecast(
-        name=run.cell.name,
-        status="finished",
-        step=run.cell.config.steps,
-        seconds_left=0.0,
-        seconds=None,
-        disk_bytes=size,
-        peak_bytes=size,
-        config=run.cell.config,
-    )
+    config = run.cell.config
+    return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, size, size, config)
 
 
 def _measured(run: Run, episodes: int) -> RunForecast:
     config = run.cell.config
     cost = probe(config, episodes)
     left = cost.training_s * (1 - run.step / config.steps) + cost.evaluation_s
-    return RunForecast(
-        name=run.cell.name,
-        status=run.status,
-        step=run.step,
-        seconds_left=left,
-        seconds=cost.training_s + cost.evaluation_s,
-        disk_bytes=cost.disk_bytes,
-        peak_bytes=cost.peak_bytes,
-        config=config,
-    )
+    whole = cost.training_s + cost.evaluation_s
+    return RunForecast(run.cell.name, run.status, run.step, left, whole, cost.disk_bytes, cost.peak_bytes, config)

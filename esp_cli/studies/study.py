@@ -88,19 +88,10 @@ class Study(BaseModel):
     rows: Literal["panels", "variants"] = Field(description="what the rows of the table are; the other are columns")
     cells: tuple[Cell, ...]
 
-    def cell(self, name: str) -> Cell:
-        """Return a cell by its name."""
-        return next(cell for cell in self.cells if cell.name == name)
-
     @property
     def panels(self) -> list[str]:
         """The panels in order."""
         return list(dict.fromkeys(cell.panel for cell in self.cells))
-
-    @property
-    def variants(self) -> list[str]:
-        """The variants in order."""
-        return list(dict.fromkeys(cell.variant for cell in self.cells))
 
 
 class StudyFolder:

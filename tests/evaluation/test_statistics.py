@@ -223,9 +223,6 @@ def test_curve_band_is_the_interval_at_each_step():
     assert low[1] == pytest.approx(2 * low[0])
     assert high[1] == pytest.approx(2 * high[0])
     assert (low[0], high[0]) == pytest.approx(bootstrap_interval(TEN), abs=0.2)
-    mean, low, high = curve_band(values, "sem")
-    assert high[0] - mean[0] == pytest.approx(mean_and_sem(TEN)[1])
-    assert mean[0] - low[0] == pytest.approx(mean_and_sem(TEN)[1])
 
 
 def test_curve_band_of_one_seed_is_the_curve():

@@ -36,7 +36,7 @@ def gathered(curves, at=(), thresholds=()):
 def compare(curves, at, thresholds) -> dict:
     """The document that `esp report RUN... --json` writes."""
     named = [c if c.label != "run" else replace(c, label=f"run {k}") for k, c in enumerate(curves)]
-    return comparison(gathered(named, at, thresholds), thresholds).document()
+    return comparison(gathered(named, at, thresholds), thresholds)
 
 
 def written(folder: Path, rows: list[dict], **choice) -> RunFolder:

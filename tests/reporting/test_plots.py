@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from esp_cli.evaluation.curve_statistics import curve_band
 from esp_cli.reporting import plots
 from esp_cli.reporting.plots import PALETTE, Bar, Curve, bars, learning_curves
 
@@ -34,12 +35,12 @@ def drawn(monkeypatch):
 
 
 def draw_curves(path, **changes):
-    settings = {"anchors": {"random": -221.4, "heuristic": -109.0}, "references": {"paper": -110.22}, **changes}
+    settings = {"references": {"random": -221.4, "heuristic": -109.0, "paper": -110.22}, **changes}
     return learning_curves(CURVES, path, "navigation", "return, convention esp", **settings)
 
 
 def draw_bars(path, **changes):
-    settings = {"baseline": -221.4, "anchors": {"random": -221.4}, "references": {"paper": -122.25}, **changes}
+    settings = {"baseline": -221.4, "anchors": {"random": -221.4}, **changes}
     return bars(GROUPS, path, "transforms", "return, convention esp", **settings)
 
 
@@ -57,9 +58,10 @@ def test_figures_are_the_same_bytes_every_time_and_carry_no_date(tmp_path, draw)
     assert "dc:date" not in text
 
 
-@pytest.mark.parametrize("draw", [draw_curves, draw_bars])
-def test_other_numbers_are_another_figure(tmp_path, draw):
-    assert draw(tmp_path / "a")[1].read_bytes() != draw(tmp_path / "b", references={"paper": -130.0})[1].read_bytes()
+@pytest.mark.parametrize(("draw", "lines"), [(draw_curves, "references"), (draw_bars, "anchors")])
+def test_other_numbers_are_another_figure(tmp_path, draw, lines):
+    other = draw(tmp_path / "b", **{lines: {"paper": -130.0}})
+    assert draw(tmp_path / "a")[1].read_bytes() != other[1].read_bytes()
 
 
 def test_the_settings_of_the_caller_are_left_alone(tmp_path):
@@ -85,13 +87,13 @@ def test_curves_show_the_mean_over_seeds_in_colours_apart(tmp_path, drawn):
     assert {text.get_text() for text in axes.texts} == {"random -221.4", "heuristic -109", "paper -110.22"}
 
 
-def test_the_band_is_as_wide_as_asked_for(tmp_path, drawn):
-    one_step = [Curve("a", [0, 1], [[1.0, 3.0, 5.0]] * 2)]
-    learning_curves(one_step, tmp_path / "a", "t", "y", band="sem")
+def test_the_band_is_the_bootstrap_interval(tmp_path, drawn):
+    values = [[1.0, 3.0, 5.0]] * 2
+    learning_curves([Curve("a", [0, 1], values)], tmp_path / "a", "t", "y")
     edges = drawn[0].axes[0].collections[0].get_paths()[0].vertices[:, 1]
-    # mean 3, s.e.m. 2 / sqrt(3)
-    assert edges.min() == pytest.approx(3 - 2 / math.sqrt(3))
-    assert edges.max() == pytest.approx(3 + 2 / math.sqrt(3))
+    _, low, high = curve_band(values)
+    assert (edges.min(), edges.max()) == (low[0], high[0])
+    assert 1.0 <= low[0] < 3.0 < high[0] <= 5.0
 
 
 def test_one_seed_has_no_band_and_one_step_is_a_dot(tmp_path, drawn):
