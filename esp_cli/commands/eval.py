@@ -35,9 +35,9 @@ def evaluate(
     prior: BundledPriorOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Play episodes greedily and stochastically; print mean, s.e.m., 95 % interval, anchors and task metrics.
+    """Play episodes greedily and stochastically; print mean, s.e.m., 95 % interval, reference policies and metrics.
 
-    A policy may be played under other settings of its task than it was trained under: another physics, more noise.
+    The task may have other settings than in training: another physics, more noise.
     """
     from esp_cli.deploy.bundled import open_policy
     from esp_cli.evaluation.final import evaluate as evaluate_policy

@@ -1,7 +1,7 @@
 """Options and arguments that several commands share, and the parsers behind them.
 
-A command writes `task: TaskOption = "navigation"`: the flag, its help and its parser stand here once, the default
-stands in the command.
+A command writes `task: TaskOption = "navigation"`: flag, help and parser are declared here, the default in the
+command.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[
 MAX_STEPS = 10**12
 """Steps that one run may take; the fastest machine needs years for them."""
 MAX_SEEDS = 1000
-"""Seeds that one run may hold; more is a slip of the keyboard, not a study."""
+"""Most seeds of one run; more is a typing error."""
 
 
 def parse_count(value: str | int) -> int:
@@ -36,7 +36,7 @@ def parse_count(value: str | int) -> int:
     text = str(value).strip()
     match = _COUNT.fullmatch(text)
     if match is None:
-        raise ValueError(f"'{text}' is no number of steps; write for example 20000, 500k or 1.5M")
+        raise ValueError(f"'{text}' is not a number of steps; write for example 20000, 500k or 1.5M")
     count = Decimal(match["number"].replace("_", "")) * _MULTIPLIERS[match["letter"].lower()]
     if count != count.to_integral_value() or count < 1:
         raise ValueError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
@@ -49,7 +49,7 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
     """Read the seeds of a run: "10" means the ten seeds 0..9, "3,7" the seeds 3 and 7, "7," the seed 7 alone.
 
     Raises:
-        ValueError: no such list, a seed twice, or too many seeds.
+        ValueError: not a list of seeds, a seed twice, or too many seeds.
     """
     if not isinstance(value, str | int):
         return tuple(value)
@@ -62,7 +62,7 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
             )
         return tuple(range(count))
     if not re.fullmatch(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?", text):
-        raise ValueError(f"'{text}' names no seeds; write a number of seeds as 10 or a list as 3,7")
+        raise ValueError(f"'{text}' does not name seeds; write how many, as 10, or a list, as 3,7")
     seeds = tuple(int(item) for item in text.split(",") if item.strip())
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"the seeds '{text}' name one seed twice; name each once")
@@ -70,7 +70,7 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
 
 
 def parse_assignments(items: Iterable[str]) -> dict[str, object]:
-    """Read settings written as "name=value"; a value is JSON where it can be, else the text as it is.
+    """Read settings written as "name=value"; a value that is not JSON is text.
 
     "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; "prey=random" -> {"prey": "random"}.
 
@@ -83,7 +83,7 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
         name = name.strip()
         if not equals or not name:
             raise ValueError(
-                f"--set {item} is no setting; write --set name=value, as in --set mappo.learning_rate=5e-4"
+                f"--set {item} is not a setting; write --set name=value, as in --set mappo.learning_rate=5e-4"
             )
         if name in settings:
             raise ValueError(f"--set names '{name}' twice; set it once")
@@ -107,7 +107,7 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
     settings = parse_assignments(items)
     for name in settings:
         if not name.startswith("task."):
-            raise ValueError(f"--set {name} changes no setting of the task; here it takes only task.NAME=VALUE")
+            raise ValueError(f"--set {name} is not a setting of the task; this command takes only task.NAME=VALUE")
     own = {name.removeprefix("task."): value for name, value in settings.items()}
     return own if physics is None else {**own, "physics": physics}
 
@@ -138,7 +138,7 @@ def resolve_device(wanted: str) -> str:
 
 
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
-    """Wrap a parser so that its message reaches the user beside the option it belongs to."""
+    """Wrap a parser so that its message names the option."""
 
     def parser(value: str) -> T:
         try:
@@ -175,9 +175,10 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
             parser=_option_parser(parse_seeds, "SEEDS"),
         ),
     ]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Where the result goes.", metavar="PATH")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
 DeviceOption = Annotated[
-    Literal["auto", "cpu", "cuda"], typer.Option("--device", help="Where to compute; auto takes a GPU if there is one.")
+    Literal["auto", "cpu", "cuda"],
+    typer.Option("--device", help="Device to compute on; auto takes a GPU if there is one."),
 ]
 JsonOption = Annotated[
     str | None,
@@ -187,13 +188,11 @@ JsonOption = Annotated[
         metavar="FILE",
     ),
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace what stands where the result goes.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
 EpisodesOption = Annotated[int, typer.Option("--episodes", "-e", min=1, help="Episodes per seed.", metavar="COUNT")]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", help="Change one setting, as mappo.learning_rate=5e-4; may be repeated.", metavar="NAME=VALUE"
-    ),
+    typer.Option("--set", help="Change one setting, as mappo.learning_rate=5e-4; repeatable.", metavar="NAME=VALUE"),
 ]
 TaskSetOption = Annotated[
     list[str] | None,
@@ -214,15 +213,15 @@ TransformsOption = Annotated[
 PolicyArgument = Annotated[
     Path,
     typer.Argument(
-        help="Run folder, policy file, or a trained policy that comes along: its task or its name (`esp policies`).",
+        help="Run folder, policy file, or bundled policy by its task or its name (`esp policies`).",
         metavar="RUN|POLICY",
     ),
 ]
 BundledAlgoOption = Annotated[
     str | None,
-    typer.Option("--algo", "-a", help="Of the policies that come along, the one by this algorithm.", metavar="ALGO"),
+    typer.Option("--algo", "-a", help="Choose the bundled policy that this algorithm trained.", metavar="ALGO"),
 ]
 BundledPriorOption = Annotated[
     Literal["esp", "augment", "consistency", "none"] | None,
-    typer.Option("--prior", help="Of the policies that come along, one with this prior (none: the plain learner)."),
+    typer.Option("--prior", help="Choose the bundled policy with this prior (none: the plain learner)."),
 ]

@@ -1,4 +1,4 @@
-"""`esp policies`: the trained policies that come along."""
+"""`esp policies`: the bundled policies."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ EPILOG = """Examples:\n
 
 
 def policies(
-    task: Annotated[str | None, typer.Argument(help="Only those of this task.", metavar="[TASK]")] = None,
+    task: Annotated[str | None, typer.Argument(help="List only the policies of this task.", metavar="[TASK]")] = None,
     json: JsonOption = None,
 ) -> None:
-    """List the trained policies that come along, with what each scores and the command that trains such a run."""
+    """List the bundled policies, with the score of each and the command that trains such a run."""
     from esp_cli.deploy.manifest import bundled_folder, read_bundled
 
     found = [entry for entry in read_bundled() if task in (None, entry.task)]
     if not found:
-        raise ValueError(f"{bundled_folder()} holds no policy of {task or 'any task'}; 'esp policies' lists all")
+        raise ValueError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
     if json != "-":
         rows = [
             (
@@ -48,7 +48,7 @@ def policies(
             "episodes>",
             "reward convention",
         )
-        caption = "greedy, interval over episodes; the seed is the best of its run, found on other episodes"
+        caption = "greedy, interval over episodes; the seed is the best of its run on other episodes"
         console.table(headings, rows, caption=caption)
         for entry in found if task else ():
             console.say(f"{entry.name}: {entry.command}")

@@ -16,10 +16,10 @@ EPILOG = """Examples:\n
 
 
 def tasks(
-    task: Annotated[str | None, typer.Argument(help="Show the whole card of this task.", metavar="[TASK]")] = None,
+    task: Annotated[str | None, typer.Argument(help="Print the card of this task.", metavar="[TASK]")] = None,
     json: JsonOption = None,
 ) -> None:
-    """List the tasks and the symmetries that each carries, or print the card of one task."""
+    """List the tasks with their symmetries, or print the card of one task."""
     from esp_cli.symmetry import carried_groups
     from esp_envs.registry import make, task_class, task_names
     from esp_envs.spec import describe_action

@@ -48,7 +48,10 @@ def train(
     ] = "default",
     prior: Annotated[
         Literal["esp", "augment", "consistency", "none"] | None,
-        typer.Option("--prior", help="Both means of the prior, one of them, or the plain learner."),
+        typer.Option(
+            "--prior",
+            help="esp: both parts of the prior; augment or consistency: one of them; none: the plain learner.",
+        ),
     ] = None,
     transforms: TransformsOption = None,
     consistency_coef: Annotated[
@@ -69,7 +72,7 @@ def train(
         Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.", metavar="PATH")
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option("--resume", help="Go on with this run folder, just as it was.", metavar="RUN")
+        Path | None, typer.Option("--resume", help="Continue this run with its own settings.", metavar="RUN")
     ] = None,
     device: DeviceOption = "cpu",
     settings: SetOption = None,
@@ -94,14 +97,14 @@ def train(
         given = {name: value for name, value in chosen.items() if value is not None}
         overrides = {**given, **parse_assignments(settings or [])}
         config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), overrides)
-        build_learner(config)  # refuses what does not go together while there is no run folder yet
+        build_learner(config)  # refuses settings that do not fit together before a run folder exists
         name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
         folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
     train_folder(folder, tensorboard)
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
-    """Refuse options that a resumed run, which keeps its own configuration, would silently ignore."""
+    """Refuse options that a resumed run would ignore: it keeps its own configuration."""
     given = [
         parameter.opts[0]
         for parameter in context.command.params
@@ -110,12 +113,12 @@ def _refuse_beside_resume(context: typer.Context) -> None:
     ]
     if given:
         raise ValueError(
-            f"--resume goes on with a run just as it was; leave out {', '.join(given)}, or start a new run"
+            f"--resume continues a run with its own settings; leave out {', '.join(given)}, or start a new run"
         )
 
 
 def train_folder(folder: RunFolder, tensorboard: bool) -> None:
-    """Train in a locked run folder until the end or an interrupt, then say what came out and what to do next."""
+    """Train in a locked run folder until the end or an interrupt, then print the result and the next command."""
     from esp_cli.training.loading import parse_config
     from esp_cli.training.trainer import Trainer
 
@@ -138,7 +141,7 @@ def train_folder(folder: RunFolder, tensorboard: bool) -> None:
             complete = trainer.run(listen)
     if not complete:
         console.note(
-            f"stopped at {console.format_count(trainer.step)} steps; go on with: "
+            f"stopped at {console.format_count(trainer.step)} steps; continue with: "
             f"{shlex.join(['esp', 'train', '--resume', str(folder.path)])}"
         )
         raise typer.Exit(130)
@@ -158,7 +161,7 @@ def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
 
 
 def _shown(news: Progress) -> dict[str, float]:
-    """Return the few numbers worth a look while it runs, as means over the seeds that still train."""
+    """Return the numbers of the progress line: means over the seeds that still train."""
     names = {"greedy": "eval/return_greedy", "return": "train/return", "entropy": "train/entropy"}
     out = {}
     for label, name in names.items():

@@ -75,7 +75,9 @@ def open_policy(
     if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled(folder)):
         return load_entry(find(str(where), algo, prior, folder), folder)
     if choosy:
-        raise ValueError(f"--algo and --prior choose among a task's policies, but {where} is no task; leave them out")
+        raise ValueError(
+            f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out"
+        )
     return load_policy(where)
 
 
@@ -88,5 +90,5 @@ def load_entry(entry: Entry, folder: Path | None = None) -> TrainedPolicy:
     trained = load_policy((folder or manifest.bundled_folder()) / entry.file, entry.sha256)
     described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
     if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
-        raise ValueError(f"{trained.source} holds another policy than its manifest says; get both anew")
+        raise ValueError(f"{trained.source} does not hold the policy that its manifest describes; get both again")
     return trained

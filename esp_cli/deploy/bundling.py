@@ -56,12 +56,12 @@ def bundle(
         Its line in the manifest.
 
     Raises:
-        ValueError: no such seed, a name that is none, a damaged manifest, or a file that cannot be written.
+        ValueError: an unknown seed, an invalid name, a damaged manifest, or a file that cannot be written.
     """
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
     if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
-        raise ValueError(f"'{name}' is no name for a policy; write words of a-z and 0-9 with - between them")
+        raise ValueError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
     alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
     played = play_greedily(alone, episodes)
     score = score_of(played)

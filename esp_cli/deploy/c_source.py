@@ -17,12 +17,12 @@ from esp_cli.deploy.program import (
 )
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
-"""With which the source compiles without a word."""
+"""The source compiles without warnings under these."""
 
 
 @dataclass(frozen=True)
 class CSource:
-    """The two files, and what they take of a microcontroller.
+    """The two files, and the memory that they need on a microcontroller.
 
     Attributes:
         flash_bytes: of the weights; the code comes on top (about 1 kB without libm).
@@ -43,10 +43,12 @@ def c_source(program: Program, comment: str) -> CSource:
         comment: what it is, line by line; stands at the top of the header.
 
     Raises:
-        ValueError: agents that exchange messages, and whose actions are no choices.
+        ValueError: agents that exchange messages and have continuous actions.
     """
     if program.team > 1 and program.head != "choose":
-        raise ValueError("of agents that exchange messages, only choices are written as C; use onnx, torch or numpy")
+        raise ValueError(
+            "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
+        )
     scratch = _Scratch(program)
     return CSource(
         header=_header(program, comment),

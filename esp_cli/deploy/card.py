@@ -1,4 +1,4 @@
-"""What an export says of itself: layouts with units, meaning of the actions, a worked example; JSON and README."""
+"""The description of an export: layouts with units, meaning of the actions, a worked example; JSON and README."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
 
 
 def _together(team: int) -> str:
-    return f"The {team} agents of a world exchange messages and act together: their rows stand side by side."
+    return f"The {team} agents of a world exchange messages and act together: their rows are adjacent."
 
 
 def _unit(unit: str) -> str:

@@ -149,7 +149,7 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
         force: replace files of an earlier export.
 
     Raises:
-        ValueError: something is in the way, a library is missing, or the policy has no such export.
+        ValueError: a file exists already, a library is missing, or the format does not support the policy.
     """
     formats = tuple(dict.fromkeys(formats))
     program = program_of(alone.policy)

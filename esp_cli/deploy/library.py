@@ -121,7 +121,7 @@ class LoadedPolicy:
         try:
             array = np.asarray(values, np.float32)
         except (TypeError, ValueError):
-            raise ValueError(f"the {what} is no array of numbers; give (..., {width}): {meaning}") from None
+            raise ValueError(f"the {what} is not an array of numbers; give (..., {width}): {meaning}") from None
         if array.ndim == 0 or array.shape[-1] != width:
             raise ValueError(
                 f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}"

@@ -4,12 +4,12 @@ A program maps a row of observation, and of memory where it has one, to outputs,
 
     x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
     x = layer(x) for each layer            affine x W + b, activation, layer normalisation, gated recurrent unit;
-                                           for pictures a cut, convolutions, the largest response, and what is heard
+                                           for pictures a slice, convolutions, global max pooling, message aggregation
     action = argmax(x)                     head `choose`, or
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
 The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
-agents exchange messages, the rows of a world's agents stand side by side.
+agents exchange messages, the rows of a world's agents are adjacent.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Learned:
 
     @property
     def arrays(self) -> tuple[Floats, ...]:
-        """What it learned, in the order in which exports store it."""
+        """The learned arrays, in the order in which exports store them."""
         return self.weight, self.bias
 
 
@@ -99,12 +99,12 @@ class Recurrent:
 
     @property
     def arrays(self) -> tuple[Floats, ...]:
-        """What it learned, in the order in which exports store it."""
+        """The learned arrays, in the order in which exports store them."""
         return (*self.input.arrays, *self.recurrent.arrays)
 
     @property
     def flops(self) -> int:
-        """Both products, and for every number two sigmoids (four each with their sums), tanh and the mixing."""
+        """Both products; per number two sigmoids (four operations each, sums included), tanh and the interpolation."""
         return self.input.flops + self.recurrent.flops + 14 * self.hidden
 
 
@@ -136,17 +136,17 @@ class Convolution(Learned):
 
     @property
     def outputs(self) -> int:
-        """Channels that it gives."""
+        """Channels of the output."""
         return self.bias.size
 
     @property
     def places(self) -> tuple[int, int]:
-        """Rows h and columns w of what it gives."""
+        """Rows h and columns w of the output."""
         return (self.rows - self.side) // self.stride + 1, (self.columns - self.side) // self.stride + 1
 
     @property
     def width(self) -> int:
-        """Numbers that it gives."""
+        """Width of the output."""
         return self.outputs * self.places[0] * self.places[1]
 
     @property
@@ -170,11 +170,11 @@ class GlobalMaxPool(Fixed):
 
 @dataclass(frozen=True)
 class MessageAggregation(Fixed):
-    """Own features x beside what the near ones say: [x, mean of their way / reach, mean of their x].
+    """Own features x and those of near agents: [x, mean relative position / reach, mean of their x].
 
-    The others of the team stand in the observation's columns from `begin`, two numbers each, in the team's order
-    without the agent itself. Near are those whose squared distance is less than `reach_squared`; the means divide by
-    their number and one, for the agent itself.
+    The observation holds the relative positions of the others from column `begin` on, two numbers each, in team order.
+    Near agents have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
+    itself.
     """
 
     begin: int
@@ -184,12 +184,12 @@ class MessageAggregation(Fixed):
 
     @property
     def end(self) -> int:
-        """The column behind the last way."""
+        """The column after the last relative position."""
         return self.begin + 2 * (self.team - 1)
 
     @property
     def reach(self) -> float:
-        """In which ways are measured."""
+        """Unit of the relative positions."""
         return math.sqrt(self.reach_squared)
 
     @property
@@ -199,7 +199,7 @@ class MessageAggregation(Fixed):
 
     @property
     def flops(self) -> int:
-        """For each other distance (3), comparison, count, and two operations for each number of way and features."""
+        """Per other agent: distance (3), comparison, count, and two operations per number of position and features."""
         return (self.team - 1) * (9 + 2 * self.width) + 4
 
 

@@ -81,13 +81,13 @@ def _network(actor: Network) -> tuple[int, list[Layer]]:
 
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:
-    """Return the layers of a team: every agent's picture, then what it hears."""
+    """Return the layers of a team: the pictures, then message passing."""
     layers: list[Layer] = [Slice(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
     for layer in actor.layers:
         affine = _affine(layer)
         width = (affine.weight.shape[0] - 2) // 2
-        heard = MessageAggregation(actor.others.start, actor.team, width, REACH_SQUARED)
-        layers += [heard, affine, _activation("relu", affine)]
+        messages = MessageAggregation(actor.others.start, actor.team, width, REACH_SQUARED)
+        layers += [messages, affine, _activation("relu", affine)]
     return [*layers, _affine(actor.head)]
 
 

@@ -15,7 +15,7 @@ from esp_envs.spec import Spaces
 
 
 class OneValue:
-    """Of agents that share their reward: the critic sees a scene once, all actions in the agents' order.
+    """One value for agents that share their reward: the critic sees a scene once, with all actions in agent order.
 
     Args:
         spec: the task.
@@ -36,22 +36,22 @@ class OneValue:
         return state if self.reads == "state" else obs.flatten(-2)
 
     def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A] in what it sees."""
+        """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A]."""
         return torch.cat([seen, action.flatten(-2)], -1)
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
-        """Return Q [S, W, C] of encoded joint actions [S, W, N, A] where the critic has seen `seen`."""
+        """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
         rows = self.inputs(seen, action)
         return critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-        """Return each agent's Q if it alone did otherwise.
+        """Return each agent's Q for its other actions, with the actions of all others fixed.
 
         Args:
             critic: with frozen parameters.
             seen: what it sees of the scenes.
             joint: [S, W, N, A] encoded actions.
-            others: [S, W, N, K, A] what each might do instead.
+            others: [S, W, N, K, A] other actions of each agent.
 
         Returns:
             [S, W, N, K].
@@ -60,10 +60,10 @@ class OneValue:
 
 
 class OneValueEach(OneValue):
-    """Of agents with rewards of their own, which share one critic: it sees a scene once for each of them.
+    """One value per agent, for agents with their own rewards: one shared critic sees a scene once per agent.
 
-    All agents stand in the order of a circle that ends with the one whose value it tells; beside a global state the
-    critic sees that agent's observation.
+    The row of an agent lists all agents in circular order and ends with that agent. Beside a global state, the critic
+    sees that agent's observation.
     """
 
     @property
@@ -78,7 +78,7 @@ class OneValueEach(OneValue):
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
     def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return the critic's inputs [S, W, N, D] for encoded joint actions [S, W, N, A] in what it sees."""
+        """Return the critic's inputs [S, W, N, D] for encoded joint actions [S, W, N, A]."""
         return torch.cat([seen, in_a_circle(action)], -1)
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
@@ -86,8 +86,8 @@ class OneValueEach(OneValue):
         return super().value(critic, seen, action).squeeze(-1)
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-        """Return each agent's own Q if it alone did otherwise: [S, W, N, K]; arguments as of `OneValue`."""
-        # of the actions in an agent's row, its own stands last and is exchanged alone
+        """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `OneValue`."""
+        # the agent's own action is the last of its row, and the only one that is exchanged
         seen = torch.cat([seen, in_a_circle(joint)[..., : -joint.shape[-1]]], -1)
         return _exchanged(critic, seen, joint.unsqueeze(-2), others.unsqueeze(-3)).squeeze(-2)
 
@@ -99,7 +99,7 @@ def _exchanged(critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> 
 
 
 def in_a_circle(items: Tensor) -> Tensor:
-    """Put N items in a row once for each of them, in the order of a circle that ends with it.
+    """Return N rows of all items: row i lists the items in circular order and ends with item i.
 
     Args:
         items: [..., N, A].
@@ -114,20 +114,22 @@ def in_a_circle(items: Tensor) -> Tensor:
 
 
 def with_one_exchanged(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
-    """Return the outputs for rows that end in N items, with each item in turn replaced by each of K others.
+    """Return the outputs for rows that end in N items, with one item at a time replaced by each of K others.
+
+    The N K rows share nearly all of the first layer's sums, which are computed once.
 
     Gradients flow to `others` alone; the network's own parameters have to be frozen.
 
     Args:
         network: of inputs of width D + N A.
-        rows: [S, R, D] what stands before the items.
-        items: [S, R, N, A] what stands there.
-        others: [S, R, N, K, A] what each is replaced by.
+        rows: [S, R, D] the numbers before the items.
+        items: [S, R, N, A].
+        others: [S, R, N, K, A] replacements of each item.
 
     Returns:
         [S, R, N, K, outputs].
     """
-    if network.norms is not None:  # a normalised input is another for every exchange
+    if network.norms is not None:  # normalisation changes the whole input with every exchange
         return _one_by_one(network, rows, items, others)
     first: SeedLinear = network.layers[0]  # type: ignore[assignment]
     precision, (num_rows, num_items, num_others, width) = network.precision, others.shape[1:]
@@ -145,7 +147,7 @@ def with_one_exchanged(network: SeedMLP, rows: Tensor, items: Tensor, others: Te
 
 
 def _one_by_one(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
-    """Build every row as it is, and ask the network for each."""
+    """Build every row and apply the network to it."""
     num_rows, num_items, num_others = others.shape[1:4]
     own = torch.eye(num_items, dtype=torch.bool, device=rows.device).view(num_items, 1, num_items, 1)
     joint = torch.where(own, others.unsqueeze(4), items.view(-1, num_rows, 1, 1, *items.shape[2:])).flatten(-2)

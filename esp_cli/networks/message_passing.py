@@ -1,9 +1,9 @@
 """Message passing networks on pictures (van der Pol et al., 2022), plain and equivariant: one class for any group.
 
-Each drone encodes its picture by two convolutions and their largest response anywhere; then drones that are near each
-other exchange what they found and where they are. With the group of one element the layers are plain, and this is the
-standard network; with C4 or D4 every layer is equivariant: group convolutions, regular features, relative positions as
-planar vectors, values invariant, actions permuted.
+Each drone encodes its picture by two convolutions and a maximum over all places. Near drones then exchange features
+and relative positions. With the group of one element the layers are plain; this is the standard network. With C4 or D4
+every layer is equivariant: group convolutions, regular features, relative positions as planar vectors, invariant
+values, permuted actions.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _LOT = 16
 
 
 class PictureEncoder(nn.Module):
-    """Convolutions for S seeds, each followed by relu, then the largest response over all places.
+    """Convolutions for S seeds, each followed by relu, then a maximum over all places.
 
     Args:
         generators: one CPU generator per seed.
         field: the pictures.
-        group: how they may turn.
+        group: that acts on the pictures.
 
     Shape:
         [S, B, pixels of all channels] -> [S, B, width].
@@ -55,7 +55,7 @@ class PictureEncoder(nn.Module):
         self.sides, self.strides, layers = [], [], []
         for channels, filter_side, stride in zip(CHANNELS, FILTERS, STRIDES, strict=True):
             used = min(filter_side, side)
-            # a filter that stepped over the last pixels would see one edge and not the other
+            # a stride that skips the last pixels would break the symmetry between the edges
             step = stride if all((length - used) % stride == 0 for length in self._after(field.pixels)) else 1
             following = regular(group, copies_for(channels, group))
             layers.append(ConstrainedLinear(generators, [with_pixels(block, used, group)], [following], GAINS["relu"]))
@@ -70,14 +70,14 @@ class PictureEncoder(nn.Module):
         self.register_buffer("keys", keys, False)
 
     def _after(self, pixels: tuple[int, int]) -> list[int]:
-        """Return height and width behind the layers so far."""
+        """Return height and width after the layers so far."""
         sizes = list(pixels)
         for side, stride in zip(self.sides, self.strides, strict=True):
             sizes = [(size - side) // stride + 1 for size in sizes]
         return sizes
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """Encode pictures; those that occur several times are encoded once. No gradient reaches a picture."""
+        """Encode pictures; equal pictures are encoded once. No gradient reaches a picture."""
         which, place = distinct(pictures.detach(), self.keys)
         num_seeds, batch = place.shape
         seeds = torch.arange(num_seeds, device=place.device).unsqueeze(1)
@@ -95,14 +95,14 @@ class PictureEncoder(nn.Module):
         return rows.unflatten(-1, self.shape).movedim(2, -1)
 
     def responses(self, x: Tensor) -> list[Tensor]:
-        """Return what each layer responds to pictures [S, B, rows, columns, channels], in the same shape."""
+        """Return the output of each layer for pictures [S, B, rows, columns, channels], in the same layout."""
         out = []
         for layer, side, stride in zip(self.layers, self.sides, self.strides, strict=True):
             assert isinstance(layer, ConstrainedLinear)
             num_seeds, batch = x.shape[:2]
             rows, columns = ((length - side) // stride + 1 for length in x.shape[2:4])
             patches = _Patches.apply(x, side, stride)  # type: ignore[no-untyped-call]
-            # a constrained weight counts channels, then pixels; a patch the other way round, which copies in long runs
+            # a constrained weight orders channels, then pixels; a patch orders pixels, then channels, for long copies
             weight = layer.weight().unflatten(1, (-1, side * side)).transpose(1, 2).flatten(1, 2)
             x = torch.relu(affine(layer.bias(), patches, weight)).view(num_seeds, batch, rows, columns, -1)
             out.append(x)
@@ -112,7 +112,7 @@ class PictureEncoder(nn.Module):
 class _Patches(Function):
     """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C].
 
-    Torch's own backward of the view adds up number by number; here it adds up picture by picture.
+    Torch's backward of the view adds single numbers; this backward adds whole pictures.
     """
 
     @staticmethod
@@ -135,17 +135,17 @@ class _Patches(Function):
 
 
 def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Find which rows are different: on a torus of 49 cells a batch of thousands of pictures holds 49.
+    """Find the different rows; a batch of thousands of pictures of a torus with 49 cells has 49.
 
-    Rows are told apart by two fixed random projections, so two that differ are taken for one with a chance of 2^-46.
+    Two fixed random projections identify a row; two different rows collide with probability 2^-46.
 
     Args:
         rows: [S, B, D].
         keys: [2, D].
 
     Returns:
-        which: [S, U] for each seed the index of one row of each sort; filled up with others.
-        place: [S, B] the sort of each row.
+        which: [S, U] for each seed the index of one row of each kind; the rest is padding.
+        place: [S, B] the kind of each row.
     """
     num_seeds, batch, width = rows.shape
     flat = rows.reshape(-1, width)
@@ -187,11 +187,11 @@ class EmpnConfig(NetworkConfig):
 class MessagePassing(Memoryless):
     """Encoder, message passing layers, head; see the module.
 
-    A layer maps [own features, mean of (relative position, features) over the near], where the mean counts the drone
-    itself among those it divides by, through one linear layer and relu.
+    A layer maps [own features, mean of (relative position, features) over near drones] through a linear layer and relu.
+    The mean divides by the number of near drones plus one, for the drone itself.
 
     Raises:
-        ValueError: the task does not show pictures and relative positions, or a critic is to read them all in a row.
+        ValueError: the task does not show pictures and relative positions, or a critic reads all of them in a row.
     """
 
     def __init__(
@@ -226,11 +226,11 @@ class MessagePassing(Memoryless):
         self.register_buffer("index", torch.tensor(index), False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [S, W * N, D] to [S, W * N, out]; the N rows of a world stand side by side."""
+        """Map [S, W * N, D] to [S, W * N, out]; the N rows of a world are adjacent."""
         return self.head(self.features(x)[-1])
 
     def features(self, x: Tensor) -> list[Tensor]:
-        """Return the features [S, W * N, C] behind the encoder and behind each message passing layer."""
+        """Return the features [S, W * N, C] after the encoder and after each message passing layer."""
         way = x[..., self.others].unflatten(-1, (-1, 2))
         near = (way.square().sum(-1) < REACH_SQUARED).float()
         share = near / (1 + near.sum(-1, keepdim=True))  # [S, W * N, N - 1]
@@ -238,18 +238,18 @@ class MessagePassing(Memoryless):
         features = [self.encoder(x[..., self.picture])]
         for layer in self.layers:
             own = features[-1]
-            heard = self._aggregate(own, share)
-            features.append(torch.relu(layer(torch.cat([own, mean_way, heard], -1))))
+            messages = self._aggregate(own, share)
+            features.append(torch.relu(layer(torch.cat([own, mean_way, messages], -1))))
         return features
 
     def _aggregate(self, own: Tensor, share: Tensor) -> Tensor:
         """Return for each drone the sum of the others' features by their shares: [S, W * N, C]."""
         worlds = own.unflatten(1, (-1, self.team))
         shares = share.unflatten(1, (-1, self.team)).unsqueeze(-1)
-        heard = torch.zeros_like(worlds)
+        total = torch.zeros_like(worlds)
         for k in range(self.team - 1):
-            heard = torch.addcmul(heard, shares[:, :, :, k], worlds[:, :, self.index[:, k]])
-        return heard.flatten(1, 2)
+            total = torch.addcmul(total, shares[:, :, :, k], worlds[:, :, self.index[:, k]])
+        return total.flatten(1, 2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""

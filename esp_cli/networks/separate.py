@@ -1,4 +1,4 @@
-"""Outputs for actions that have parts, as the two wheels of a robot: one output per value of each part."""
+"""Outputs for actions with parts, such as the two wheels of a robot: one output per value of each part."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from esp_envs.spec import ActionSpace, Discrete
 
 
 def action_parts(space: ActionSpace) -> Tensor:
-    """Return which values of its parts an action has, [values of all parts, actions], ones and zeros.
+    """Return the 0/1 matrix [values of all parts, actions] of the part values that make up each action.
 
     Raises:
-        ValueError: the actions are not all combinations of what their parts can be.
+        ValueError: the actions are not all combinations of part values.
     """
     if isinstance(space, Discrete):
         columns = list(zip(*space.points, strict=True))
@@ -28,16 +28,16 @@ def action_parts(space: ActionSpace) -> Tensor:
             ]
             return torch.tensor(has, dtype=torch.float32)
     raise ValueError(
-        "network.separate_parts is for discrete actions that are all combinations of what their parts can be, "
-        "as pairs of wheel speeds; leave it off"
+        "network.separate_parts is for discrete actions that are all combinations of part values, "
+        "such as pairs of wheel speeds; leave it off"
     )
 
 
 class Separate(Network):
-    """y_j = sum over the parts p of action j of f(x)_p: values (or logits) of the parts add up to those of the action.
+    """y_j = sum over the parts p of action j of f(x)_p: the values (or logits) of an action's parts add up to its own.
 
-    Greedy parts make the greedy action, and a softmax of the sums is a product of one distribution per part. What
-    moves parts around, as a mirror that swaps the wheels, moves the sums along.
+    Greedy parts make the greedy action, and a softmax of the sums is a product of one distribution per part. A
+    permutation of the parts, such as a mirror that swaps the wheels, permutes the sums.
 
     Args:
         network: f, with one output per value of each part.

@@ -1,4 +1,4 @@
-"""Getting a trained policy back from a run folder or a policy file; loading never runs code."""
+"""Loading a trained policy from a run folder or a policy file; loading never runs code."""
 
 from __future__ import annotations
 
@@ -126,12 +126,12 @@ def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedP
 
 
 def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
-    """Return one seed's policy alone, on the CPU and with products in float32, as it goes into other hands.
+    """Return one seed's policy, on the CPU and with products in float32, for export.
 
-    Products in bfloat16 are a matter of the machine that trained; the weights are float32 there too.
+    Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
 
     Raises:
-        ValueError: the run has no such seed.
+        ValueError: the run does not have this seed.
     """
     seeds = trained.config.seeds
     if seed not in seeds:
@@ -155,7 +155,7 @@ def _build(
     if type(step) is not int or step < 0:
         raise ValueError(f"{path} is damaged: it does not say after how many steps it was written")
     misfit = f"{path}: the weights do not fit the configuration beside them"
-    # Before worlds are made for every seed: a damaged configuration may ask for more of them than the machine has.
+    # Checked before worlds are made for every seed: a damaged configuration may ask for more than the memory holds.
     if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
         raise ValueError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
     spec = build_environment(config, 1, "shape").spec
@@ -163,9 +163,9 @@ def _build(
     if version != spec.version:
         raise ValueError(
             f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
-            "which a policy sees, does or earns something else; use the esp that it was trained with, or train anew"
+            "which observations, actions or rewards differ; use the esp that it was trained with, or train again"
         )
-    # ... and before networks are made: it may ask for larger ones than fit.
+    # Checked before networks are made, for the same reason.
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
@@ -178,7 +178,7 @@ def _build(
 def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -> None:
     """Put weights into a policy that was built for them."""
     for name, own in policy.state_dict().items():
-        # torch would convert them without a word
+        # torch would convert them silently
         if name in tensors and tensors[name].dtype != own.dtype:
             raise ValueError(f"{misfit} ({name} is {tensors[name].dtype}, where {own.dtype} is needed)")
     try:
@@ -187,4 +187,4 @@ def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -
         reason = str(error).strip().splitlines()[-1].strip()
         raise ValueError(f"{misfit} ({reason})") from None
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
-        raise ValueError(f"{path} holds weights that are not finite; use another copy of it, or train anew")
+        raise ValueError(f"{path} holds weights that are not finite; use another copy of it, or train again")

@@ -88,7 +88,7 @@ class MetricsWriter:
             values: by name (``train/...``, ``eval/...``, ``time/...``), a number or one number per seed [S].
 
         Raises:
-            MetricsError: a value is no number or list of numbers.
+            MetricsError: a value is neither a number nor a list of numbers.
             OSError: the disk is full.
         """
         row: dict[str, Any] = {"step": int(step)}
@@ -205,7 +205,7 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     try:
         values = np.array([[math.nan if v is None else float(v) for v in numbers] for numbers in lists])
     except (TypeError, ValueError, OverflowError):
-        raise MetricsError(f"the rows of '{name}' hold something that is no number") from None
+        raise MetricsError(f"the rows of '{name}' hold a value that is not a number") from None
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
@@ -223,14 +223,14 @@ def _number(name: str, value: Any) -> float | int | None:
     if value is None:
         return None
     if not isinstance(value, bool | int | float):
-        raise MetricsError(f"the metric '{name}' is no number and no list of one number per seed")
+        raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
     return value if math.isfinite(value) else None
 
 
 def _rows(path: Path) -> list[tuple[bytes, dict[str, Any]]]:
     """Return each row with the line that it stands on."""
     if not path.is_file():
-        raise MetricsError(f"{path} does not exist or is no plain file; check the path")
+        raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
     with attempting("read", path, MetricsError):
         lines = path.read_bytes().split(b"\n")
     rows = []
@@ -240,7 +240,7 @@ def _rows(path: Path) -> list[tuple[bytes, dict[str, Any]]]:
             rows.append((line, row))
         elif number < len(lines):
             # only the text behind the last line break can be a line that a killed process had not finished
-            raise MetricsError(f"{path} is damaged: line {number} is no row of metrics; remove that line")
+            raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
     return rows
 
 

@@ -27,7 +27,7 @@ def read_policy(path: str | os.PathLike[str], sha256: str | None = None) -> tupl
 
 
 def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
-    """Return what a policy file says of itself.
+    """Return the description that a policy file holds.
 
     Args:
         config: of the run, or of the one seed of it that the file holds.

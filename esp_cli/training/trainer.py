@@ -44,7 +44,7 @@ def checkpoint_seconds() -> float:
 CHECKPOINT_SECONDS = checkpoint_seconds()
 """Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
 CHECKPOINT_SPACING = 20
-"""A checkpoint takes milliseconds, with a large replay seconds: the next waits for as many times as long as it took."""
+"""The next checkpoint waits at least this many times as long as the last one took; a large replay takes seconds."""
 
 
 class Standing(BaseModel):
@@ -61,7 +61,7 @@ class Standing(BaseModel):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a listener is told after every iteration.
+    """The news for a listener after every iteration.
 
     Attributes:
         step: environment steps per seed so far.
@@ -187,7 +187,7 @@ class Trainer:
         return row
 
     def _stop_broken_seeds(self, finite: Tensor) -> None:
-        """Put a seed whose numbers are not `finite` [S] back to its last good state, for the rest of the run."""
+        """Reset a seed whose numbers are not `finite` [S] to its last good state, for the rest of the run."""
         for index in (~finite).nonzero().flatten().tolist():
             if index not in self.stopped_seeds:
                 self.stopped_seeds[index] = self.step
@@ -232,7 +232,7 @@ class Trainer:
         return time.monotonic() - begun
 
     def _restore(self) -> None:
-        """Continue from the newest good checkpoint; without one, start anew."""
+        """Continue from the newest good checkpoint; without one, start from the beginning."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", CheckpointWarning)
             found = self.folder.latest_checkpoint()

@@ -112,7 +112,7 @@ def test_the_traceback_of_a_sentence_can_be_asked_for(commands: None, monkeypatc
         (["fly"], "there is no command 'fly'; 'esp --help' lists the commands"),
         (
             ["toy", "--steps", "many"],
-            "'many' is no number of steps; write for example 20000, 500k or 1.5M (see 'esp toy --help')",
+            "'many' is not a number of steps; write for example 20000, 500k or 1.5M (see 'esp toy --help')",
         ),
         (["toy", "--seeds", "2,2"], "name one seed twice"),
         (["toy", "--speed", "3"], "No such option: --speed"),

@@ -115,7 +115,7 @@ def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> 
         ("task.actions=continuous", "was trained with other action than the task has"),
         ("task.wind=2", "unknown setting 'task.wind'"),
         ("task.horizon=0", "bad value 0 for 'task.horizon'"),
-        ("mappo.gamma=0.9", "changes no setting of the task"),
+        ("mappo.gamma=0.9", "is not a setting of the task"),
     ],
 )
 def test_settings_that_a_policy_cannot_take_are_refused(finished: Path, setting: str, sentence: str) -> None:

@@ -57,7 +57,7 @@ def test_a_policy_goes_into_a_folder_and_is_used_from_there(
     assert (tmp_path / "n.png").stat().st_size
     said = refused("eval", "navigation", "--algo", "qmix")
     assert "no policy fits navigation --algo qmix; the bundled policies are navigation-mappo-esp" in said
-    assert "holds no policy of formation" in refused("policies", "formation")
+    assert "has no policy of formation" in refused("policies", "formation")
     (folder / MANIFEST).write_text("{")
     assert "is not valid JSON" in refused("eval", "navigation")
 

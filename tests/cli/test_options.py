@@ -56,10 +56,10 @@ def test_seeds_are_read(text: str | int | tuple[int, ...], seeds: tuple[int, ...
         ("0", "cannot be trained at once"),
         (str(MAX_SEEDS + 1), "cannot be trained at once"),
         ("1,1", "twice"),
-        ("a", "names no seeds"),
-        ("-1", "names no seeds"),
-        (",", "names no seeds"),
-        ("1.5", "names no seeds"),
+        ("a", "does not name seeds"),
+        ("-1", "does not name seeds"),
+        (",", "does not name seeds"),
+        ("1.5", "does not name seeds"),
     ],
 )
 def test_what_names_no_seeds_is_refused(text: str, reason: str) -> None:
@@ -81,7 +81,7 @@ def test_assignments_are_json_where_they_can_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("items", "reason"), [(["x"], "no setting"), (["=3"], "no setting"), (["x=1", "x=2"], "twice")]
+    ("items", "reason"), [(["x"], "not a setting"), (["=3"], "not a setting"), (["x=1", "x=2"], "twice")]
 )
 def test_what_is_no_assignment_is_refused(items: list[str], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):

@@ -136,7 +136,7 @@ def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--at", "soon"], "'soon' is no number of steps"),
+        (["--at", "soon"], "'soon' is not a number of steps"),
         (["--reference", "paper"], "--reference paper is no line to draw"),
         (["--reference", "-110"], "--reference -110 is no line to draw"),
         (["--reference", "paper=nan"], "--reference paper=nan is no line to draw"),
@@ -159,8 +159,8 @@ def test_what_is_no_run_is_told_in_one_sentence(finished: Path, copied: Path, ki
     [
         ("", "no row has the metric 'eval/return_greedy'"),
         ('{"step": 0, "eval/return_greedy": [1.0]}\n', "its metrics have 1 seeds, its configuration 2"),
-        ('{"step": 0, "eval/return_greedy": ["high", 1]}\n', "something that is no number"),
-        ("train more\nsleep less\n", "line 1 is no row of metrics"),
+        ('{"step": 0, "eval/return_greedy": ["high", 1]}\n', "a value that is not a number"),
+        ("train more\nsleep less\n", "line 1 is not a row of metrics"),
     ],
 )
 def test_damaged_metrics_are_told_in_one_sentence(copied: Path, content: str, sentence: str) -> None:

@@ -37,7 +37,7 @@ def test_names_and_steps_are_read_from_lists() -> None:
         ("formation", 1_000_000),
         (None, 3_000_000),
     )
-    with pytest.raises(ValueError, match="'soon' is no number of steps"):
+    with pytest.raises(ValueError, match="'soon' is not a number of steps"):
         parse_study_steps(["formation=soon"])
 
 
@@ -118,7 +118,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
     ("arguments", "sentence"),
     [
         (["ablate", "colours"], "'colours' is not one of"),
-        (["ablate", "modules", "--steps", "soon"], "'soon' is no number of steps"),
+        (["ablate", "modules", "--steps", "soon"], "'soon' is not a number of steps"),
         (["ablate", "modules", "--algo", "magic"], "unknown algorithm 'magic'"),
         (["ablate", "coefficient", "--set", "prior.consistency_coef=1"], "varies by itself"),
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),

@@ -97,7 +97,7 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (["--consistency-coef", "-1"], "--consistency-coef"),
         (["--consistency-coef", "nan"], "--consistency-coef"),
         (["--consistency-coef", "inf"], "bad value inf for 'prior.consistency_coef': it has to be a finite number"),
-        (["--steps", "some"], "'some' is no number of steps"),
+        (["--steps", "some"], "'some' is not a number of steps"),
         (["--seeds", "2,2"], "name one seed twice"),
         (["--seeds", "0"], "0 seeds cannot be trained at once"),
         (["--device", "tpu"], "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
@@ -106,7 +106,7 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (["--set", "mappo.gamma=2"], "bad value 2 for 'mappo.gamma': input should be less than or equal to 1"),
         (["--set", "mappo.learning_rate=fast"], "bad value 'fast' for 'mappo.learning_rate'"),
         (["--set", "mappo.learning_rate=Infinity"], "it has to be a finite number"),
-        (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is no setting"),
+        (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is not a setting"),
         (["--set", "task.prey=still"], "unknown setting 'task.prey'"),
         (["--set", "task.num_agents=99"], "bad value 99 for 'task.num_agents'"),
         (["--task", "predator-prey", "--set", "task.prey=policy"], "give both or neither"),
@@ -165,7 +165,7 @@ def test_a_signal_stops_after_the_iteration_and_the_run_goes_on_to_the_same_end(
         stopped = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", run, code=130)
     assert signal.getsignal(number) is before
     assert "stopping after this iteration" in stopped.stderr
-    assert stopped.stderr.endswith(f"stopped at 50 steps; go on with: esp train --resume {run}\n")
+    assert stopped.stderr.endswith(f"stopped at 50 steps; continue with: esp train --resume {run}\n")
     assert stopped.stdout == ""
     resumed = esp("train", "--resume", run)
     assert "resuming at 50" in resumed.stderr
@@ -196,7 +196,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path, monkeypatch: pytest.Mo
     ],
 )
 def test_options_that_a_resumed_run_would_ignore_are_refused(copied: Path, options: list[str], named: str) -> None:
-    sentence = f"--resume goes on with a run just as it was; leave out {named}, or start a new run"
+    sentence = f"--resume continues a run with its own settings; leave out {named}, or start a new run"
     assert refused("train", "--resume", copied, *options) == sentence
 
 
@@ -234,7 +234,7 @@ def test_a_damaged_run_is_not_resumed(copied: Path, kind: str) -> None:
         ({"task": None}, "bad value None for 'config.task'"),
         ({"network": {"hidden": [9]}}, "the checkpoint does not fit this configuration"),
         ({"seeds": [3]}, "the checkpoint does not fit this configuration"),
-        ({"algorithm_settings": {"gamma": "low"}}, "setting 'gamma'"),
+        ({"algorithm_settings": {"gamma": "low"}}, "bad value 'low' for 'mappo.gamma'"),
     ],
 )
 def test_a_configuration_that_was_changed_by_hand_is_not_resumed(
@@ -247,7 +247,7 @@ def test_a_policy_file_and_damaged_metrics_are_not_resumed(copied: Path) -> None
     assert "is a file, not a run folder" in refused("train", "--resume", copied / "policy.safetensors")
     metrics = copied / "metrics.jsonl"
     metrics.write_text("sleep less\n" + metrics.read_text())
-    assert "line 1 is no row of metrics" in refused("train", "--resume", copied)
+    assert "line 1 is not a row of metrics" in refused("train", "--resume", copied)
 
 
 def test_a_run_in_use_is_refused(copied: Path) -> None:

@@ -137,7 +137,7 @@ def test_a_policy_is_found_by_task_algorithm_and_prior(small: Path, asked: tuple
         (("navigation", "qmix", None), "no policy fits navigation --algo qmix; the bundled policies are navigation-"),
         (("navigation", None, "none"), "no policy fits navigation --prior none; the bundled policies are"),
         (("formation", None, None), "no policy fits formation; the bundled policies are navigation-"),
-        (("nothing", "mappo", None), "--algo and --prior choose among a task's policies, but nothing is no task"),
+        (("nothing", "mappo", None), "--algo and --prior choose among a task's policies, but nothing is not a task"),
         (("nothing", None, None), "nothing does not exist"),
     ],
 )
@@ -159,7 +159,7 @@ def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
     second = bundle(drawn_policy("choice", hidden=(5,)), tmp_path, 4)
     assert first.sha256 != second.sha256
     assert read_bundled(tmp_path) == (second,)
-    with pytest.raises(ValueError, match=r"'Best one!' is no name for a policy"):
+    with pytest.raises(ValueError, match=r"'Best one!' is not a valid policy name"):
         bundle(drawn_policy("choice"), tmp_path, 4, name="Best one!")
 
 
@@ -177,7 +177,7 @@ def test_a_manifest_that_says_something_else_of_a_file_is_refused(small: Path, t
     folder = Path(shutil.copytree(small, tmp_path / "bundled"))
     entry = find("navigation", folder=folder)
     manifest.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
-    with pytest.raises(ValueError, match="holds another policy than its manifest says"):
+    with pytest.raises(ValueError, match="does not hold the policy that its manifest describes"):
         open_policy(Path("navigation"), folder=folder)
 
 

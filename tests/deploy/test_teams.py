@@ -174,7 +174,7 @@ def test_an_equivariant_team_is_exported_as_plain_layers() -> None:
 
 def test_c_refuses_a_team_whose_actions_are_no_choices() -> None:
     program = Program(5, (Slice(0, 1), MessageAggregation(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
-    with pytest.raises(ValueError, match="only choices are written as C"):
+    with pytest.raises(ValueError, match="supports discrete actions only"):
         c_source(program, "")
 
 

@@ -71,13 +71,13 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
 def test_a_foreign_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "prey.safetensors"
     path.write_bytes(content)
-    assert "no intact safetensors file" in refused(str(path))
+    assert "is not an intact safetensors file" in refused(str(path))
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
     path = Path(write(tmp_path / "prey.safetensors"))
     path.write_bytes(path.read_bytes()[:-50])
-    assert "no intact safetensors file" in refused(str(path))
+    assert "is not an intact safetensors file" in refused(str(path))
 
 
 def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None
     save_file({"x": torch.zeros(1)}, path)
     assert "no 'esp' entry" in refused(str(path))
     save_file({"x": torch.zeros(1)}, path, {"esp": "{broken"})
-    assert "no intact safetensors file" in refused(str(path))
+    assert "is not an intact safetensors file" in refused(str(path))
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,7 @@ def test_each_row_is_in_the_file_when_write_returns(tmp_path):
 @pytest.mark.parametrize("value", ["text", [[1.0]], {"a": 1}, torch.zeros(2, 2)])
 def test_what_is_no_number_is_refused(tmp_path, value):
     path = tmp_path / "m.jsonl"
-    with MetricsWriter(path) as writer, pytest.raises(MetricsError, match="'train/loss' is no number"):
+    with MetricsWriter(path) as writer, pytest.raises(MetricsError, match="'train/loss' is neither a number"):
         writer.write(1, {"train/loss": value})
     assert path.read_text() == ""
 
@@ -100,9 +100,9 @@ def test_column_is_steps_and_values_per_seed(path):
         ([], "no row has the metric 'train/loss', and no other"),
         ([{"step": 1, "train/los": [1.0]}], "there is train/los"),
         ([{"step": 1, "train/loss": [1.0]}, {"step": 2, "train/loss": [1.0, 2.0]}], "differ in the number of seeds"),
-        ([{"step": 1, "train/loss": ["x"]}], "no number"),
-        ([{"step": 1, "train/loss": [[1.0]]}], "no number"),
-        ([{"step": 1, "train/loss": [10**400]}], "no number"),
+        ([{"step": 1, "train/loss": ["x"]}], "not a number"),
+        ([{"step": 1, "train/loss": [[1.0]]}], "not a number"),
+        ([{"step": 1, "train/loss": [10**400]}], "not a number"),
     ],
 )
 def test_columns_that_are_not_there_are_one_sentence(rows, text):
@@ -124,7 +124,7 @@ def test_the_last_line_may_be_torn_at_any_byte(path):
 def test_damage_inside_is_told_with_its_line(path, line):
     lines = path.read_bytes().split(b"\n")
     path.write_bytes(b"\n".join([lines[0], line, *lines[1:]]))
-    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2 is no row"):
+    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2 is not a row"):
         read_metrics(path)
 
 

@@ -66,9 +66,11 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
             tensors = {name: file.get_tensor(name) for name in names}
         header = json.loads(metadata.get(METADATA_KEY, "null"))
     except (SafetensorError, OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"the prey policy {path} is no intact safetensors file ({error}); export it again") from error
+        raise ValueError(
+            f"the prey policy {path} is not an intact safetensors file ({error}); export it again"
+        ) from error
     if not isinstance(header, dict):
-        raise ValueError(f"the file {path} has no 'esp' entry, so it is no policy of this project; export a prey")
+        raise ValueError(f"the file {path} has no 'esp' entry, so it is not a policy of this project; export a prey")
     return header, tensors
 
 

@@ -60,7 +60,7 @@ def test_robots_or_pillars_that_do_not_fit_are_refused() -> None:
         make("formation", 1, [0], {"num_obstacles": 8, "obstacle_radius_m": 0.3})
     with pytest.raises(ValueError, match=r"pillars of radius 0.9 m reach the posts"):
         make("formation", 1, [0], {"obstacle_radius_m": 0.9})
-    with pytest.raises(ValueError, match=r"control period of .* is no multiple"):
+    with pytest.raises(ValueError, match=r"control period of .* is not a multiple"):
         make("formation", 1, [0], {"control_period_s": 0.055})
 
 

@@ -121,7 +121,7 @@ def test_what_is_read_is_memory_of_its_own(name: str) -> None:
 
 @every_engine
 def test_a_period_that_no_whole_number_of_time_steps_fills_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"0\.015 s is no multiple of 0\.01 s"):
+    with pytest.raises(ValueError, match=r"0\.015 s is not a multiple of 0\.01 s"):
         make_physics(name, OPEN, 1, 0.015)
 
 
