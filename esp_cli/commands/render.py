@@ -84,8 +84,6 @@ def render(
     from esp_cli.training.build import build_environment
     from esp_cli.training.loading import transfer
 
-    if kind == ".mp4":
-        films.mp4_library()  # a missing one is told before all the work, not after it
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)

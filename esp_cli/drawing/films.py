@@ -1,14 +1,16 @@
-"""Films and pictures as files: GIF, MP4 and PNG, each written whole or not at all."""
+"""Films and pictures as files: GIF, MP4 and PNG, each written whole or not at all.
+
+imageio writes MP4 and PNG. The GIFs are made here: with one palette for a whole film, and without pixels that do not
+change, they have a fourth to two thirds of the size of imageio's, at the same fidelity.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from importlib import import_module
 from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -102,45 +104,17 @@ def _colors(codes: NDArray[np.uint32]) -> Frame:
     return np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)
 
 
-def mp4_library() -> Any:
-    """Return imageio-ffmpeg, which brings its own ffmpeg.
-
-    Raises:
-        ValueError: it is not installed.
-    """
-    try:
-        return import_module("imageio_ffmpeg")
-    except ImportError:
-        raise ValueError('an MP4 needs an extra: pip install "esp-marl[video]"; or name a .gif file') from None
-
-
 def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
-    """Write frames as an MP4.
-
-    Raises:
-        ValueError: imageio-ffmpeg is not installed.
-    """
-    ffmpeg = mp4_library()
-    with TemporaryDirectory() as folder:
-        made = Path(folder) / "film.mp4"
-        writer = None
-        for frame in frames:
-            height, width = frame.shape[:2]
-            even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # as the format wants it
-            if writer is None:
-                height, width = even.shape[:2]
-                writer = ffmpeg.write_frames(
-                    str(made), (width, height), fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
-                )
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-        if writer is not None:
-            writer.close()
-        write_file(path, made.read_bytes())
+    """Write frames as an MP4."""
+    film = np.stack(list(frames))
+    height, width = film.shape[1:3]
+    even = np.pad(film, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # the format asks for it
+    made = iio.imwrite(
+        "<bytes>", even, extension=".mp4", fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    write_file(path, made)
 
 
 def write_png(path: Path, picture: Frame) -> None:
     """Write one picture."""
-    content = BytesIO()
-    Image.fromarray(picture).save(content, "PNG")
-    write_file(path, content.getvalue())
+    write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))

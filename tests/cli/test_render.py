@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 
 import pytest
@@ -80,16 +78,6 @@ def test_a_png_is_a_figure_of_the_trajectories(finished: Path, tmp_path: Path) -
     assert sentence == f"{other} holds one episode; leave out --episodes 2 or name a .gif file"
 
 
-def test_an_mp4_without_its_extra_is_refused_before_anything_is_drawn(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    sentence = refused("render", finished, "-o", tmp_path / "film.mp4")
-    assert sentence == 'an MP4 needs an extra: pip install "esp-marl[video]"; or name a .gif file'
-    assert not (tmp_path / "film.mp4").exists()
-
-
-@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs the extra video")
 def test_an_mp4_is_written(finished: Path, tmp_path: Path) -> None:
     told = esp("render", finished, "-o", tmp_path / "film.mp4", "--episodes", 1, "--size", 64)
     assert f"{FRAMES} frames -> {tmp_path / 'film.mp4'}" in told.stderr

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
-import sys
 from io import BytesIO
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from esp_cli.drawing.films import mp4_library, write_gif, write_mp4
+from esp_cli.drawing.films import write_gif, write_mp4
 from esp_cli.drawing.rendering import (
     default_episodes,
     open_painter,
@@ -216,21 +215,13 @@ def test_a_gif_that_cannot_be_written_leaves_nothing_behind(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.gif"]
 
 
-def test_an_mp4_without_its_extra_names_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ValueError, match=r'needs an extra: pip install "esp-marl\[video\]"; or name a \.gif'):
-        mp4_library()
-
-
-@pytest.mark.skipif(importlib.util.find_spec("imageio_ffmpeg") is None, reason="needs the extra video")
 def test_an_mp4_holds_the_frames_at_their_rate(tmp_path):
     frames = [np.full((33, 48, 3), 40 * k, dtype=np.uint8) for k in range(6)]
     write_mp4(tmp_path / "new" / "film.mp4", frames, 12.5)
-    reader = mp4_library().read_frames(str(tmp_path / "new" / "film.mp4"))
-    about = next(reader)
-    shown = [np.frombuffer(content, np.uint8).mean() for content in reader]
-    assert about["fps"] == 12.5
-    assert about["size"] == (48, 34), "an odd side is made even"
+    film = tmp_path / "new" / "film.mp4"
+    shown = [frame.mean() for frame in iio.imiter(film)]
+    assert iio.immeta(film)["fps"] == 12.5
+    assert iio.improps(film).shape[1:] == (34, 48, 3), "an odd side is made even"
     assert shown == pytest.approx([40 * k for k in range(6)], abs=10)
 
 
