@@ -202,6 +202,11 @@ class OffPolicyLearner(Learner):
         """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""
         return {}
 
+    def bytes_to_come(self, steps: int) -> int:
+        """Return by how many bytes the replay will grow; see `Learner.bytes_to_come`."""
+        episodes = min(self.replay.capacity, steps // self.spec.horizon * (1 + self.prior.num_stored))
+        return self.replay.num_bytes * max(0, episodes - self.replay.size) // self.replay.capacity
+
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return what a resumed run needs; a complete run's replay is left out."""
         out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}

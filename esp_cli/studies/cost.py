@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 
 from esp_cli.algorithms.learner import Learner
-from esp_cli.algorithms.off_policy import OffPolicyLearner
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.play import PolicyController, play
@@ -84,7 +83,7 @@ def _probe(config: RunConfig, episodes: int) -> Cost:
         training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
         evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * episodes * per_episode,
         disk_bytes=kept,
-        peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + _replay_to_come(config, learner)),
+        peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + learner.bytes_to_come(config.steps)),
     )
 
 
@@ -99,13 +98,3 @@ def _seconds_per_episode(config: RunConfig, learner: Learner) -> float:
 
 def _bytes(learner: Learner, complete: bool = False) -> int:
     return sum(tensor.nbytes for tensor in learner.state_dict(complete).values())
-
-
-def _replay_to_come(config: RunConfig, learner: Learner) -> int:
-    """Return by how much the replay in a checkpoint will grow."""
-    if not isinstance(learner, OffPolicyLearner):
-        return 0
-    replay = learner.replay
-    copies = 1 + learner.prior.num_stored
-    episodes = min(replay.capacity, config.steps // learner.spec.horizon * copies)
-    return replay.num_bytes * max(0, episodes - replay.size) // replay.capacity

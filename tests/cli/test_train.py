@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 import torch
 
 from esp_cli import console
+from esp_cli.algorithms.learner import Iteration
 from esp_cli.algorithms.mappo import Mappo
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.metrics import read_metrics
@@ -260,10 +262,8 @@ def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
 ) -> None:
     iterate = Mappo.iterate
 
-    def broken(self: Mappo, progress: float) -> dict[str, torch.Tensor]:
-        metrics = iterate(self, progress)
-        metrics["train/policy_loss"][0] = torch.nan
-        return metrics
+    def broken(self: Mappo, progress: float) -> Iteration:
+        return replace(iterate(self, progress), finite=torch.tensor([False, True]))
 
     monkeypatch.setattr(Mappo, "iterate", broken)
     told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", tmp_path / "run")
@@ -280,9 +280,7 @@ def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
 
 def test_a_run_whose_every_seed_stopped_ends_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     iterate = Mappo.iterate
-    monkeypatch.setattr(
-        Mappo, "iterate", lambda self, p: {**iterate(self, p), "train/value_loss": torch.full((1,), torch.inf)}
-    )
+    monkeypatch.setattr(Mappo, "iterate", lambda self, p: replace(iterate(self, p), finite=torch.tensor([False])))
     told = esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "run", code=2)
     assert told.stderr.splitlines()[-1].startswith("error: every seed stopped on a number that is not finite")
 

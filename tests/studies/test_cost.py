@@ -34,11 +34,11 @@ def test_the_replay_is_counted_as_full_as_it_will_be():
     config = resolve_config("navigation", "maddpg", steps=25 * 30, overrides=SMALL)
     learner = build_learner(config)
     whole = learner.replay.num_bytes
-    assert cost._replay_to_come(config, learner) == whole * 30 // 40
+    assert learner.bytes_to_come(config.steps) == whole * 30 // 40
     longer = config.model_copy(update={"steps": 25 * 300})
-    assert cost._replay_to_come(longer, learner) == whole, "it keeps the last 40"
+    assert learner.bytes_to_come(longer.steps) == whole, "it keeps the last 40"
     learner.iterate(0.0)
-    assert cost._replay_to_come(longer, learner) == whole * 38 // 40
+    assert learner.bytes_to_come(longer.steps) == whole * 38 // 40
     found = cost.probe(config, 4)
     assert found.peak_bytes - found.disk_bytes > 3 * (whole * 30 // 40)
 
@@ -46,6 +46,6 @@ def test_the_replay_is_counted_as_full_as_it_will_be():
 def test_an_on_policy_run_has_no_replay_and_threads_are_as_before():
     before = torch.get_num_threads()
     config = tiny_config(steps=100)
-    assert cost._replay_to_come(config, build_learner(config)) == 0
+    assert build_learner(config).bytes_to_come(config.steps) == 0
     assert cost.probe(config, 4).disk_bytes > 0
     assert torch.get_num_threads() == before
