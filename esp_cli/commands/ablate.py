@@ -29,4 +29,5 @@ def ablate(
     choices: StudyChoices,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""
-    run_study(f"ablate-{part}", ("ablate", part), choices)
+    kind = f"ablate-{part}"
+    run_study(kind, choices.request(kind, "ablate", part), choices)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import typer
@@ -14,7 +15,7 @@ EPILOG = """Examples:\n
     esp compare-homomorphic --methods mpn,empn --steps 100k --seeds 3 --out runs/quick\n
     esp compare-homomorphic --grid 9 --drones 4 --group d4"""
 
-DRONES, GRID = 3, 7
+DRONES, GRID, GROUP = 3, 7, "c4"
 
 
 @study_command
@@ -26,7 +27,7 @@ def compare_homomorphic(
         str | None,
         typer.Option("--methods", "--contestants", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order."),
     ] = None,
-    group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = "c4",
+    group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = GROUP,
     mode: Annotated[
         Literal["greedy", "stochastic"] | None,
         typer.Option("--mode", help="Which evaluations the tables state; by default stochastic."),
@@ -39,19 +40,13 @@ def compare_homomorphic(
 
     Called again, it goes on where it was.
     """
-    names = None if methods is None else parse_names([methods])
-    words = ["compare-homomorphic"]
-    words += ["--methods", ",".join(names)] if names else []
-    words += ["--drones", str(drones)] if drones != DRONES else []
-    words += ["--grid", str(grid)] if grid != GRID else []
-    words += ["--group", group] if group != "c4" else []
-    run_study(
-        "homomorphic",
-        words,
-        choices,
-        settings={"task.num_agents": drones, "task.width": grid, "task.height": grid},
-        variants=names,
-        group=group,
-        mode=mode,
-        thresholds=[] if threshold is None else [threshold],
-    )
+    names = parse_names([methods]) if methods is not None else None
+    limits = [] if threshold is None else [threshold]
+    given = {"--drones": (drones, DRONES), "--grid": (grid, GRID), "--group": (group, GROUP), "--mode": (mode, None)}
+    words = ["--methods", ",".join(names)] if names else []
+    words += [word for flag, (value, default) in given.items() if value != default for word in (flag, str(value))]
+    words += [word for limit in limits for word in ("--threshold", f"{limit:g}")]
+    request = choices.request("homomorphic", "compare-homomorphic", *words)
+    board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
+    request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
+    run_study("homomorphic", request, choices, mode, limits)

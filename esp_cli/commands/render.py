@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -72,13 +73,7 @@ def render(
     prior: BundledPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
-    kind = out.suffix.lower()
-    if kind not in (*FILMS, PICTURE):
-        raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
-    if kind == PICTURE and episodes is not None and episodes > 1:
-        raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
-    if out.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
+    kind = _kind_of(out, episodes)
     from esp_cli.deploy.bundled import open_policy
     from esp_cli.drawing import films, rendering
     from esp_cli.training.build import build_environment
@@ -106,3 +101,15 @@ def render(
         with console.TrainingProgress(len(taken), description="draw") as progress:
             rendering.write_film(out, painter, taken, period / speed, progress.update)
     console.note(f"{len(taken)} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
+
+
+def _kind_of(out: Path, episodes: int | None) -> str:
+    """Return the ending of a file that can be drawn into."""
+    kind = out.suffix.lower()
+    if kind not in (*FILMS, PICTURE):
+        raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
+    if kind == PICTURE and episodes is not None and episodes > 1:
+        raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
+    if out.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
+    return kind

@@ -27,46 +27,54 @@ EPILOG = """Examples:\n
 Mode = Literal["greedy", "stochastic"]
 
 
+RunsArgument = Annotated[
+    list[str] | None,
+    typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
+]
+ResultsOption = Annotated[
+    Path | None,
+    typer.Option("--results", help="Also write every seed's numbers and the configurations as JSON.", metavar="FILE"),
+]
+FillOption = Annotated[
+    Path | None,
+    typer.Option("--fill", help="Compute the tables of this Markdown page from its results files.", metavar="PAGE"),
+]
+AtOption = Annotated[
+    list[str] | None,
+    typer.Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
+]
+ReferenceOption = Annotated[
+    list[str] | None,
+    typer.Option("--reference", help="Runs: draw a line at somebody else's number.", metavar="NAME=VALUE"),
+]
+ThresholdOption = Annotated[
+    list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
+]
+ModeOption = Annotated[
+    Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
+]
+ViewOption = Annotated[
+    tuple[float, float] | None, typer.Option("--view", help="Lowest and highest return in the picture.")
+]
+PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")]
+
+
 def report(
-    runs: Annotated[
-        list[str] | None,
-        typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
-    ] = None,
+    runs: RunsArgument = None,
+    out: OutOption = None,
     films: Annotated[bool, typer.Option("--films", help="Draw the trained policies for the page.")] = False,
-    results: Annotated[
-        Path | None,
-        typer.Option(
-            "--results", help="Also write every seed's numbers and the configurations as JSON.", metavar="FILE"
-        ),
-    ] = None,
-    fill: Annotated[
-        Path | None,
-        typer.Option("--fill", help="Compute the tables of this Markdown page from its results files.", metavar="PAGE"),
-    ] = None,
-    at: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--at", help="Runs: compare them at this step; by default the last that all reached.", metavar="STEPS"
-        ),
-    ] = None,
-    threshold: Annotated[
-        list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
-    ] = None,
-    reference: Annotated[
-        list[str] | None,
-        typer.Option("--reference", help="Runs: draw a line at somebody else's number.", metavar="NAME=VALUE"),
-    ] = None,
-    mode: Annotated[
-        Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
-    ] = None,
-    view: Annotated[
-        tuple[float, float] | None, typer.Option("--view", help="Lowest and highest return in the picture.")
-    ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")] = None,
+    results: ResultsOption = None,
+    fill: FillOption = None,
+    at: AtOption = None,
+    threshold: ThresholdOption = None,
+    reference: ReferenceOption = None,
+    mode: ModeOption = None,
+    view: ViewOption = None,
+    plot: PlotOption = None,
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""

@@ -24,5 +24,5 @@ def reproduce(
     ],
     choices: StudyChoices,
 ) -> None:
-    """Train, judge and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    run_study(table, ("reproduce", table), choices)
+    """Train, evaluate and tabulate what a table of the paper shows; called again, it goes on where it was."""
+    run_study(table, choices.request(table, "reproduce", table), choices)

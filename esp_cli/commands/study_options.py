@@ -110,12 +110,16 @@ class StudyChoices:
     reuse: ReuseOption = None
     json: JsonOption = None
 
-    def request(self, words: Sequence[str], out: Path) -> Request:
+    def folder(self, kind: str) -> Path:
+        """Return the study folder of a kind of study."""
+        return self.out or Path("runs") / kind
+
+    def request(self, kind: str, *words: str) -> Request:
         """Return what a study is asked for.
 
         Args:
-            words: the command without its options, such as ("reproduce", "table1").
-            out: study folder.
+            kind: of the study.
+            words: the command without these options, such as "reproduce", "table1".
 
         Raises:
             ValueError: a name, number or setting that cannot be read.
@@ -131,7 +135,7 @@ class StudyChoices:
             overrides=parse_assignments(self.settings or []),
             device=resolve_device(self.device),
             episodes=self.episodes,
-            command=shlex.join(["esp", *words, *self._options(), "--out", str(out)]),
+            command=shlex.join(["esp", *words, *self._options(), "--out", str(self.folder(kind))]),
         )
 
     def _options(self) -> list[str]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import typer
@@ -19,32 +17,23 @@ from esp_cli.commands.study_progress import StudyProgress
 
 if TYPE_CHECKING:
     from esp_cli.evaluation.final import Mode
+    from esp_cli.studies.catalogue import Request
     from esp_cli.studies.forecast import Forecast
     from esp_cli.studies.scheduler import Snapshot
-    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.study import Study, StudyFolder
 
 _MEBIBYTE = 2**20
 
 
 def run_study(
-    kind: str,
-    words: Sequence[str],
-    choices: StudyChoices,
-    settings: Mapping[str, object] | None = None,
-    variants: Sequence[str] | None = None,
-    group: str = "c4",
-    mode: Mode | None = None,
-    thresholds: Sequence[float] = (),
+    kind: str, request: Request, choices: StudyChoices, mode: Mode | None = None, thresholds: Sequence[float] = ()
 ) -> None:
     """Plan a study and run it, or with --dry-run say what it would cost.
 
     Args:
         kind: of `studies.kinds`.
-        words: the command without the options of all studies.
-        choices: of the user.
-        settings: of all runs, under those of the user.
-        variants: of the study; by default all.
-        group: whose symmetry a study of networks is about.
+        request: what is asked of the study.
+        choices: how it is run.
         mode: which evaluations the tables state; by default those of this kind of study.
         thresholds: returns whose first passing the tables state, likewise.
 
@@ -52,15 +41,11 @@ def run_study(
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
     from esp_cli.studies.catalogue import plan
-    from esp_cli.studies.engine_local import LocalEngine
-    from esp_cli.studies.scheduler import Scheduler, available_cores
+    from esp_cli.studies.scheduler import available_cores
     from esp_cli.studies.study import StudyFolder
     from esp_cli.training.build import build_learner
 
-    out = choices.out or Path("runs") / kind
-    request = choices.request(words, out)
-    overrides = {**(settings or {}), **request.overrides}
-    study = plan(kind, replace(request, overrides=overrides, variants=variants, group=group))
+    out, study = choices.folder(kind), plan(kind, request)
     others = [StudyFolder.open(path) for path in choices.reuse or ()]
     jobs = choices.jobs or (1 if study.cells[0].config.device == "cuda" else available_cores())
     if choices.dry_run:
@@ -69,39 +54,48 @@ def run_study(
     for cell in study.cells:  # refuses what does not go together while there is no folder yet
         build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1]}))
     folder = StudyFolder.create(out, study)
+    begun = time.monotonic()
     with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
-        begun = time.monotonic()
-        names = {cell.name for cell in study.cells}
-        cells = [cell for cell in folder.study.cells if cell.name in names]
-        for cell in cells:
-            twin = folder.find_twin(cell, others)
-            if twin is not None:
-                folder.adopt(cell, twin)
-                console.note(f"taking over {twin} as {cell.name}")
-        scheduler = Scheduler(folder, cells, min(jobs, len(cells)), LocalEngine())
-        finished = sum(run.status == "finished" for run in scheduler.runs)
-        console.note(
-            f"{study.title}: {len(cells)} runs, {finished} of them finished, "
-            f"{scheduler.jobs} side by side -> {folder.path}"
-        )
-        with StudyProgress() as progress:
-
-            def listen(snapshot: Snapshot) -> bool:
-                progress.update(snapshot)
-                return not requests
-
-            complete = scheduler.run(listen)
+        complete, failed = _run(folder, study, others, jobs, requests)
     if not complete:
         console.note(f"stopped; go on with: {study.command}")
         raise typer.Exit(130)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     _report(folder, choices.json, mode, thresholds)
-    failed = [run.cell.name for run in scheduler.runs if run.status == "failed"]
     if failed:
         raise ValueError(
-            f"{len(failed)} of {len(cells)} runs failed ({', '.join(failed)}); see log.txt in their folders below "
-            f"{folder.path / 'runs'}; the same command tries them again"
+            f"{len(failed)} of {len(study.cells)} runs failed ({', '.join(failed)}); see log.txt in their folders "
+            f"below {folder.path / 'runs'}; the same command tries them again"
         )
+
+
+def _run(
+    folder: StudyFolder, study: Study, others: Sequence[StudyFolder], jobs: int, requests: Sequence[int]
+) -> tuple[bool, list[str]]:
+    """Run the cells of a study with live progress; return whether it came to its end, and which runs failed."""
+    from esp_cli.studies.engine_local import LocalEngine
+    from esp_cli.studies.scheduler import Scheduler
+
+    names = {cell.name for cell in study.cells}
+    cells = [cell for cell in folder.study.cells if cell.name in names]
+    for cell in cells:
+        twin = folder.find_twin(cell, others)
+        if twin is not None:
+            folder.adopt(cell, twin)
+            console.note(f"taking over {twin} as {cell.name}")
+    scheduler = Scheduler(folder, cells, min(jobs, len(cells)), LocalEngine())
+    finished = sum(run.status == "finished" for run in scheduler.runs)
+    console.note(
+        f"{study.title}: {len(cells)} runs, {finished} of them finished, {scheduler.jobs} side by side -> {folder.path}"
+    )
+    with StudyProgress() as progress:
+
+        def listen(snapshot: Snapshot) -> bool:
+            progress.update(snapshot)
+            return not requests
+
+        complete = scheduler.run(listen)
+    return complete, [run.cell.name for run in scheduler.runs if run.status == "failed"]
 
 
 def _report(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:

@@ -48,7 +48,7 @@ def bundle(
     Args:
         trained: a run.
         folder: of the manifest; made where it is missing.
-        episodes: to choose the seed by, and as many others to judge it by.
+        episodes: to choose the seed by, and as many others to score it by.
         seed: which one; by default the best.
         name: of the policy; by default from task, algorithm and prior.
 

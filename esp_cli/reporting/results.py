@@ -1,7 +1,6 @@
 """The results of a study as one small JSON document: every seed's numbers, the configuration and version behind them.
 
-Everything that tables state is computed from this document by `summary`, so whoever has the file can compute the tables
-again.
+Everything that tables state is computed from this document by `summary`, so the file alone gives the tables again.
 """
 
 from __future__ import annotations

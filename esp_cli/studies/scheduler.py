@@ -1,7 +1,7 @@
 """The one scheduler of all studies: runs side by side in processes of their own, resumed, skipped and reported.
 
-What is done and what is not is read off the run folders alone, so a study may be killed at any moment, and whoever
-starts it again goes on with what is there.
+What is done and what is not is read off the run folders alone, so a study may be killed at any moment, and
+the next scheduler goes on with what is there.
 """
 
 from __future__ import annotations

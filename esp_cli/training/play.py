@@ -1,4 +1,4 @@
-"""Judging a policy: whole episodes, returns with their convention, beside random and heuristic anchors."""
+"""Playing whole episodes with a policy, at random, or with a heuristic of the task."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from esp_envs.base import Environment, Observation
 
 
 class Controller(Protocol):
-    """Whoever chooses joint actions: a trained policy or an anchor."""
+    """Chooses joint actions: a trained policy or a reference policy."""
 
     def begin(self, env: Environment, observation: Observation) -> None:
         """Prepare for new episodes in all worlds."""
