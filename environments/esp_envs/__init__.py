@@ -11,7 +11,8 @@ from esp_envs.base import (
     generators_for,
     restore_generators,
 )
-from esp_envs.registry import make, task_class, task_names
+from esp_envs.lockstep import BatchedTask, Outcome, World, to_others
+from esp_envs.registry import make, register, task_class, task_names
 from esp_envs.spec import (
     Continuous,
     Discrete,
@@ -26,6 +27,7 @@ from esp_envs.spec import (
 )
 
 __all__ = [
+    "BatchedTask",
     "Body",
     "Continuous",
     "Discrete",
@@ -35,17 +37,21 @@ __all__ = [
     "Kind",
     "Layout",
     "Observation",
+    "Outcome",
     "Scene",
     "Spaces",
     "Step",
     "TaskSettings",
     "TaskSpec",
+    "World",
     "generator_states",
     "generators_for",
     "joint_layout",
     "layout",
     "make",
+    "register",
     "restore_generators",
     "task_class",
     "task_names",
+    "to_others",
 ]

@@ -57,6 +57,20 @@ class Step:
     metrics: dict[str, Tensor]
 
 
+def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
+    """Refuse a tensor of another shape.
+
+    Raises:
+        ValueError: names both shapes.
+    """
+    if tuple(tensor.shape) != expected:
+        raise ValueError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
+
+
+OTHER_SIZE = "the saved environment has other seeds, worlds or bodies than this one; use its settings"
+"""What every task answers to the saved state of an environment of another size."""
+
+
 def generators_for(seeds: Sequence[int], device: torch.device | str = "cpu") -> list[torch.Generator]:
     """Return one generator per seed, on the CPU-or-GPU `device`."""
     return [torch.Generator(device=device).manual_seed(int(seed)) for seed in seeds]
@@ -90,7 +104,8 @@ class Environment(ABC):
     """A batch of worlds of one task.
 
     A subclass names its settings model, builds `spec` from settings in its constructor and implements the abstract
-    methods. Its class docstring is the environment card.
+    methods. `set_state`, `heuristic` and `scene` are optional: a task without them is trained and evaluated like any
+    other. Its class docstring is the environment card.
     """
 
     Settings: ClassVar[type[TaskSettings]] = TaskSettings
@@ -126,14 +141,6 @@ class Environment(ABC):
         """
 
     @abstractmethod
-    def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state (as laid out by `spec.state`) at the start of an episode.
-
-        Args:
-            state: [S, E, state width]; it fixes the physics completely, up to the task's own noise.
-        """
-
-    @abstractmethod
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything that `load_state_dict` needs to go on bit for bit, generators included."""
 
@@ -141,13 +148,51 @@ class Environment(ABC):
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
 
-    @abstractmethod
-    def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of a hand-written policy in the present state (shape as for `step`)."""
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state (as laid out by `spec.state`) at the start of an episode.
 
-    @abstractmethod
+        Args:
+            state: [S, E, state width]; it fixes the physics completely, up to the task's own noise.
+
+        Raises:
+            ValueError: the task cannot be put into a state.
+        """
+        raise ValueError(f"task {self.spec.name} cannot be put into a state; its class has no 'set_state'")
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        """Return the joint action of a hand-written policy in the present state (shape as for `step`).
+
+        Args:
+            name: one of `heuristics`; the first by default.
+
+        Raises:
+            ValueError: the task has no such policy.
+        """
+        raise ValueError(f"task {self.spec.name} has no hand-written policy; its class has no 'heuristic'")
+
+    def named_heuristic(self, name: str | None) -> str:
+        """Return a heuristic's name with its default filled in.
+
+        Raises:
+            ValueError: the task has no heuristic of this name.
+        """
+        name = name or self.heuristics[0]
+        if name not in self.heuristics:
+            raise ValueError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        return name
+
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return what there is to draw of one world (seed index, world index)."""
+        """Return what there is to draw of one world (seed index, world index).
+
+        Raises:
+            ValueError: the task cannot be drawn.
+        """
+        raise ValueError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
+
+    @classmethod
+    def has(cls, method: str) -> bool:
+        """Return whether a task class offers one of the optional methods `set_state`, `heuristic` and `scene`."""
+        return getattr(cls, method) is not getattr(Environment, method)
 
     def painter(self, size: int) -> AbstractContextManager[Painter] | None:
         """Return a view of this task's own to open, or None where the view from above is all there is.
@@ -159,11 +204,21 @@ class Environment(ABC):
         """
         return None
 
+    @property
+    def action_shape(self) -> tuple[int, ...]:
+        """Shape of a joint action: [S, E, N], and the width of a continuous one."""
+        lead = (self.num_seeds, self.num_envs, self.spec.num_agents)
+        return (*lead, self.spec.action.width) if isinstance(self.spec.action, Continuous) else lead
+
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """Shape of the global states: [S, E, state width]."""
+        return self.num_seeds, self.num_envs, self.spec.state.width
+
     def random_action(self) -> Tensor:
         """Return a uniformly random joint action, drawn from each seed's own generator."""
-        shape: tuple[int, ...] = (self.num_envs, self.spec.num_agents)
+        shape = self.action_shape[1:]
         if isinstance(self.spec.action, Continuous):
-            shape += (self.spec.action.width,)
             draws = [torch.rand(shape, generator=g, device=self.device) * 2 - 1 for g in self.generators]
         else:
             count = self.spec.action.count

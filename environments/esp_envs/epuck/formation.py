@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import (
-    Environment,
+    OTHER_SIZE,
     Observation,
     Painter,
     Scene,
-    Step,
     TaskSettings,
     generator_states,
     restore_generators,
@@ -27,6 +26,7 @@ from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
 from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness
+from esp_envs.lockstep import LockstepTask, Outcome
 
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
@@ -35,7 +35,7 @@ CONTACT_GAP_M = 0.001
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
-class Formation(Environment):
+class Formation(LockstepTask):
     """Formation change of e-pucks: every robot drives to the antipode of its post, past the others and past pillars.
 
     N robots (discs of radius 0.037 m, 0.16 kg, at most 0.1256 m/s) stand around the edge of a walled square, eight on
@@ -99,10 +99,7 @@ class Formation(Environment):
             settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
         )
         robots = (self.num_worlds, settings.num_agents)
-        lead = (self.num_seeds, num_envs, settings.num_agents)
-        self._action_shape = lead if settings.actions == "discrete" else (*lead, 2)
         self._pairs = torch.tensor(WHEEL_PAIRS.points, dtype=torch.float64)
-        self._time = 0
         posts = torch.from_numpy(self.arena.posts()).expand(*robots, 2)
         self._goals = -posts
         self._pillars = torch.from_numpy(self.arena.pillars()).repeat(self.num_worlds, 1, 1)
@@ -117,8 +114,7 @@ class Formation(Environment):
         pose = torch.cat([posts, torch.zeros(*robots, 1, dtype=torch.float64)], -1)
         self._place(pose, torch.zeros_like(pose))
 
-    def reset(self) -> Observation:
-        """Start a new episode in every world."""
+    def _begin(self) -> None:
         settings = self.settings
         posts = torch.from_numpy(self.arena.posts())
         draws = [self._draw_episode(generator) for generator in self.generators]
@@ -130,7 +126,6 @@ class Formation(Environment):
         self._friction = 1 + settings.friction_spread * friction
         pose = torch.cat([posts + settings.start_noise_m * noise, math.pi * heading.unsqueeze(-1)], -1)
         self._place(pose, torch.zeros_like(pose))
-        return self._observe()
 
     def _draw_episode(self, generator: torch.Generator) -> tuple[Tensor, ...]:
         """Draw all random numbers of the starts of one seed: uniform in [-1, 1], wheel factors normal."""
@@ -147,7 +142,6 @@ class Formation(Environment):
 
     def _place(self, pose: Tensor, velocity: Tensor) -> None:
         """Begin an episode with the robots here."""
-        self._time = 0
         self._pending.zero_()
         parts = (pose, velocity, self._pillars, self._mass, self._friction)
         self.physics.place(Bodies(*(part.numpy() for part in parts)))
@@ -155,33 +149,14 @@ class Formation(Environment):
         self._look()
         self._touching = self._touches()
 
-    def step(self, action: Tensor) -> Step:
-        """Advance every world by one control step.
-
-        Raises:
-            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, 2] (continuous).
-        """
-        if tuple(action.shape) != self._action_shape:
-            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {self._action_shape}")
+    def _play(self, action: Tensor) -> Outcome:
         before, distance_before = self._position, self._distance
         self.physics.advance(self._wheel_speeds(action).numpy())
-        self._time += 1
         self._look()
-        ended = self._time == self.spec.horizon
         reward = self._reward(distance_before)
+        ended = self._time + 1 == self.spec.horizon
         metrics = self._measure((self._position - before).norm(dim=-1), ended)
-        following, final = self._observe(), None
-        if ended:
-            final, following = following, self.reset()
-        shape = (self.num_seeds, self.num_envs)
-        return Step(
-            next=following,
-            reward=self._per_world(reward),
-            terminated=torch.zeros(shape, dtype=torch.bool, device=self.device),
-            truncated=torch.full(shape, ended, dtype=torch.bool, device=self.device),
-            final=final,
-            metrics={name: self._per_world(value) for name, value in metrics.items()},
-        )
+        return self._per_world(reward), {name: self._per_world(value) for name, value in metrics.items()}
 
     def _wheel_speeds(self, action: Tensor) -> Tensor:
         """Return what the wheels really do [W, N, 2], rad/s."""
@@ -239,8 +214,7 @@ class Formation(Environment):
             "final_distance_m": self._distance.mean(-1) * ended,
         }
 
-    def _observe(self) -> Observation:
-        """Return what the robots see, and the global state."""
+    def _seen(self) -> Observation:
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
         heading, offsets = self._heading, [self._to_goal.unsqueeze(2)]
         if pillars:
@@ -281,11 +255,8 @@ class Formation(Environment):
         shaped = values.float().view(self.num_seeds, self.num_envs, *values.shape[1:])
         return shaped.contiguous().to(self.device)
 
-    def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode, with nominal masses, grip and wheels."""
-        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
-        if tuple(state.shape) != expected:
-            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
+    def _put(self, state: Tensor) -> None:
+        """Write a state, with nominal masses, grip and wheels."""
         rows = state.double().cpu().reshape(self.num_worlds, -1)
         where = self.spec.state.slices()
 
@@ -301,7 +272,6 @@ class Formation(Environment):
         self._mass = self._friction = torch.ones_like(self._mass)
         self._wheel_factor = torch.ones_like(self._wheel_factor)
         self._place(pose, velocity)
-        return self._observe()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock, memory of the metrics, what this episode drew, and generators."""
@@ -318,7 +288,7 @@ class Formation(Environment):
         physics = {k.removeprefix("physics."): v.numpy() for k, v in tensors.items() if k.startswith("physics.")}
         own = self.state_dict()
         if {k: v.shape for k, v in tensors.items()} != {k: v.shape for k, v in own.items()}:
-            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+            raise ValueError(OTHER_SIZE)
         for name in _REMEMBERED:
             setattr(self, f"_{name}", tensors[name].clone())
         self.physics.load_state_dict(physics)
@@ -332,9 +302,7 @@ class Formation(Environment):
         Raises:
             ValueError: no such heuristic.
         """
-        name = name or self.heuristics[0]
-        if name not in self.heuristics:
-            raise ValueError(f"formation has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        name = self.named_heuristic(name)
         wish = self._to_goal
         if name == "avoid":
             wish = steering.give_way(wish, self._ways, self._apart - self._reach)

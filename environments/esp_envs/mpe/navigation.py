@@ -143,15 +143,10 @@ class Navigation(ParticleTask):
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy` (default) or `cover`."""
-        name = name or self.heuristics[0]
         worlds, agents = self.worlds, self.settings.num_agents
         position, landmark = worlds.position, worlds.entity[agents:]
-        if name == "greedy":
-            goal = covering.one_each(position, landmark)
-        elif name == "cover":
-            goal = covering.shared_out(position, landmark)
-        else:
-            raise ValueError(f"navigation has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        assign = covering.one_each if self.named_heuristic(name) == "greedy" else covering.shared_out
+        goal = assign(position, landmark)
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:

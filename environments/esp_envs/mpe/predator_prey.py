@@ -142,8 +142,7 @@ class PredatorPrey(ParticleTask):
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy`: the chase, or the flight with `control="prey"`."""
-        if name not in (None, *self.heuristics):
-            raise ValueError(f"predator-prey has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        self.named_heuristic(name)
         return self._to_action(self._flight() if self._prey_learns else self._chase())
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:

@@ -1,7 +1,6 @@
-"""What the particle tasks share: lockstep episodes, fast readouts, actions, saving and restoring.
+"""What the particle tasks share: fast readouts, actions, saving and restoring.
 
-All worlds begin and end an episode together, so the clock is one Python integer and no device is ever asked whether an
-episode is over. All random numbers of an episode are drawn at its start, from each seed's own generator.
+All random numbers of an episode are drawn at its start, from each seed's own generator.
 """
 
 from __future__ import annotations
@@ -14,7 +13,8 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.base import Environment, Observation, Step, TaskSettings, generator_states, restore_generators
+from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
+from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
 
@@ -38,7 +38,7 @@ class ParticleSettings(TaskSettings):
     horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode (0.1 s each); 25 in MPE")
 
 
-class ParticleTask(Environment):
+class ParticleTask(LockstepTask):
     """A batch of particle worlds in lockstep.
 
     A subclass builds `spec`, calls `_build`, and implements the methods below that are abstract. Its state is laid out
@@ -58,9 +58,6 @@ class ParticleTask(Environment):
         self.spec = spec
         velocity_first = self.settings.convention == "esp"
         self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
-        self._time = 0
-        lead = (self.num_seeds, self.num_envs, spec.num_agents)
-        self._action_shape = lead if isinstance(spec.action, Discrete) else (*lead, spec.action.width)
         lanes = self.worlds.num_lanes
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
         self._learner_control = self._control[first_learner : first_learner + spec.num_agents]
@@ -92,51 +89,23 @@ class ParticleTask(Environment):
     def _drive(self) -> None:
         """Fill the controls of the agents that do not learn."""
 
-    def reset(self) -> Observation:
-        """Start a new episode in every world."""
-        self._time = 0
+    def _begin(self) -> None:
         self.worlds.velocity.zero_()
         for seed in range(self.num_seeds):
             self._start(seed, slice(seed * self.num_envs, (seed + 1) * self.num_envs))
         self.worlds.measure()
-        return self._observe()
 
-    def step(self, action: Tensor) -> Step:
-        """Advance every world by one step; see the class for the action.
-
-        Raises:
-            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, 2] (continuous).
-        """
-        if action.shape != self._action_shape:
-            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {self._action_shape}")
+    def _play(self, action: Tensor) -> Outcome:
         self._act(action)
         self._drive()
         self.worlds.advance(self._control)
-        self._time += 1
         reward, metrics = self._outcome()
-        following, final = self._observe(), None
-        ended = self._time == self.spec.horizon
-        if ended:
-            final, following = following, self.reset()
-        shape = (self.num_seeds, self.num_envs)
-        return Step(
-            next=following,
-            reward=self._per_world(reward.expand(self.spec.num_agents, -1).t()),
-            terminated=torch.zeros(shape, dtype=torch.bool, device=self.device),
-            truncated=torch.full(shape, ended, dtype=torch.bool, device=self.device),
-            final=final,
-            metrics={name: self._per_world(value) for name, value in metrics.items()},
-        )
+        per_agent = self._per_world(reward.expand(self.spec.num_agents, -1).t())
+        return per_agent, {name: self._per_world(value) for name, value in metrics.items()}
 
-    def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode."""
-        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
-        if tuple(state.shape) != expected:
-            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
-        self._time = 0
+    def _put(self, state: Tensor) -> None:
         self.worlds.rows().copy_(state.reshape(-1, self.spec.state.width).t())
         self.worlds.measure()
-        return self._observe()
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock and generators."""
@@ -154,13 +123,13 @@ class ParticleTask(Environment):
         """
         physics, states = tensors["physics"], tensors["generators"]
         if physics.shape != self.worlds.rows().shape or len(states) != self.num_seeds:
-            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+            raise ValueError(OTHER_SIZE)
         self.worlds.rows().copy_(physics)
         self._time = int(tensors["time"])
         restore_generators(self.generators, states)
         self.worlds.measure()
 
-    def _observe(self) -> Observation:
+    def _seen(self) -> Observation:
         rows = self.worlds.rows().t()
         lead = (self.num_seeds, self.num_envs)
         obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)

@@ -9,12 +9,14 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import (
+    OTHER_SIZE,
     Body,
     Environment,
     Observation,
     Scene,
     Step,
     generator_states,
+    require_shape,
     restore_generators,
 )
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP
@@ -109,9 +111,7 @@ class Wildlife(Environment):
             ValueError: the action has another shape than [S, E, N].
         """
         settings, agents = self.settings, self.settings.num_agents
-        expected = (self.num_seeds, self.num_envs, agents)
-        if tuple(action.shape) != expected:
-            raise ValueError(f"the joint action has shape {tuple(action.shape)}, expected {expected}")
+        require_shape("joint action", action, self.action_shape)
         before = self._cells
         chance = self.plan[self._clock].long()
         after = self._wrap(before + torch.cat([self._points[action], chance[:, :, :1]], 2))
@@ -135,7 +135,7 @@ class Wildlife(Environment):
         reward = torch.where(captured, 1.0 + helpers, 0.0) - STEP_COST
         return Step(
             next=self._observe(self._cells),
-            reward=reward.unsqueeze(-1).expand(expected).contiguous(),
+            reward=reward.unsqueeze(-1).expand(self.action_shape).contiguous(),
             terminated=captured,
             truncated=truncated,
             final=final,
@@ -149,9 +149,7 @@ class Wildlife(Environment):
 
     def set_state(self, state: Tensor) -> Observation:
         """Put every world into a global state at the start of an episode; the plan stays, and begins anew."""
-        expected = (self.num_seeds, self.num_envs, self.spec.state.width)
-        if tuple(state.shape) != expected:
-            raise ValueError(f"the state has shape {tuple(state.shape)}, expected (seeds, worlds, width) {expected}")
+        require_shape("state", state, self.state_shape)
         self._clock = 0
         self._time.zero_()
         self._cells = state.round().long().unflatten(-1, (-1, 2))
@@ -174,7 +172,7 @@ class Wildlife(Environment):
             ValueError: the tensors belong to an environment of another size.
         """
         if tensors["plan"].shape != self.plan.shape or len(tensors["generators"]) != self.num_seeds:
-            raise ValueError("the saved environment has other seeds, worlds or bodies than this one; use its settings")
+            raise ValueError(OTHER_SIZE)
         self._cells = tensors["cells"].to(self.device).long()
         self._time = tensors["time"].to(self.device).clone()
         self._clock = int(tensors["clock"])
@@ -183,8 +181,7 @@ class Wildlife(Environment):
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `surround`."""
-        if name not in (None, *self.heuristics):
-            raise ValueError(f"wildlife has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+        self.named_heuristic(name)
         drones, poacher = self._cells[:, :, :-1], self._cells[:, :, -1:]
         way = self._wrap(poacher - drones)
         distance = way.abs().sum(-1)

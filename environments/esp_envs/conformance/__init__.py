@@ -1,0 +1,61 @@
+"""What every environment promises, as checks that anybody can run on a task.
+
+    from esp_envs.conformance import PROMISES, Subject, check
+    for finding in check(Subject(lambda worlds, seeds: make("navigation", worlds, seeds))):
+        print(finding.promise, finding.broken or "holds")
+
+Each promise is one function of a `Subject`. It returns nothing where the promise holds, and raises `Broken` with one
+sentence where it does not, or `NotAsked` where the task does not offer what the promise is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from esp_envs.conformance import repeating, stepping
+from esp_envs.conformance.subject import Broken, NotAsked, Subject
+
+__all__ = ["PROMISES", "Broken", "Finding", "NotAsked", "Subject", "check"]
+
+PROMISES: tuple[Callable[[Subject], None], ...] = (
+    stepping.observations_rewards_and_metrics_fit_the_spec,
+    stepping.actions_of_heuristics_and_chance_lie_in_the_action_space,
+    stepping.episodes_end_together_at_the_horizon,
+    stepping.episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest,
+    repeating.the_same_seed_gives_the_same_run,
+    repeating.a_seed_alone_equals_itself_among_others,
+    repeating.worlds_do_not_touch_each_other,
+    repeating.results_are_memory_of_their_own,
+    repeating.a_saved_environment_goes_on_bit_for_bit,
+    repeating.an_environment_of_another_size_is_refused,
+    stepping.a_joint_action_of_the_wrong_shape_is_refused,
+    repeating.set_state_reproduces_what_follows,
+    repeating.set_state_starts_an_episode,
+    stepping.a_scene_can_be_drawn,
+)
+"""All promises, in the order in which `check` goes through them."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one promise: `broken` and `not_asked` are sentences; both are None where it holds."""
+
+    promise: str
+    broken: str | None = None
+    not_asked: str | None = None
+
+
+def check(subject: Subject) -> Iterator[Finding]:
+    """Check every promise in turn; a task that raises breaks the promise."""
+    for promise in PROMISES:
+        name = promise.__name__.replace("_", " ")
+        try:
+            promise(subject)
+        except NotAsked as reason:
+            yield Finding(name, not_asked=str(reason))
+        except Exception as failure:
+            said = str(failure) if isinstance(failure, Broken) else f"{type(failure).__name__}: {failure}"
+            yield Finding(name, broken=said)
+        else:
+            yield Finding(name)

@@ -1,0 +1,161 @@
+"""Promises about runs that repeat: seeds, worlds apart, memory, saving, and states to begin from."""
+
+from __future__ import annotations
+
+import torch
+
+from esp_envs.conformance.subject import (
+    WORLDS,
+    Broken,
+    NotAsked,
+    Subject,
+    nearly,
+    parts_of,
+    require,
+    require_set_state,
+    same_observation,
+    same_step,
+    tensors_of,
+)
+from esp_envs.spec import Continuous
+
+
+def the_same_seed_gives_the_same_run(subject: Subject) -> None:
+    """Two environments of one seed agree bit for bit; one of another seed starts elsewhere."""
+    first, again, other = (subject.worlds(seeds=(seed,)) for seed in (3, 3, 4))
+    start = first.reset()
+    require(same_observation(start, again.reset()), "two resets from one seed differ")
+    require(not torch.equal(start.state, other.reset().state), "another seed gives the same start")
+    for _ in range(first.spec.horizon + 5):
+        action = first.random_action()
+        require(torch.equal(action, again.random_action()), "random actions of one seed differ")
+        require(same_step(first.step(action), again.step(action)), "two runs of one seed and the same actions differ")
+
+
+def a_seed_alone_equals_itself_among_others(subject: Subject) -> None:
+    """Seed 7 gives the same run alone and among three seeds."""
+    alone, among = subject.worlds(seeds=(7,)), subject.worlds(seeds=(3, 7, 11))
+    require(torch.equal(alone.reset().obs[0], among.reset().obs[1]), "a seed starts otherwise among others")
+    for _ in range(alone.spec.horizon + 5):
+        own, joint = alone.random_action(), among.random_action()
+        require(torch.equal(own[0], joint[1]), "a seed draws other random actions among others")
+        pairs = zip(tensors_of(alone.step(own)), tensors_of(among.step(joint)), strict=True)
+        require(all(torch.equal(x[0], y[1]) for x, y in pairs), "a seed gives another run among others")
+
+
+def worlds_do_not_touch_each_other(subject: Subject) -> None:
+    """Other actions in world 0 change nothing in the other worlds."""
+    env, twin = subject.worlds(), subject.worlds()
+    env.reset(), twin.reset()
+    changed = False
+    for _ in range(env.spec.horizon + 3):
+        action = env.random_action()
+        twin.random_action()
+        different = action.clone()
+        if isinstance(env.spec.action, Continuous):
+            different[:, 0] = -action[:, 0]
+        else:
+            different[:, 0] = (action[:, 0] + 1) % env.spec.action.count
+        a, b = env.step(action), twin.step(different)
+        require(same_step(a, b, (slice(None), slice(1, None))), "an action in one world changes another world")
+        changed |= not same_step(a, b)
+    require(changed, "actions change nothing")
+
+
+def results_are_memory_of_their_own(subject: Subject) -> None:
+    """Whoever overwrites a result or an action changes neither the simulation nor another result."""
+    env, twin = subject.worlds(), subject.worlds()
+    env.reset()
+    start = twin.reset()
+    start.obs.fill_(7), start.state.fill_(7)
+    for _ in range(env.spec.horizon + 2):
+        action = env.random_action()
+        before = action.clone()
+        step, marred = env.step(action), twin.step(twin.random_action())
+        require(torch.equal(action, before), "a step writes into the action")
+        require(same_step(step, marred), "overwriting an earlier result changes the simulation")
+        copies = [value.clone() for value in tensors_of(step)]
+        for value in tensors_of(marred):
+            value.fill_(1)
+        if env.heuristics:
+            env.heuristic()
+        intact = all(torch.equal(x, y) for x, y in zip(copies, tensors_of(step), strict=True))
+        require(intact, "two results share memory")
+    env.step(env.random_action())
+    intact = all(torch.equal(x, y) for x, y in zip(copies, tensors_of(step), strict=True))
+    require(intact, "a step overwrites the result of the one before")
+
+
+def a_saved_environment_goes_on_bit_for_bit(subject: Subject) -> None:
+    """Restored into worlds of other seeds, a saved state repeats what followed; saving takes a copy."""
+    env, other = subject.worlds(), subject.worlds(seeds=(100, 101))
+    env.reset(), other.reset()
+    for _ in range(env.spec.horizon // 2):
+        env.step(env.random_action())
+    saved = env.state_dict()
+    copies = {name: value.clone() for name, value in saved.items()}
+    expected = [env.step(env.random_action()) for _ in range(env.spec.horizon + 5)]
+    intact = all(torch.equal(saved[name], copies[name]) for name in copies)
+    require(intact, "what 'state_dict' returned changes when the environment goes on")
+    other.load_state_dict(copies)
+    for step in expected:
+        require(same_step(step, other.step(other.random_action())), "a restored environment goes on otherwise")
+
+
+def an_environment_of_another_size_is_refused(subject: Subject) -> None:
+    """A saved state of other seeds or worlds is answered by a ValueError."""
+    env = subject.worlds()
+    env.reset()
+    saved = env.state_dict()
+    for other in (subject.worlds(WORLDS + 1), subject.worlds(seeds=(1,))):
+        try:
+            other.load_state_dict(saved)
+        except ValueError:
+            continue
+        raise Broken("the saved state of an environment of another size is accepted")
+
+
+def set_state_reproduces_what_follows(subject: Subject) -> None:
+    """A state fixes observations and, where a task has no chance of its own, the next step."""
+    env, other, third = subject.worlds(), subject.worlds(seeds=(50, 60)), subject.worlds(seeds=(51, 61))
+    require_set_state(env)
+    if subject.hides_state:
+        raise NotAsked("the state leaves something out")
+    observation = env.reset()
+    for t in range(min(6, env.spec.horizon - 1)):
+        again = other.set_state(observation.state)
+        seen = nearly(parts_of(again), parts_of(observation), subject.rounding)
+        require(seen, "the observation after 'set_state' differs from the one that came with the state")
+        third.set_state(observation.state)
+        if subject.align is not None:
+            subject.align(env, other, t)
+            subject.align(env, third, t)
+        action = env.random_action()
+        step, copy, twin = env.step(action), other.step(action), third.step(action)
+        if not nearly(tensors_of(copy), tensors_of(twin), subject.rounding):
+            raise NotAsked("the task has chance of its own")
+        same = nearly(tensors_of(copy), tensors_of(step), subject.rounding)
+        require(same, "the step after 'set_state' differs from the one that the state had")
+        observation = step.next
+
+
+def set_state_starts_an_episode(subject: Subject) -> None:
+    """The clock begins anew, and a state of another width is refused."""
+    env = subject.worlds()
+    require_set_state(env)
+    observation = env.reset()
+    if env.spec.horizon > 1:
+        env.step(env.random_action())
+    env.set_state(observation.state)
+    alive = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
+    for t in range(env.spec.horizon):
+        step = env.step(env.random_action())
+        alive &= ~step.terminated
+        due = alive & (t == env.spec.horizon - 1)
+        require(torch.equal(step.truncated & alive, due), "'set_state' does not restart the clock")
+        alive &= ~step.truncated
+    try:
+        env.set_state(observation.state[:, :-1])
+    except ValueError:
+        return
+    raise Broken("a state of another shape is accepted; compare it with 'state_shape'")

@@ -1,0 +1,131 @@
+"""Promises about what a step returns, how episodes end, and what is refused."""
+
+from __future__ import annotations
+
+import torch
+
+from esp_envs.conformance.subject import (
+    WORLDS,
+    Broken,
+    NotAsked,
+    Subject,
+    require,
+    require_equal,
+    same_observation,
+    tensors_of,
+)
+from esp_envs.spec import Continuous
+
+
+def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
+    """Shapes, types, finite numbers and contiguous memory, over more than an episode."""
+    env = subject.worlds()
+    spec, lead = env.spec, (env.num_seeds, env.num_envs)
+    observation = env.reset()
+    for _ in range(spec.horizon + 2):
+        require_equal("obs", tuple(observation.obs.shape), (*lead, spec.num_agents, spec.observation.width))
+        require_equal("state", tuple(observation.state.shape), (*lead, spec.state.width))
+        step = env.step(env.random_action())
+        observation = step.next
+        require_equal("reward", tuple(step.reward.shape), (*lead, spec.num_agents))
+        for name, flags in (("terminated", step.terminated), ("truncated", step.truncated)):
+            require_equal(name, (tuple(flags.shape), flags.dtype), (lead, torch.bool))
+        for name, value in step.metrics.items():
+            require_equal(f"metric {name}", tuple(value.shape), lead)
+        for value in tensors_of(step):
+            require(value.dtype in (torch.float32, torch.bool), f"a result of 'step' is {value.dtype}, not float32")
+            require(value.is_contiguous(), "a result of 'step' is not contiguous")
+            require(bool(torch.isfinite(value.float()).all()), "a result of 'step' is not finite")
+        if spec.shared_reward:
+            same = torch.equal(step.reward, step.reward[..., :1].expand_as(step.reward))
+            require(same, "the spec says that agents share the reward, but they get different ones")
+
+
+def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -> None:
+    """Shape, type and range of every joint action that the task itself proposes."""
+    env = subject.worlds()
+    env.reset()
+    action = env.spec.action
+    for name in (None, *env.heuristics):
+        for joint in (env.random_action(), env.heuristic(name) if env.heuristics else env.random_action()):
+            require_equal("a joint action", tuple(joint.shape), env.action_shape)
+            if isinstance(action, Continuous):
+                require(joint.dtype == torch.float32, f"a continuous action is {joint.dtype}, not float32")
+                require(float(joint.abs().max()) <= 1 + 1e-6, "a continuous action is larger than 1")
+            else:
+                require(joint.dtype == torch.int64, f"a discrete action is {joint.dtype}, not int64")
+                require(int(joint.min()) >= 0 and int(joint.max()) < action.count, "an action is out of range")
+            env.step(joint)
+    if env.heuristics:
+        first = torch.equal(env.heuristic(), env.heuristic(env.heuristics[0]))
+        require(first, "the default heuristic is not the first that the class names")
+
+
+def episodes_end_together_at_the_horizon(subject: Subject) -> None:
+    """Where no world ends of its own: truncated in the last step alone, then elsewhere, and anew after a reset."""
+    env = subject.worlds()
+    if env.spec.terminates:
+        raise NotAsked("each world ends for itself")
+    env.reset()
+    for _ in range(2):
+        step = env.step(env.random_action())
+        for t in range(env.spec.horizon):
+            last = t == env.spec.horizon - 1
+            require(not bool(step.terminated.any()), "a world terminated; set 'terminates' in the spec")
+            require(bool(step.truncated.all() if last else not step.truncated.any()), "truncated at another step")
+            require((step.final is not None) == last, "'final' belongs to the last step alone")
+            if not last:
+                step = env.step(env.random_action())
+        assert step.final is not None
+        require(not torch.equal(step.final.state, step.next.state), "the next episode starts where the last ended")
+    env.step(env.random_action())
+    env.reset()
+    ends = [bool(env.step(env.random_action()).truncated.any()) for _ in range(env.spec.horizon)]
+    require(ends == [False] * (env.spec.horizon - 1) + [True], "reset does not restart the clock")
+
+
+def episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest(subject: Subject) -> None:
+    """Where worlds end of their own: never both ends at once, and `final` equals `next` in the others."""
+    env = subject.worlds(40)
+    if not env.spec.terminates:
+        raise NotAsked("all worlds end together")
+    env.reset()
+    age = torch.zeros(env.num_seeds, 40, device=env.device)
+    for _ in range(2 * env.spec.horizon + 2):
+        step = env.step(env.random_action())
+        age += 1
+        require(step.final is not None, "'final' is missing although a world may have ended")
+        assert step.final is not None
+        require(not bool((step.terminated & step.truncated).any()), "a world is terminated and truncated at once")
+        at_horizon = torch.equal(step.truncated, (age == env.spec.horizon) & ~step.terminated)
+        require(at_horizon, "a world is truncated at another step than the horizon")
+        goes_on = ~(step.terminated | step.truncated)
+        same = same_observation(step.final, step.next, (goes_on,))
+        require(same, "'final' differs from 'next' in a world that goes on")
+        age[~goes_on] = 0
+
+
+def a_joint_action_of_the_wrong_shape_is_refused(subject: Subject) -> None:
+    """A ValueError, before anything has moved."""
+    env = subject.worlds()
+    env.reset()
+    try:
+        env.step(env.random_action().transpose(0, 1))
+    except ValueError:
+        return
+    raise Broken("a joint action of another shape is accepted; compare it with 'action_shape'")
+
+
+def a_scene_can_be_drawn(subject: Subject) -> None:
+    """Finite bodies in a window, other ones in another world."""
+    env = subject.worlds()
+    if not env.has("scene"):
+        raise NotAsked("the task has no picture")
+    env.reset()
+    first, second = env.scene((0, 0)), env.scene((1, WORLDS - 1))
+    require(first != second, "two worlds give the same picture")
+    require(len(first.bodies) >= env.spec.num_agents, "fewer bodies than agents are drawn")
+    x_min, x_max, y_min, y_max = first.window
+    require(x_min < x_max and y_min < y_max, f"the window {first.window} is empty")
+    places = torch.tensor([(*body.position, body.radius) for body in first.bodies])
+    require(bool(places.isfinite().all() and (places[:, 2] > 0).all()), "a body has no finite place or no radius")

@@ -1,0 +1,90 @@
+"""The task that a promise is asked of, the two ways of not keeping it, and how results are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from esp_envs.base import Environment, Observation, Step
+
+MakeWorlds = Callable[[int, Sequence[int]], Environment]
+WORLDS, SEEDS = 5, (3, 7)
+
+
+class Broken(ValueError):  # noqa: N818 - it is a finding, not an error of the program
+    """A task does not keep a promise; the message says what happens instead."""
+
+
+class NotAsked(ValueError):  # noqa: N818
+    """A promise does not concern a task; the message says why."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A task to check.
+
+    Attributes:
+        make: makes the worlds, given E and the seeds.
+        rounding: how far a step from a restored state may differ, where the physics is finer than float32.
+        hides_state: whether the global state leaves something out, so that nothing is asked of what follows it.
+        align: gives the second environment the chance that the first has drawn in advance, at a step of its episode.
+    """
+
+    make: MakeWorlds
+    rounding: float = 0.0
+    hides_state: bool = False
+    align: Callable[[Environment, Environment, int], None] | None = None
+
+    def worlds(self, num_envs: int = WORLDS, seeds: Sequence[int] = SEEDS) -> Environment:
+        """Make E worlds for each seed."""
+        return self.make(num_envs, seeds)
+
+
+def tensors_of(step: Step) -> list[Tensor]:
+    """Return every tensor of a step."""
+    final = [] if step.final is None else parts_of(step.final)
+    return [*parts_of(step.next), step.reward, *step.metrics.values(), *final, step.terminated, step.truncated]
+
+
+def same_step(a: Step, b: Step, where: tuple[slice | Tensor, ...] = ()) -> bool:
+    """Return whether two steps are equal bit for bit, in the worlds that `where` selects."""
+    if (a.final is None) != (b.final is None) or a.metrics.keys() != b.metrics.keys():
+        return False
+    return all(torch.equal(x[where], y[where]) for x, y in zip(tensors_of(a), tensors_of(b), strict=True))
+
+
+def parts_of(observation: Observation) -> list[Tensor]:
+    """Return what an observation consists of."""
+    return [observation.obs, observation.state]
+
+
+def same_observation(a: Observation, b: Observation, where: tuple[Tensor, ...] = ()) -> bool:
+    """Return whether two observations are equal bit for bit, in the worlds that `where` selects."""
+    return all(torch.equal(x[where], y[where]) for x, y in zip(parts_of(a), parts_of(b), strict=True))
+
+
+def nearly(a: Sequence[Tensor], b: Sequence[Tensor], bound: float) -> bool:
+    """Return whether tensors agree within `bound`; bit for bit where it is 0."""
+    return len(a) == len(b) and all(
+        bool(((x.float() - y.float()).abs() <= bound).all()) for x, y in zip(a, b, strict=True)
+    )
+
+
+def require_set_state(env: Environment) -> None:
+    """Ask nothing of a task that cannot be put into a state."""
+    if not env.has("set_state"):
+        raise NotAsked("the task cannot be put into a state")
+
+
+def require(holds: bool, otherwise: str) -> None:
+    """Raise `Broken` with a sentence unless something holds."""
+    if not holds:
+        raise Broken(otherwise)
+
+
+def require_equal(what: str, got: object, expected: object) -> None:
+    """Raise `Broken` unless something is as expected."""
+    require(got == expected, f"{what} is {got}, expected {expected}")

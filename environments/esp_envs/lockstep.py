@@ -1,0 +1,211 @@
+"""Tasks whose worlds begin and end their episodes together: the clock is one integer, and no device is ever asked.
+
+`LockstepTask` keeps what all such tasks share. `BatchedTask` derives everything else from three methods, for a task
+whose world is a few named tensors:
+
+    class Rendezvous(BatchedTask):
+        def _describe(self) -> TaskSpec: ...                    # from self.settings
+        def _start(self, generator) -> World: ...               # the worlds of one seed
+        def _advance(self, world, action) -> Outcome: ...       # reward and metrics; writes the new world
+        def _observe(self, world) -> Tensor: ...                # [S, E, N, D]
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from esp_envs.base import (
+    OTHER_SIZE,
+    Environment,
+    Observation,
+    Step,
+    TaskSettings,
+    generator_states,
+    require_shape,
+    restore_generators,
+)
+from esp_envs.spec import Continuous, Kind, TaskSpec
+
+World = dict[str, Tensor]
+"""The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
+Outcome = tuple[Tensor, dict[str, Tensor]]
+"""The reward [S, E, N] of a step and its metrics [S, E]."""
+
+
+class LockstepTask(Environment):
+    """A batch of worlds that all begin and end an episode in the same step, after `spec.horizon` steps."""
+
+    _time = 0
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Draw a new episode for every world."""
+
+    @abstractmethod
+    def _play(self, action: Tensor) -> Outcome:
+        """Advance every world by one step; the action has the right shape."""
+
+    @abstractmethod
+    def _seen(self) -> Observation:
+        """Return what the agents and the critic see now, as tensors of their own."""
+
+    @abstractmethod
+    def _put(self, state: Tensor) -> None:
+        """Write a global state [S, E, state width] into the worlds."""
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        self._time = 0
+        self._begin()
+        return self._seen()
+
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one step.
+
+        Raises:
+            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, width] (continuous).
+        """
+        require_shape("joint action", action, self.action_shape)
+        reward, metrics = self._play(action)
+        self._time += 1
+        following, final = self._seen(), None
+        ended = self._time == self.spec.horizon
+        if ended:
+            final, following = following, self.reset()
+        shape = (self.num_seeds, self.num_envs)
+        return Step(
+            next=following,
+            reward=reward,
+            terminated=torch.zeros(shape, dtype=torch.bool, device=self.device),
+            truncated=torch.full(shape, ended, dtype=torch.bool, device=self.device),
+            final=final,
+            metrics=metrics,
+        )
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state at the start of an episode.
+
+        Raises:
+            ValueError: the state has another shape than [S, E, state width].
+        """
+        require_shape("state", state, self.state_shape)
+        self._time = 0
+        self._put(state)
+        return self._seen()
+
+
+class BatchedTask(LockstepTask):
+    """A task whose world is one tensor for each field of its state.
+
+    A subclass implements `_describe`, `_start`, `_advance` and `_observe`, and may add `heuristic` and `scene`. All
+    randomness comes from `draw` or from the generator that `_start` is given. Vectors of a continuous action arrive
+    in `_advance` with a length of at most 1, its other numbers in [-1, 1].
+    """
+
+    def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        self.spec = self._describe()
+        self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
+
+    @abstractmethod
+    def _describe(self) -> TaskSpec:
+        """Return the spec that follows from `self.settings`."""
+
+    @abstractmethod
+    def _start(self, generator: torch.Generator) -> World:
+        """Draw an episode for the E worlds of one seed: for each field of the state [E, items, item width]."""
+
+    @abstractmethod
+    def _advance(self, world: World, action: Tensor) -> Outcome:
+        """Write the next step's tensors into `world`; return the reward [S, E, N] (or [S, E]) and metrics [S, E]."""
+
+    @abstractmethod
+    def _observe(self, world: World) -> Tensor:
+        """Return each agent's observation [S, E, N, D] as the layout says; any trailing axes are flattened."""
+
+    def draw(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
+        """Return numbers uniform in [-1, 1]: [E, *shape] from one generator, else [S, E, *shape] from each seed's."""
+        own = self.generators if generator is None else [generator]
+        drawn = [torch.rand(self.num_envs, *shape, generator=g, device=self.device) * 2 - 1 for g in own]
+        return torch.stack(drawn) if generator is None else drawn[0]
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the world, the clock and the generators."""
+        return {
+            "world": self._state(),
+            "time": torch.tensor(self._time),
+            "generators": generator_states(self.generators),
+        }
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: the tensors belong to an environment of another size.
+        """
+        if tensors["world"].shape != self.state_shape or len(tensors["generators"]) != self.num_seeds:
+            raise ValueError(OTHER_SIZE)
+        self._put(tensors["world"].to(self.device))
+        self._time = int(tensors["time"])
+        restore_generators(self.generators, tensors["generators"])
+
+    def _begin(self) -> None:
+        drawn = [self._start(generator) for generator in self.generators]
+        self.world = {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
+        for field in self.spec.state.fields:
+            found = self.world.get(field.name)
+            expected = (self.num_seeds, self.num_envs, field.count, field.item_width)
+            if found is None or tuple(found.shape) != expected:
+                got = "is missing" if found is None else f"has shape {tuple(found.shape[1:])}"
+                raise ValueError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
+
+    def _play(self, action: Tensor) -> Outcome:
+        reward, metrics = self._advance(self.world, self._admissible(action))
+        if reward.dim() == 2:
+            reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
+        metrics = {name: value.float().contiguous().clone() for name, value in metrics.items()}
+        return reward.float().contiguous().clone(), metrics
+
+    def _seen(self) -> Observation:
+        obs = self._observe(self.world).flatten(3).float().clone(memory_format=torch.contiguous_format)
+        require_shape("observation", obs, (*self.action_shape[:3], self.spec.observation.width))
+        return Observation(obs, self._state())
+
+    def _put(self, state: Tensor) -> None:
+        self.world = self._split(state.clone())
+
+    def _state(self) -> Tensor:
+        return torch.cat([self.world[field.name].flatten(2) for field in self.spec.state.fields], -1)
+
+    def _split(self, state: Tensor) -> World:
+        parts = state.split([field.width for field in self.spec.state.fields], -1)
+        fields = self.spec.state.fields
+        return {f.name: part.unflatten(-1, (f.count, f.item_width)) for f, part in zip(fields, parts, strict=True)}
+
+    def _admissible(self, action: Tensor) -> Tensor:
+        """Scale vectors back to length 1 and clip other numbers, as a continuous action space promises."""
+        if not isinstance(self.spec.action, Continuous):
+            return action
+        parts = []
+        for field, part in zip(
+            self.spec.action.layout.fields,
+            action.split([f.width for f in self.spec.action.layout.fields], -1),
+            strict=True,
+        ):
+            if field.kind is Kind.VECTOR:
+                vectors = part.unflatten(-1, (-1, 2))
+                parts.append((vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1.0)).flatten(-2))
+            else:
+                parts.append(part.clamp(-1.0, 1.0))
+        return torch.cat(parts, -1)
+
+
+def to_others(position: Tensor) -> Tensor:
+    """Return where each agent sees each other agent, in index order: [..., N, N - 1, w] from positions [..., N, w]."""
+    count = position.shape[-2]
+    others = torch.tensor([[j for j in range(count) if j != i] for i in range(count)], device=position.device)
+    return position[..., others, :] - position.unsqueeze(-2)

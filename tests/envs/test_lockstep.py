@@ -1,0 +1,260 @@
+"""Tasks derived from `BatchedTask`, and what the optional methods answer where a task lacks them."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from esp_envs import BatchedTask, Environment, Field, Kind, TaskSettings, generators_for, layout, to_others
+from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
+from esp_envs.spec import Continuous, TaskSpec
+from tests.own_tasks import lines_of, page_files, save_page_files
+
+
+@pytest.fixture(scope="module")
+def rendezvous(tmp_path_factory: pytest.TempPathFactory) -> type[Environment]:
+    folder = tmp_path_factory.mktemp("page")
+    save_page_files(folder)
+    return load(folder / "rendezvous.py").Rendezvous
+
+
+def load(path: Path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def worlds(cls: type[Environment], num_envs: int = 5, seeds: Sequence[int] = (3, 7), **settings) -> Environment:
+    return cls(cls.Settings(**settings), num_envs, generators_for(seeds))
+
+
+def test_the_task_of_the_page_keeps_every_promise(rendezvous: type[Environment]) -> None:
+    findings = list(check(Subject(lambda num_envs, seeds: worlds(rendezvous, num_envs, seeds))))
+    assert [finding for finding in findings if finding.broken] == []
+    assert [f.promise for f in findings if f.not_asked] == [
+        "episodes that end for themselves end at the horizon at the latest"
+    ]
+
+
+def test_a_complete_task_is_short() -> None:
+    assert lines_of(page_files()["rendezvous.py"]) <= 45
+
+
+def test_the_heuristic_of_the_page_beats_chance(rendezvous: type[Environment]) -> None:
+    returns = {}
+    for name, choose in (("random", "random_action"), ("middle", "heuristic")):
+        env = worlds(rendezvous, 50)
+        env.reset()
+        returns[name] = sum(float(env.step(getattr(env, choose)()).reward.mean()) for _ in range(25))
+    assert returns["middle"] > returns["random"] + 5
+
+
+class Plain(BatchedTask):
+    """A point that drifts; it has nothing that is optional, and each subclass below breaks one promise."""
+
+    def _describe(self) -> TaskSpec:
+        return TaskSpec(
+            name="plain",
+            version=1,
+            convention="none",
+            num_agents=2,
+            horizon=4,
+            observation=layout(Field("position", Kind.VECTOR)),
+            state=layout(Field("position", Kind.VECTOR, 2)),
+            action=Continuous(layout(Field("push", Kind.VECTOR), Field("turn", Kind.PSEUDOSCALAR))),
+            symmetry="o2*agents",
+            shared_reward=False,
+        )
+
+    def _start(self, generator):
+        return {"position": self.draw(2, 2, generator=generator)}
+
+    def _advance(self, world, action):
+        world["position"] = world["position"] + action[..., :2] + action[..., 2:]
+        return -world["position"].norm(dim=-1), {"x": world["position"][..., 0].mean(-1)}
+
+    def _observe(self, world):
+        return world["position"]
+
+
+@pytest.mark.parametrize("method", ["heuristic", "scene", "set_state"])
+def test_what_a_task_lacks_is_said_in_one_sentence(method: str) -> None:
+    class Bare(Plain):
+        set_state = Environment.set_state
+
+    env = worlds(Bare)
+    env.reset()
+    assert not env.has(method)
+    with pytest.raises(ValueError, match=f"task plain .*its class has no '{method}'"):
+        getattr(env, method)(*([torch.zeros(2, 5, 4)] if method == "set_state" else []))
+
+
+def test_what_a_task_has_is_known(rendezvous: type[Environment]) -> None:
+    assert all(rendezvous.has(method) for method in ("heuristic", "scene", "set_state"))
+
+
+def test_actions_arrive_within_their_bounds() -> None:
+    seen = []
+
+    class Watching(Plain):
+        def _advance(self, world, action):
+            seen.append(action)
+            return super()._advance(world, action)
+
+    env = worlds(Watching)
+    env.reset()
+    env.step(torch.tensor([3.0, -4.0, 7.0]).expand(2, 5, 2, 3))
+    torch.testing.assert_close(seen[0][0, 0, 0], torch.tensor([0.6, -0.8, 1.0]))
+
+
+def test_a_start_of_another_shape_is_refused() -> None:
+    class Short(Plain):
+        def _start(self, generator):
+            return {"position": self.draw(2, generator=generator)}
+
+    with pytest.raises(ValueError, match=r"'position' has shape \(5, 2\) in what '_start' of plain drew"):
+        worlds(Short).reset()
+
+
+def test_an_observation_of_another_width_is_refused() -> None:
+    class Wide(Plain):
+        def _observe(self, world):
+            return to_others(world["position"]).repeat(1, 1, 1, 2, 1)
+
+    with pytest.raises(ValueError, match=r"the observation has shape \(2, 5, 2, 4\), expected \(2, 5, 2, 2\)"):
+        worlds(Wide).reset()
+
+
+def test_others_are_seen_in_index_order() -> None:
+    position = torch.tensor([[0.0], [1.0], [10.0]])
+    assert to_others(position).squeeze(-1).tolist() == [[1.0, 10.0], [-1.0, 9.0], [-10.0, -9.0]]
+
+
+class Nan(Plain):
+    def _observe(self, world):
+        return world["position"] / 0
+
+
+class Unequal(Plain):
+    def _describe(self):
+        return TaskSpec(**{**vars(super()._describe()), "shared_reward": True})
+
+
+class EarlyClock(Plain):
+    def step(self, action):
+        return super().step(action) if self._time < 2 else self._ended_early(action)
+
+    def _ended_early(self, action):
+        self._time = self.spec.horizon - 1
+        return super().step(action)
+
+
+class GlobalDice(Plain):
+    def _advance(self, world, action):
+        reward, metrics = super()._advance(world, action)
+        return reward + torch.rand(()), metrics
+
+
+class SharedDice(Plain):
+    def _begin(self):
+        self.world = {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])}
+
+
+class Crowd(Plain):
+    def _advance(self, world, action):
+        return super()._advance(world, action + action.mean((0, 1), keepdim=True))
+
+
+class Leaky(Plain):
+    def _play(self, action):
+        action[..., 0] += 1
+        return super()._play(action)
+
+
+class Forgetful(Plain):
+    def state_dict(self):
+        return super().state_dict() | {"time": torch.tensor(0)}
+
+
+class Careless(Plain):
+    def load_state_dict(self, tensors):
+        self.world = self._split(tensors["world"])
+
+
+class Lazy(Plain):
+    def step(self, action):
+        return super().step(action.reshape(self.action_shape))
+
+
+class OffState(Plain):
+    def _put(self, state):
+        super()._put(state * 2)
+
+
+class NoRestart(Plain):
+    def set_state(self, state):
+        time = self._time
+        seen = super().set_state(state)
+        self._time = time
+        return seen
+
+
+class Empty(Plain):
+    def scene(self, world=(0, 0)):
+        from esp_envs import Scene
+
+        return Scene((), (0, 1, 0, world[0] + 1))
+
+
+class Wild(Plain):
+    heuristics = ("far",)
+
+    def heuristic(self, name=None):
+        return torch.full(self.action_shape, 3.0)
+
+
+BREAKERS = {
+    "observations_rewards_and_metrics_fit_the_spec": [Nan, Unequal],
+    "actions_of_heuristics_and_chance_lie_in_the_action_space": [Wild],
+    "episodes_end_together_at_the_horizon": [EarlyClock],
+    "the_same_seed_gives_the_same_run": [GlobalDice],
+    "a_seed_alone_equals_itself_among_others": [SharedDice],
+    "worlds_do_not_touch_each_other": [Crowd],
+    "results_are_memory_of_their_own": [Leaky],
+    "a_saved_environment_goes_on_bit_for_bit": [Forgetful],
+    "an_environment_of_another_size_is_refused": [Careless],
+    "a_joint_action_of_the_wrong_shape_is_refused": [Lazy],
+    "set_state_reproduces_what_follows": [OffState],
+    "set_state_starts_an_episode": [NoRestart],
+    "a_scene_can_be_drawn": [Empty],
+}
+BY_NAME = {promise.__name__: promise for promise in PROMISES}
+
+
+@pytest.mark.parametrize(("name", "cls"), [(name, cls) for name, many in BREAKERS.items() for cls in many], ids=str)
+def test_a_task_that_breaks_a_promise_is_found(name: str, cls: type[Environment]) -> None:
+    with pytest.raises(Broken):
+        BY_NAME[name](Subject(lambda num_envs, seeds: worlds(cls, num_envs, seeds)))
+    try:
+        BY_NAME[name](Subject(lambda num_envs, seeds: worlds(Plain, num_envs, seeds)))
+    except NotAsked as reason:
+        assert "picture" in str(reason)  # noqa: PT017
+
+
+def test_a_task_that_raises_is_a_finding_too() -> None:
+    class Raising(Plain):
+        def _advance(self, world, action):
+            raise KeyError("speed")
+
+    findings = list(check(Subject(lambda num_envs, seeds: worlds(Raising, num_envs, seeds))))
+    assert findings[0].broken == "KeyError: 'speed'"
+    assert len(findings) == len(PROMISES)
+
+
+def test_settings_are_the_classs_own() -> None:
+    assert Plain.Settings is TaskSettings

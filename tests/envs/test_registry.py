@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from esp_envs import BatchedTask, Environment, make, register, registry, task_class, task_names
+from tests.own_tasks import save_page_files
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory of its own, whose modules are forgotten afterwards."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def test_a_task_in_the_working_directory_is_registered_by_module_and_class(folder: Path) -> None:
+    save_page_files(folder)
+    assert register("rendezvous:Rendezvous") == "rendezvous:Rendezvous"
+    assert "rendezvous:Rendezvous" in task_names()
+    env = make("rendezvous:Rendezvous", 2, [0], {"num_agents": 4})
+    assert isinstance(env, BatchedTask)
+    assert env.reset().obs.shape == (1, 2, 4, 6)
+
+
+def test_a_name_alone_never_imports_a_module(folder: Path) -> None:
+    (folder / "trap.py").write_text("from pathlib import Path\nPath('sprung').touch()\n")
+    with pytest.raises(ValueError, match="'trap:Trap' is not installed; add --task trap:Trap"):
+        task_class("trap:Trap")
+    with pytest.raises(ValueError, match="add --task"):
+        make("trap:Trap", 1, [0])
+    assert not (folder / "sprung").exists()
+    with pytest.raises(ValueError, match="has no class 'Trap'"):
+        register("trap:Trap")
+    assert (folder / "sprung").exists(), "the control: a registered module is imported"
+
+
+def test_a_class_can_be_registered_itself(folder: Path) -> None:
+    navigation = task_class("navigation")
+    name = register(navigation)
+    assert name == "esp_envs.mpe.navigation:Navigation"
+    assert task_class(name) is navigation
+
+
+def test_an_ordinary_name_needs_no_registration() -> None:
+    assert register("navigation") == "navigation"
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        (
+            "import no_such_module\n",
+            "cannot import the module 'mine' of the task: ModuleNotFoundError: No module",
+        ),
+        ("def f(:\n", "cannot import the module 'mine' of the task: SyntaxError: "),
+        ("raise RuntimeError('first\\nlast')\n", "cannot import the module 'mine' of the task: RuntimeError: last"),
+        ("Task = 3\n", "'mine:Task' is not a task; a task is a subclass of esp_envs.Environment"),
+        ("class Task: pass\n", "'mine:Task' is not a task"),
+        ("class Other: pass\n", "the module 'mine' has no class 'Task'"),
+        ("from esp_envs import BatchedTask\nclass Task(BatchedTask): pass\n", "lacks _advance, _describe, _observe"),
+    ],
+)
+def test_a_module_without_a_task_is_answered_by_a_sentence(folder: Path, source: str, sentence: str) -> None:
+    (folder / "mine.py").write_text(source)
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - the sentence is compared below
+        register("mine:Task")
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["os", "a:b:c", "../x:Y", "x:", ":Y", "x y:Z", "navigaton"])
+def test_what_names_no_task_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=r"names no task|unknown task"):
+        task_class(register(name))
+
+
+def test_the_users_modules_do_not_hide_others(folder: Path) -> None:
+    (folder / "mine.py").write_text("import csv\n")
+    (folder / "this_is_unused.py").write_text("")
+    with pytest.raises(ValueError, match="no class"):
+        register("mine:Task")
+    assert sys.path[0] != str(folder)
+    assert sys.path[-1] == str(folder)
+
+
+def test_an_installed_task_is_known_by_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    entries = [
+        EntryPoint("theirs", "esp_envs.mpe.navigation:Navigation", "esp.tasks"),
+        EntryPoint("broken", "no_such_package:Task", "esp.tasks"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: entries if group == "esp.tasks" else [])
+    assert {"theirs", "broken", "navigation"} <= set(task_names())
+    assert issubclass(task_class("theirs"), Environment)
+    with pytest.raises(ValueError, match="the installed task 'broken' cannot be imported: ModuleNotFoundError"):
+        task_class("broken")
