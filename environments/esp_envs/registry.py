@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import import_module
+from importlib import import_module, invalidate_caches
 from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract
 from pathlib import Path
@@ -114,6 +114,7 @@ def _import(name: str) -> type[Environment]:
     here = str(Path.cwd())
     # First while the module is found, as for a script; last afterwards, so that no other import meets the user's files.
     sys.path.insert(0, here)
+    invalidate_caches()  # the user may have written the file a moment ago
     try:
         module = import_module(module_name)
     except Exception as error:

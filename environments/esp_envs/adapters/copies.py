@@ -1,0 +1,242 @@
+"""Many copies of one environment, stepped here or in worker processes, with all numbers in shared memory.
+
+A `Board` holds what goes to and comes from every copy; a `Stepper` steps some copies and knows nothing of processes.
+`HereCopies` and `WorkerCopies` are two ways to drive steppers, with the same results bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import multiprocessing
+import os
+import signal
+import warnings
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkProcess
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+_RESET, _STEP, _LEAVE = b"reset", b"step", b"leave"
+TERMINATED, TRUNCATED = 1, 2
+"""What `Board.ended` says of a copy whose episode ended in this step."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large the arrays of a board are: C copies, N agents, and the widths of their numbers."""
+
+    copies: int
+    agents: int
+    obs: int
+    state: int
+    metrics: int
+    action: int | None
+    """Width of a continuous action; None for a discrete one."""
+
+
+class Board:
+    """Arrays over one piece of memory, which a fork of this process shares.
+
+    Attributes:
+        active: [C] uint8, which copies the next command concerns.
+        cut: [C] uint8, which copies reach the horizon with the next step.
+        ended: [C] uint8, 0 or how the episode ended in the last step.
+        seed: [C] int64, of the next start.
+        action: [C, N] int64 or [C, N, width] float32.
+        reward: [C, N] float32.
+        obs, final_obs: [C, N, D] float32, before and after the automatic reset the same unless the episode ended.
+        state, final_state: [C, state width] float32.
+        metrics: [C, M] float32.
+    """
+
+    active: NDArray[np.uint8]
+    cut: NDArray[np.uint8]
+    ended: NDArray[np.uint8]
+    seed: NDArray[np.int64]
+    action: NDArray[Any]
+    reward: NDArray[np.float32]
+    obs: NDArray[np.float32]
+    final_obs: NDArray[np.float32]
+    state: NDArray[np.float32]
+    final_state: NDArray[np.float32]
+    metrics: NDArray[np.float32]
+
+    def __init__(self, sizes: Sizes) -> None:
+        copies, agents = sizes.copies, sizes.agents
+        action = ((copies, agents), np.int64) if sizes.action is None else ((copies, agents, sizes.action), np.float32)
+        parts: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
+            "seed": ((copies,), np.int64),
+            "action": action,
+            "reward": ((copies, agents), np.float32),
+            "obs": ((copies, agents, sizes.obs), np.float32),
+            "final_obs": ((copies, agents, sizes.obs), np.float32),
+            "state": ((copies, sizes.state), np.float32),
+            "final_state": ((copies, sizes.state), np.float32),
+            "metrics": ((copies, sizes.metrics), np.float32),
+            "active": ((copies,), np.uint8),
+            "cut": ((copies,), np.uint8),
+            "ended": ((copies,), np.uint8),
+        }
+        # the widest numbers first, so that each array begins at a multiple of its number's width
+        order = sorted(parts, key=lambda name: -np.dtype(parts[name][1]).itemsize)
+        total = sum(int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in parts.values())
+        memory = mmap.mmap(-1, total)
+        start = 0
+        for name in order:
+            shape, kind = parts[name]
+            array = np.frombuffer(memory, kind, int(np.prod(shape)), start).reshape(shape)
+            setattr(self, name, array)
+            start += array.nbytes
+
+
+class Stepper(Protocol):
+    """Whoever resets and steps the copies of a board that are `active`."""
+
+    def reset(self) -> None:
+        """Start an episode in the active copies."""
+
+    def step(self) -> None:
+        """Advance the active copies by one step, and reset those whose episode ends."""
+
+
+class HereCopies:
+    """All copies in this process."""
+
+    def __init__(self, sizes: Sizes, make_stepper: Callable[[Board, range], Stepper]) -> None:
+        self.board = Board(sizes)
+        self._stepper = make_stepper(self.board, range(sizes.copies))
+
+    def reset(self) -> None:
+        """Start an episode in the active copies."""
+        self._stepper.reset()
+
+    def step(self) -> None:
+        """Advance the active copies by one step."""
+        self._stepper.step()
+
+
+class WorkerCopies:
+    """The copies shared out among worker processes, which are forks of this one.
+
+    A command is one byte in a pipe; its answer is empty, or the sentence of what went wrong. A worker leaves when its
+    pipe closes, so none outlives this process.
+
+    Args:
+        sizes: of the board.
+        make_stepper: called in each worker with the board and its share of the copies.
+        count: of the workers.
+    """
+
+    def __init__(self, sizes: Sizes, make_stepper: Callable[[Board, range], Stepper], count: int) -> None:
+        self.board = Board(sizes)
+        context = multiprocessing.get_context("fork")
+        self._workers: list[tuple[Connection, ForkProcess]] = []
+        for k in range(count):
+            share = range(sizes.copies * k // count, sizes.copies * (k + 1) // count)
+            here, there = context.Pipe()
+            ends = [here, *(pipe for pipe, _ in self._workers)]
+            worker = context.Process(target=_work, args=(there, ends, make_stepper, self.board, share), daemon=True)
+            with warnings.catch_warnings():  # threads of this process hold nothing that a worker uses
+                warnings.simplefilter("ignore", DeprecationWarning)
+                worker.start()
+            there.close()
+            self._workers.append((here, worker))
+        self._finalizer = weakref.finalize(self, _stop, self._workers)
+        self._wait()
+
+    def reset(self) -> None:
+        """Start an episode in the active copies."""
+        self._command(_RESET)
+
+    def step(self) -> None:
+        """Advance the active copies by one step."""
+        self._command(_STEP)
+
+    def _command(self, word: bytes) -> None:
+        for pipe, _ in self._workers:
+            with contextlib.suppress(BrokenPipeError):  # the answer will be missing
+                pipe.send_bytes(word)
+        self._wait()
+
+    def _wait(self) -> None:
+        """Read one answer of every worker.
+
+        Raises:
+            ValueError: an environment raised, or a worker died.
+        """
+        failures = [failure for pipe, worker in self._workers if (failure := _answer(pipe, worker))]
+        if failures:
+            raise ValueError(failures[0])
+
+
+def can_fork() -> bool:
+    """Return whether this machine can fork processes."""
+    return "fork" in multiprocessing.get_all_start_methods()
+
+
+def _answer(pipe: Connection, worker: ForkProcess) -> str:
+    try:
+        return pipe.recv_bytes().decode()
+    except (EOFError, ConnectionError):
+        worker.join()
+        return (
+            f"a worker process that steps environments died (exit code {worker.exitcode}); the run's checkpoints are "
+            "intact, go on with esp train --resume"
+        )
+
+
+def _work(
+    pipe: Connection,
+    ends_of_the_parent: Sequence[Connection],
+    make_stepper: Callable[[Board, range], Stepper],
+    board: Board,
+    share: range,
+) -> None:
+    """Obey commands until the pipe closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops in its own time, and then closes the pipe
+    for end in ends_of_the_parent:
+        end.close()
+    os.dup2(2, 1)  # an environment may print, and the command's output stays clean
+    torch.set_num_threads(1)
+    stepper: Stepper | None = None
+
+    def begin() -> None:
+        nonlocal stepper
+        stepper = make_stepper(board, share)
+
+    failure = _failure_of(begin)
+    pipe.send_bytes(failure.encode())
+    if stepper is None:
+        return
+    commands = {_RESET: stepper.reset, _STEP: stepper.step}
+    with contextlib.suppress(EOFError, ConnectionError):
+        while (word := pipe.recv_bytes()) != _LEAVE:
+            pipe.send_bytes(_failure_of(commands[word]).encode())
+
+
+def _failure_of(command: Callable[[], None]) -> str:
+    try:
+        command()
+    except Exception as failure:
+        return str(failure) if isinstance(failure, ValueError) else f"{type(failure).__name__}: {failure}"
+    return ""
+
+
+def _stop(workers: Sequence[tuple[Connection, ForkProcess]]) -> None:
+    """Let the workers leave; end those that do not."""
+    for pipe, _ in workers:
+        with contextlib.suppress(OSError):
+            pipe.send_bytes(_LEAVE)
+        pipe.close()
+    for _, worker in workers:
+        worker.join(timeout=5)
+        if worker.exitcode is None:
+            worker.kill()
+            worker.join()

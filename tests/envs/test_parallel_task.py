@@ -1,0 +1,300 @@
+"""PettingZoo and Gymnasium environments as tasks: a small one of our own, and the real packages."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from esp_envs import Continuous, Environment, Field, Kind, generators_for, layout, make, register
+from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
+from esp_envs.conformance import Subject, check
+from esp_envs.conformance.subject import same_step
+from esp_envs.spec import Discrete
+from tests.own_tasks import lines_of, page_files, save_page_files
+
+LIKE_GYMNASIUM = pytest.importorskip("gymnasium", reason="spaces come from the extra 'pettingzoo'")
+spaces = LIKE_GYMNASIUM.spaces
+
+
+class Walk:
+    """Two walkers and a ghost on a line; what chance does follows from the seed, or from the process if `dicey`."""
+
+    def __init__(self, length: int = 6, box: bool = False, dicey: bool = False) -> None:
+        self.possible_agents = ["walker_0", "walker_1", "ghost"]
+        self.length, self.box, self.dicey = length, box, dicey
+
+    def action_space(self, agent):
+        return spaces.Box(np.float32([0.0]), np.float32([10.0])) if self.box else spaces.Discrete(3)
+
+    def reset(self, seed=None, options=None):
+        self.rng = np.random.default_rng(None if self.dicey else seed)
+        self.places, self.time = self.rng.normal(size=3), 0
+        return self._seen(), {}
+
+    def step(self, actions):
+        self.time += 1
+        moves = [float(np.ravel(actions[name])[0]) for name in self.possible_agents]
+        self.places = self.places + np.array(moves) + 0.1 * self.rng.normal(size=3)
+        over = dict.fromkeys(self.possible_agents, self.time == self.length)
+        never = dict.fromkeys(self.possible_agents, False)
+        reward = dict(zip(self.possible_agents, self.places, strict=True))
+        infos = {name: {"height": float(p)} for name, p in reward.items()}
+        return self._seen(), reward, never, over, infos
+
+    def state(self):
+        return self.places
+
+    def _seen(self):
+        return {name: np.array([p, self.time]) for name, p in zip(self.possible_agents, self.places, strict=True)}
+
+
+class WalkSettings(ParallelSettings):
+    horizon: int = 6
+
+
+class Walking(ParallelTask):
+    Settings = WalkSettings
+    observation = layout(Field("place", Kind.SCALAR), Field("time", Kind.SCALAR))
+    action = Discrete(Kind.SCALAR, ((0.0,), (1.0,), (2.0,)), ("stay", "walk", "run"))
+    symmetry, convention = "o2", "place"
+    learners, metrics = "walker", ("height",)
+
+    def make_one(self):
+        return Walk(self.settings.horizon)
+
+    def opponent(self, agent, observation, generator):
+        return int(generator.integers(3))
+
+
+def worlds(cls: type[Environment], num_envs=5, seeds=(3, 7), **settings) -> Environment:
+    return cls(cls.Settings(**settings), num_envs, generators_for(seeds))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_parallel_task_keeps_every_promise(workers: int) -> None:
+    subject = Subject(lambda num_envs, seeds: worlds(Walking, num_envs, seeds, workers=workers))
+    findings = list(check(subject))
+    assert [finding for finding in findings if finding.broken] == []
+    assert {f.not_asked for f in findings if f.not_asked} == {
+        "all worlds end together",
+        "the task cannot be put into a state",
+        "the task has no picture",
+    }
+
+
+def test_an_episode_that_ends_for_itself_keeps_every_promise() -> None:
+    class Short(Walk):
+        def step(self, actions):
+            seen, reward, never, over, infos = super().step(actions)
+            if max(self.places[:2]) > 4:
+                return seen, reward, dict.fromkeys(over, True), never, infos
+            return seen, reward, never, over, infos
+
+    class Ending(Walking):
+        terminates = True
+
+        def make_one(self):
+            return Short(self.settings.horizon)
+
+    findings = list(check(Subject(lambda num_envs, seeds: worlds(Ending, num_envs, seeds))))
+    assert [finding for finding in findings if finding.broken] == []
+    env = worlds(Ending, 40)
+    env.reset()
+    assert any(bool(env.step(env.random_action()).terminated.any()) for _ in range(6))
+
+
+def test_workers_change_no_number() -> None:
+    here, there = worlds(Walking, workers=0), worlds(Walking, workers=3)
+    assert torch.equal(here.reset().obs, there.reset().obs)
+    for _ in range(15):
+        action = here.random_action()
+        assert same_step(here.step(action), there.step(action))
+
+
+def test_numbers_in_the_unit_interval_are_stretched_to_a_box() -> None:
+    class Boxed(Walking):
+        action = Continuous(layout(Field("speed", Kind.SCALAR)))
+
+        def make_one(self):
+            return Walk(self.settings.horizon, box=True)
+
+        def opponent(self, agent, observation, generator):
+            return 0.0
+
+    env = worlds(Boxed)
+    first = env.reset().obs[..., 0]
+    moved = env.step(torch.tensor([0.0, 1.0]).view(1, 1, 2, 1).expand(2, 5, 2, 1)).next.obs[..., 0] - first
+    assert moved.mean((0, 1)).tolist() == pytest.approx([5.0, 10.0], abs=0.2)
+
+
+def test_metrics_state_and_reading_come_from_the_environment() -> None:
+    class Reading(Walking):
+        observation = layout(Field("place", Kind.SCALAR), Field("clock", Kind.VECTOR))
+        state = layout(Field("places", Kind.SCALAR, 3))
+
+        def reading(self, agent, observation):
+            return np.array([observation[0], np.cos(observation[1]), np.sin(observation[1])])
+
+    env = worlds(Reading)
+    start = env.reset()
+    assert start.state.shape == (2, 5, 3)
+    assert start.obs[..., 1:].flatten().unique().tolist() == [0.0, 1.0]
+    step = env.step(env.random_action())
+    assert torch.equal(step.next.state[..., :2], step.next.obs[..., 0])
+    torch.testing.assert_close(step.metrics["height"], step.next.state.mean(-1))
+
+
+def test_opponents_draw_from_their_own_copys_episode() -> None:
+    env, again = worlds(Walking), worlds(Walking)
+    env.reset(), again.reset()
+    still = torch.zeros(2, 5, 2, dtype=torch.int64)
+    one, two = env.step(still), again.step(still)
+    assert same_step(one, two)
+
+
+SENTENCES = {
+    "walker_0 sees 2 numbers, but the layout has 1": {"observation": layout(Field("place", Kind.SCALAR))},
+    "walker_0 acts in Discrete(3), but the task says 2 discrete actions": {
+        "action": Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("a", "b"))
+    },
+    "walker_0 acts in Discrete(3), but the task says 1 bounded numbers": {
+        "action": Continuous(layout(Field("speed", Kind.SCALAR)))
+    },
+    "the environment's state has 3 numbers, but the layout has 1": {"state": layout(Field("x", Kind.SCALAR))},
+    "no agent's name begins with 'runner'; the agents are walker_0, walker_1, ghost": {"learners": "runner"},
+}
+
+
+@pytest.mark.parametrize("sentence", SENTENCES)
+def test_what_does_not_fit_is_refused_when_the_task_is_made(sentence: str) -> None:
+    with pytest.raises(ValueError, match=r"numbers|discrete|begins") as caught:
+        worlds(type("Misfit", (Walking,), SENTENCES[sentence]))
+    assert str(caught.value) == sentence
+
+
+def test_an_agent_that_does_not_learn_needs_an_opponent() -> None:
+    class Silent(Walking):
+        opponent = ParallelTask.opponent
+
+    env = worlds(Silent)
+    env.reset()
+    with pytest.raises(ValueError, match="Silent does not say how ghost acts; define 'opponent'"):
+        env.step(env.random_action())
+
+
+class Failing(Walking):
+    """Its environment fails in the way that `how` says, in the third step."""
+
+    how = "raise"
+
+    def make_one(self):
+        how = type(self).how
+
+        class Bad(Walk):
+            def step(self, actions):
+                seen, reward, never, over, infos = super().step(actions)
+                if self.time < 3:
+                    return seen, reward, never, over, infos
+                if how == "raise":
+                    raise KeyError("lost")
+                if how == "die":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                if how == "apart":
+                    never["walker_1"] = True
+                if how == "early":
+                    never = dict.fromkeys(never, True)
+                if how == "cut":
+                    over = dict.fromkeys(over, True)
+                return seen, reward, never, over, infos
+
+        return Bad(self.settings.horizon)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize(
+    ("how", "sentence"),
+    [
+        ("raise", "of Raise raises in 'step': KeyError: 'lost'"),
+        ("apart", "walker_1 of Apart ends before the others; its agents must end together"),
+        ("early", "an episode of Early ends before its horizon; set 'terminates = True' in the class"),
+        ("cut", "an episode of Cut ends before its horizon; give both the same number of steps"),
+        ("die", "a worker process that steps environments died (exit code -9)"),
+    ],
+)
+def test_what_goes_wrong_in_mid_run_is_one_sentence(how: str, sentence: str, workers: int) -> None:
+    if how == "die" and not workers:
+        pytest.skip("without workers this process itself would die")
+    env = worlds(type(how.title(), (Failing,), {"how": how}), workers=workers)
+    env.reset()
+    env.step(env.random_action())
+    env.step(env.random_action())
+    with pytest.raises(ValueError, match=r"ends|died|raises") as caught:
+        env.step(env.random_action())
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_copy_that_does_not_repeat_itself_is_named_when_the_run_is_resumed() -> None:
+    class Dicey(Walking):
+        def make_one(self):
+            return Walk(self.settings.horizon, dicey=True)
+
+    env = worlds(Dicey)
+    env.reset()
+    env.step(env.random_action())
+    saved = env.state_dict()
+    with pytest.raises(ValueError, match="a copy of dicey does not repeat its episode from the same seed"):
+        worlds(Dicey).load_state_dict(saved)
+
+
+def test_workers_leave_with_the_environment() -> None:
+    env = worlds(Walking, workers=2)
+    env.reset()
+    processes = [worker for _, worker in env._copies._workers]
+    assert all(worker.is_alive() for worker in processes)
+    del env
+    assert not any(worker.is_alive() for worker in processes)
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_page_files(tmp_path)
+
+
+def test_the_users_file_is_short() -> None:
+    assert lines_of(page_files()["spread.py"]) <= 15
+
+
+def test_the_spread_of_the_page_agrees_with_mpe2_step_by_step(page: None) -> None:
+    simple_spread_v3 = pytest.importorskip("mpe2.simple_spread_v3", reason="the package mpe2 is missing")
+    env = make(register("spread:Spread"), 1, [0], {"workers": 0})
+    start = env.reset()
+    theirs = simple_spread_v3.parallel_env(N=3, local_ratio=0.5, max_cycles=25)
+    first_episode = np.random.SeedSequence([int(env.state_dict()["base"]), 0])
+    seen, _ = theirs.reset(seed=int(first_episode.generate_state(1)[0] >> 1))
+    for _ in range(25):
+        np.testing.assert_array_equal(start.obs[0, 0].numpy(), np.float32([seen[a] for a in theirs.possible_agents]))
+        action = env.random_action()
+        chosen = dict(zip(theirs.possible_agents, action[0, 0].tolist(), strict=True))
+        step = env.step(action)
+        seen, reward, _, truncated, _ = theirs.step(chosen)
+        np.testing.assert_allclose(step.reward[0, 0].numpy(), list(reward.values()), rtol=1e-6)
+        start = step.next
+    assert all(truncated.values())
+    assert bool(step.truncated.all())
+    np.testing.assert_array_equal(step.final.obs[0, 0].numpy(), np.float32(list(seen.values())))
+
+
+@pytest.mark.parametrize(("task", "package"), [("spread:Spread", "mpe2"), ("pendulum:Pendulum", "gymnasium")])
+def test_the_tasks_of_the_page_keep_every_promise(page: None, task: str, package: str) -> None:
+    pytest.importorskip(package, reason=f"the package {package} is missing")
+    name = register(task)
+    horizon = {} if package == "gymnasium" else {"horizon": 8}
+    findings = list(check(Subject(lambda n, seeds: make(name, n, seeds, {"workers": 0, **horizon}))))
+    assert [finding for finding in findings if finding.broken] == []
