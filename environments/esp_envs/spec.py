@@ -31,9 +31,13 @@ class Kind:
     PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
                   top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
 
+    RING          one number for each of n rays around a body, counter-clockwise from the x-axis (a lidar). A turn by
+                  360 / n shifts them, a mirror in the x-axis reverses them; other turns are refused.
+    RECORD        several numbers of several kinds, as the field's `parts` say (another agent's position and its speed).
+
     Attributes:
         name: one word.
-        width: numbers per item; of a picture, per pixel.
+        width: numbers per item; of a picture, per pixel, of a ring, per ray.
         is_vector: whether the length of an action's item is bounded by 1, and not each of its numbers.
     """
 
@@ -42,6 +46,8 @@ class Kind:
     VECTOR: ClassVar[Kind]
     WHEELS: ClassVar[Kind]
     PICTURE: ClassVar[Kind]
+    RING: ClassVar[Kind]
+    RECORD: ClassVar[Kind]
 
     name: str
     width: int
@@ -50,6 +56,7 @@ class Kind:
 
 Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.PICTURE = Kind("scalar", 1), Kind("pseudoscalar", 1), Kind("picture", 1)
 Kind.VECTOR, Kind.WHEELS = Kind("vector", 2, is_vector=True), Kind("wheels", 2)
+Kind.RING, Kind.RECORD = Kind("ring", 1), Kind("record", 0)
 
 
 class Items(Enum):
@@ -69,7 +76,8 @@ class Items(Enum):
 class Field:
     """A run of numbers of one kind: `count` items of `item_width` numbers each, item after item.
 
-    Only a picture has `pixels`, its rows and columns; its items are its channels.
+    Only a picture has `pixels`, its rows and columns; its items are its channels. Only a ring has `rays`, and only a
+    record has `parts`, the fields of one item in their order.
     """
 
     name: str
@@ -78,15 +86,25 @@ class Field:
     unit: str = ""
     items: Items = Items.FIXED
     pixels: tuple[int, int] | None = None
+    rays: int = 0
+    parts: tuple[Field, ...] = ()
 
     def __post_init__(self) -> None:
         if (self.kind == Kind.PICTURE) != (self.pixels is not None):
             raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
+        if (self.kind == Kind.RING) != (self.rays > 0):
+            raise ValueError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
+        if (self.kind == Kind.RECORD) != bool(self.parts):
+            raise ValueError(f"field '{self.name}': a record, and nothing else, says what parts it has")
+        if any(part.items is not Items.FIXED or part.pixels is not None for part in self.parts):
+            raise ValueError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
 
     @property
     def item_width(self) -> int:
         """Numbers per item."""
-        return self.kind.width if self.pixels is None else self.kind.width * math.prod(self.pixels)
+        if self.parts:
+            return sum(part.width for part in self.parts)
+        return self.kind.width * (self.rays or math.prod(self.pixels or (1,)))
 
     @property
     def width(self) -> int:
@@ -97,6 +115,10 @@ class Field:
     def described(self) -> str:
         """What it holds, in words: "vector x 2", "picture of 21 x 21 x 1"."""
         size = "" if self.pixels is None else f" of {self.pixels[0]} x {self.pixels[1]}"
+        if self.rays:
+            size = f" of {self.rays} rays"
+        if self.parts:
+            size = f" of {', '.join(f'{part.name} ({part.described})' for part in self.parts)}"
         return f"{self.kind.name}{size} x {self.count}"
 
 
@@ -149,7 +171,8 @@ class Discrete:
 
     Attributes:
         kind: what the points below are.
-        points: the physical meaning of action j as one item of `kind`: a direction, a wheel pair, ...
+        points: the physical meaning of action j as one item of `kind`: a direction, a wheel pair, ... Several actions
+            may have one meaning (stay and load, walk right and push right); a transform keeps their order.
         names: one word per action.
     """
 
@@ -158,8 +181,8 @@ class Discrete:
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        if len(self.points) != len(self.names) or len(set(self.points)) != len(self.points):
-            raise ValueError("each action needs one name and a meaning of its own")
+        if len(self.points) != len(self.names) or len(set(self.names)) != len(self.names):
+            raise ValueError("each action needs one meaning and a name of its own")
         if any(len(p) != self.kind.width for p in self.points):
             raise ValueError(f"a meaning of kind {self.kind.name} has {self.kind.width} numbers")
 
@@ -199,7 +222,8 @@ class Spaces:
         observation: layout of one agent's row, D numbers.
         state: layout of the global state that a centralised critic or mixer may see.
         action: the action space, the same for every agent.
-        symmetry: name of the largest planar group under which the *dynamics and reward* are invariant ("d4", "o2").
+        symmetry: under what the *dynamics and reward* are invariant: the largest planar group or one element ("d4",
+            "o2", "flip-y"), with "*agents" where the agents may also be exchanged ("d4*agents").
     """
 
     num_agents: int

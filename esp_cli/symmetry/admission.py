@@ -8,8 +8,8 @@ import numpy as np
 
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
-from esp_cli.symmetry.parse import parse_elements, parse_group
-from esp_cli.symmetry.representation import action_map, joint_sources, state_matrix
+from esp_cli.symmetry.parse import parse_elements
+from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
 from esp_envs.spec import Discrete, Items, Spaces, joint_layout
 
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
@@ -46,20 +46,32 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
 
     `agents` stands at the end if the agents of the task may change places.
     """
-    carried = [name for name in PLANE_GROUPS if _carries(name, spaces)]
+    own = _declared_plane(spaces)
+    names = PLANE_GROUPS if own in ("", "c1", *PLANE_GROUPS) else (*PLANE_GROUPS, own)
+    carried = [name for name in names if _carries(name, spaces)]
     if spaces.num_agents > 1 and _carries("agents", spaces):
         carried.append("agents")
     return tuple(carried)
 
 
 def _carries(name: str, spaces: Spaces) -> bool:
-    moved = parse_group(name, spaces.num_agents).witnesses()
-    return _reason(moved, spaces) is None
+    found = parse_elements(name, spaces.num_agents)
+    return _reason(found.witnesses() if isinstance(found, Group) else found, spaces) is None
+
+
+def _declared_plane(spaces: Spaces) -> str:
+    """Return the planar part of the declared symmetry; empty where there is none."""
+    return "*".join(name for name in spaces.symmetry.split("*") if name != "agents")
 
 
 def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why a task cannot carry elements, if it cannot."""
-    return _action_reason(elements, spaces) or _task_reason(elements, spaces) or _agents_reason(elements, spaces)
+    return (
+        _action_reason(elements, spaces)
+        or _task_reason(elements, spaces)
+        or _layout_reason(elements, spaces)
+        or _agents_reason(elements, spaces)
+    )
 
 
 def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
@@ -74,11 +86,23 @@ def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which element is no symmetry of the dynamics and reward, if one is none."""
-    plane = [name for name in spaces.symmetry.split("*") if name != "agents"]
-    declared = parse_group(plane[0] if plane else "c1", spaces.num_agents)
+    name = _declared_plane(spaces) or "c1"
+    declared = () if name == "c1" else parse_elements(name, spaces.num_agents)
     for element in elements:
-        if element.in_place not in declared:
-            return f"{element.in_place.name} is no symmetry of its dynamics and reward, which carry {declared.name}"
+        if not element.in_place.is_identity and element.in_place not in declared:
+            return f"{element.in_place.name} is no symmetry of its dynamics and reward, which carry {name}"
+    return None
+
+
+def _layout_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
+    """Say which field cannot be transformed, if one cannot."""
+    # A picture says so when its map is built, without a matrix of its pixels' square.
+    fields = [field for field in (*spaces.observation.fields, *spaces.state.fields) if not field.pixels]
+    try:
+        for field in fields:
+            block_matrix(field, elements)
+    except ValueError as error:
+        return str(error)
     return None
 
 
@@ -89,6 +113,8 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         return None
     if any(len(element.permutation or ()) != spaces.num_agents for element in moving):
         return f"the permutation is not one of its {spaces.num_agents} agents"
+    if "agents" not in spaces.symmetry.split("*"):
+        return f"its declared symmetry, {spaces.symmetry}, does not say that agents may be exchanged"
     joint = spaces.state == joint_layout(spaces.observation, spaces.num_agents)
     if not joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"

@@ -103,6 +103,30 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
     return (whole[:, 0] * columns + whole[:, 1]).astype(np.int64)
 
 
+def ring_sources(rays: int, planar: Floats) -> Indices:
+    """Return where each ray of a transformed ring comes from.
+
+    Ray k points at k / rays of a turn, counter-clockwise from the x-axis.
+
+    Args:
+        rays: n.
+        planar: orthogonal matrix [2, 2].
+
+    Returns:
+        [n], the index of the old ray that shows in each new one.
+
+    Raises:
+        ValueError: some ray would come to lie between others.
+    """
+    angle = 2 * np.pi * np.arange(rays) / rays
+    origin = np.stack([np.cos(angle), np.sin(angle)], -1) @ planar  # the inverse is the transpose
+    old = np.arctan2(origin[:, 1], origin[:, 0]) * rays / (2 * np.pi)
+    whole = np.rint(old)
+    if np.abs(whole - old).max() >= _PIXEL_TOLERANCE:
+        raise ValueError(f"the rays of a ring of {rays} do not come to lie on rays; it turns by 360 / {rays} degrees")
+    return whole.astype(np.int64) % rays
+
+
 @dataclass(frozen=True)
 class PlaneElement(Element):
     """One transform: mirror in the x-axis if `mirrored`, then turn, and let agent i take the place of agent sigma(i).
@@ -194,10 +218,12 @@ class PlaneElement(Element):
         """Return how one item of a field transforms: [item width, item width].
 
         Raises:
-            ValueError: the pixels of a picture do not come to lie on pixels, or the kind is unknown in the plane.
+            ValueError: pixels or rays do not come to lie on others, or the kind is unknown in the plane.
         """
         if field.pixels is not None:
             return np.eye(field.item_width)[picture_sources(field.pixels, self.matrix)]
+        if field.rays:
+            return np.eye(field.rays)[ring_sources(field.rays, self.matrix)]
         if field.kind not in KIND_MATRICES:
             raise ValueError(
                 f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns"

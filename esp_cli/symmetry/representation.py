@@ -17,6 +17,8 @@ _MATCH_TOLERANCE = 1e-6
 
 def block_matrix(field: Field, elements: Sequence[Element]) -> Floats:
     """Return how each run of d numbers of a field transforms, d dividing its width: [G, d, d]."""
+    if field.parts:
+        return layout_matrix(Layout(field.parts), elements)
     return np.stack([element.block(field) for element in elements])
 
 
@@ -74,8 +76,7 @@ def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: in
     """
     sources, signs, start = [], [], 0
     for field in layout.fields:
-        parts = [element.gather(field) for element in elements]
-        source, sign = (np.stack(part) for part in zip(*parts, strict=True))
+        source, sign = _signed_permutations(field, elements)
         runs = field.width // source.shape[1]
         first = start + source.shape[1] * np.arange(runs)[:, None]
         sources.append((source[:, None, :] + first).reshape(len(elements), -1))
@@ -89,6 +90,14 @@ def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: in
     order = joint_sources(layout, places)
     joint_sign = np.tile(sign, (1, num_agents))
     return np.take_along_axis(joint, order, 1), np.take_along_axis(joint_sign, order, 1)
+
+
+def _signed_permutations(field: Field, elements: Sequence[Element]) -> tuple[Indices, Floats]:
+    """Return source and sign of each run of d numbers of a field, [G, d] each."""
+    if field.parts:
+        return rows_permutation(Layout(field.parts), [element.in_place for element in elements], 1)
+    sources, signs = zip(*(element.gather(field) for element in elements), strict=True)
+    return np.stack(sources), np.stack(signs)
 
 
 def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
@@ -124,7 +133,8 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
 def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
     """Return K_g of a discrete action space: entry [g, j] is the action that j becomes.
 
-    It is derived by turning each action's physical meaning and looking for the action that means the result.
+    It is derived by turning each action's physical meaning and looking for the action that means the result. Of
+    several actions with one meaning the first goes to the first, the second to the second.
 
     Returns:
         [G, A].
@@ -134,7 +144,10 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
     """
     points = np.array(action.points, dtype=np.float64)
     images = np.einsum("gvw,jw->gjv", block_matrix(Field("action", action.kind), elements), points)
+    same = np.abs(points[:, None, :] - points).max(axis=-1) <= _MATCH_TOLERANCE
+    place = np.tril(same, -1).sum(axis=1)  # among the actions of its meaning
     distance = np.abs(images[:, :, None, :] - points).max(axis=-1)
+    distance += np.where(place[:, None] == place, 0.0, np.inf)
     nearest: Indices = distance.argmin(axis=-1)
     missed = np.argwhere(distance.min(axis=-1) > _MATCH_TOLERANCE)
     if len(missed):

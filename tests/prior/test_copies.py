@@ -16,7 +16,7 @@ SPACES = Spaces(
     observation=layout(Field("velocity", Kind.VECTOR), Field("other", Kind.VECTOR, items=Items.OTHERS)),
     state=layout(Field("positions", Kind.VECTOR, 2, items=Items.AGENTS)),
     action=MOVES,
-    symmetry="d4",
+    symmetry="d4*agents",
 )
 """A task that nobody wrote: the prior asks for no more."""
 

@@ -17,7 +17,9 @@ MakeSpec = Callable[..., TaskSpec]
 def make_spec() -> MakeSpec:
     """Return a factory of task specs with all field kinds in observation and state."""
 
-    def make(num_agents: int = 3, action=FOUR_DIRECTIONS, symmetry: str = "o2", joint_state: bool = False) -> TaskSpec:
+    def make(
+        num_agents: int = 3, action=FOUR_DIRECTIONS, symmetry: str = "o2*agents", joint_state: bool = False
+    ) -> TaskSpec:
         observation = layout(
             Field("velocity", Kind.VECTOR),
             Field("battery", Kind.SCALAR),

@@ -21,9 +21,9 @@ def test_four_directions_carry_d4_whatever_the_dynamics_carry(make_spec) -> None
 def test_forces_and_wheels_carry_what_the_dynamics_carry(make_spec) -> None:
     assert carried_groups(make_spec(action=FORCE)) == (*ALL, "agents")
     assert carried_groups(make_spec(action=WHEEL_PAIRS)) == (*ALL, "agents")
-    assert carried_groups(make_spec(action=FORCE, symmetry="so2")) == ("c2", "c4", "c8", "so2", "agents")
+    assert carried_groups(make_spec(action=FORCE, symmetry="so2*agents")) == ("c2", "c4", "c8", "so2", "agents")
     assert carried_groups(make_spec(action=FORCE, symmetry="d4*agents")) == (*UP_TO_D4, "agents")
-    assert carried_groups(make_spec(action=FORCE, symmetry="c1")) == ("agents",)
+    assert carried_groups(make_spec(action=FORCE, symmetry="agents")) == ("agents",)
 
 
 def test_agents_need_company_and_a_state_that_names_them(make_spec) -> None:
@@ -51,7 +51,11 @@ def test_actions_that_cannot_follow_are_refused_in_one_sentence(make_spec) -> No
         ("c8", {"action": FORCE, "symmetry": "d4"}, "rot45 is no symmetry of its dynamics and reward, which carry d4"),
         ("flip-x", {"action": FORCE, "symmetry": "so2"}, "flip-x is no symmetry .*; use a group within so2"),
         ("o2", {"action": FORCE, "symmetry": "d4"}, "rot57.296 is no symmetry"),
-        ("rot90", {"symmetry": "c1"}, "rot90 is no symmetry .* carry c1; use agents"),
+        ("rot90", {"symmetry": "c1*agents"}, "rot90 is no symmetry .* carry c1; use agents"),
+        ("flip-x", {"symmetry": "flip-y"}, "flip-x is no symmetry .*, which carry flip-y; use a group within flip-y"),
+        ("agents", {"symmetry": "d4"}, "declared symmetry, d4, does not say that agents may be exchanged; use a group"),
+        ("d4*agents", {"symmetry": "d4"}, "does not say that agents may be exchanged; use a group within d4"),
+        ("rot90,agents-1-0-2", {"symmetry": "o2"}, "does not say that agents may be exchanged"),
     ],
 )
 def test_refusals(make_spec, text, changes, message) -> None:
@@ -68,6 +72,26 @@ def test_agents_are_refused_where_layouts_do_not_name_them(make_spec) -> None:
         transform_set("d4*agents", nameless)
     with pytest.raises(ValueError, match="use --prior none"):
         transform_set("rot90", replace(nameless, symmetry="c1"))
+
+
+def test_a_single_element_can_be_declared(make_spec) -> None:
+    spec = make_spec(symmetry="flip-y*agents")
+    assert carried_groups(spec) == ("flip-y", "agents")
+    assert transform_set("flip-y*agents-1-0-2", spec).names == ("flip-y*agents-1-0-2",)
+
+
+def test_agents_that_may_not_be_exchanged_are_not_among_the_carried(make_spec) -> None:
+    assert carried_groups(make_spec(symmetry="d4")) == UP_TO_D4
+    assert carried_groups(make_spec(symmetry="d4*agents")) == (*UP_TO_D4, "agents")
+
+
+def test_a_ring_carries_the_turns_between_its_rays(make_spec) -> None:
+    ring = layout(Field("lidar", Kind.RING, rays=6))
+    spec = replace(make_spec(action=FORCE), observation=ring, state=ring)
+    assert carried_groups(spec) == ("c2", "d2")
+    assert transform_set("rot60,flip30", spec).size == 2
+    with pytest.raises(ValueError, match=r"the rays of a ring of 6 do not come to lie on rays; it turns by 360 / 6"):
+        transform_set("rot90", spec)
 
 
 def test_each_carried_group_makes_a_set(make_spec) -> None:

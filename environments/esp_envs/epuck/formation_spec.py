@@ -125,7 +125,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         observation=_observation_layout(settings),
         state=Layout(tuple(state)),
         action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
-        symmetry="d4",
+        symmetry="d4*agents",
         shared_reward=False,
         control_period_s=settings.control_period_s,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),

@@ -199,7 +199,7 @@ def _spec(settings: NavigationSettings) -> TaskSpec:
             Field("landmarks", Kind.VECTOR, landmarks, "length"),
         ),
         action=MOVES if discrete else FORCE,
-        symmetry="d4" if discrete else "o2",
+        symmetry="d4*agents" if discrete else "o2*agents",
         shared_reward=esp,
         settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
     )

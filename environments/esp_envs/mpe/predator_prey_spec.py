@@ -51,7 +51,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
         observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
         state=_state_layout(settings),
         action=MOVES if discrete else FORCE,
-        symmetry="d4" if discrete or prey_learns else "o2",
+        symmetry="d4*agents" if discrete or prey_learns else "o2*agents",
         shared_reward=True,
         settings=settings.model_dump(),
     )

@@ -62,7 +62,7 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
             Field("poacher", Kind.VECTOR, 1, "cell"),
         ),
         action=MOVES,
-        symmetry="d4" if width == height else "d2",
+        symmetry="d4*agents" if width == height else "d2*agents",
         control_period_s=0.25,
         totals=("captures", "lone_landings", "collisions", "steps"),
         terminates=True,

@@ -1,0 +1,118 @@
+"""Rings of rays, records of several numbers, and actions that share a meaning."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation
+from esp_cli.symmetry.representation import action_map, rows_matrix, rows_permutation
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, layout
+from tests.symmetry.toy_actions import FORCE
+
+RING = layout(Field("lidar", Kind.RING, rays=12))
+SEEN = (Field("way", Kind.VECTOR), Field("on_goal", Kind.SCALAR), Field("spin", Kind.PSEUDOSCALAR))
+
+
+def lidar(points: list[tuple[float, float]]) -> torch.Tensor:
+    """What 12 rays see of small bodies: how well a ray points at one, by plain geometry."""
+    angles = [2 * math.pi * k / 12 for k in range(12)]
+    return torch.tensor([max(x * math.cos(a) + y * math.sin(a) for x, y in points) for a in angles])
+
+
+@pytest.mark.parametrize("element", [rotation(30), rotation(90), rotation(210), mirror(0), mirror(15), mirror(90)])
+def test_a_ring_shows_what_the_rays_would_see_of_the_turned_scene(make_spec, element) -> None:
+    spec = replace(make_spec(action=FORCE), observation=RING, state=RING)
+    points = [(1.0, 0.2), (-0.3, 0.7)]
+    turned = [tuple(element.matrix @ np.array(point)) for point in points]
+    seen = build_transform([element], spec).obs(lidar(points).view(1, 1, 12))
+    torch.testing.assert_close(seen.flatten(), lidar(turned), atol=1e-6, rtol=0)
+    assert not torch.allclose(lidar(points), lidar(turned), atol=0.05), "the scene itself must look different"
+
+
+def test_a_ray_between_rays_is_refused() -> None:
+    with pytest.raises(ValueError, match="turns by 360 / 12 degrees"):
+        rows_matrix(RING, [rotation(45)], 1)
+
+
+def test_a_record_transforms_part_by_part() -> None:
+    record = layout(Field("food", Kind.RECORD, 2, parts=SEEN))
+    assert record.width == 8
+    apart = layout(*(replace(part, name=f"{part.name}{i}") for i in range(2) for part in SEEN))
+    for element in (rotation(90), rotation(33), mirror(10)):
+        np.testing.assert_array_equal(rows_matrix(record, [element], 1), rows_matrix(apart, [element], 1))
+
+
+def test_a_records_items_follow_the_agents() -> None:
+    record = layout(Field("others", Kind.RECORD, 2, parts=SEEN, items=Items.OTHERS))
+    split = layout(*(replace(part, count=2, items=Items.OTHERS) for part in SEEN))
+    # from item after item to field after field
+    order = [0, 1, 4, 5, 2, 6, 3, 7]
+    rows = torch.randn(3, 8, dtype=torch.float64)
+    for element in parse_elements("agents-2-0-1,rot90*agents-1-0-2,flip22.5*agents-0-2-1", 3):
+        ours = torch.as_tensor(rows_matrix(record, [element], 3)[0]) @ rows.flatten()
+        theirs = torch.as_tensor(rows_matrix(split, [element], 3)[0]) @ rows[:, order].flatten()
+        torch.testing.assert_close(ours.view(3, 8)[:, order], theirs.view(3, 8))
+
+
+def test_records_and_rings_stand_beside_pictures() -> None:
+    mixed = layout(
+        Field("picture", Kind.PICTURE, pixels=(3, 3)),
+        Field("lidar", Kind.RING, rays=8),
+        Field("others", Kind.RECORD, 2, parts=SEEN, items=Items.OTHERS),
+    )
+    elements = parse_elements("rot90*agents-2-0-1,flip-x", 3)
+    source, sign = rows_permutation(mixed, elements, 3)
+    rows = torch.randn(mixed.width * 3, dtype=torch.float64)
+    for g, matrix in enumerate(rows_matrix(mixed, elements, 3)):
+        torch.testing.assert_close(torch.as_tensor(matrix) @ rows, rows[source[g]] * torch.as_tensor(sign[g]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"kind": Kind.RING}, "a ring, and nothing else, says how many rays"),
+        ({"kind": Kind.VECTOR, "rays": 4}, "a ring, and nothing else"),
+        ({"kind": Kind.RECORD}, "a record, and nothing else, says what parts"),
+        ({"kind": Kind.SCALAR, "parts": SEEN}, "a record, and nothing else"),
+        ({"kind": Kind.RECORD, "parts": (Field("x", Kind.SCALAR, items=Items.OTHERS),)}, "count over no agents"),
+    ],
+)
+def test_fields_that_contradict_themselves_are_refused(changes, sentence) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Field("odd", **changes)
+
+
+STAY = (0.0, 0.0)
+WALK_OR_PUSH = Discrete(
+    Kind.VECTOR,
+    (STAY, RIGHT, UP, LEFT, DOWN, STAY, UP, RIGHT, DOWN, LEFT),
+    ("stay", "walk-e", "walk-n", "walk-w", "walk-s", "load", "push-n", "push-e", "push-s", "push-w"),
+)
+
+
+def test_actions_of_one_meaning_keep_their_order() -> None:
+    (table,) = action_map(WALK_OR_PUSH, [rotation(90)])
+    become = {WALK_OR_PUSH.names[j]: WALK_OR_PUSH.names[k] for j, k in enumerate(table)}
+    assert become["stay"] == "stay"
+    assert become["load"] == "load"
+    assert become["walk-e"] == "walk-n"
+    assert become["push-e"] == "push-n"
+    assert become["push-n"] == "push-w"
+    for element in (rotation(90), rotation(180), mirror(0), mirror(45)):
+        assert sorted(action_map(WALK_OR_PUSH, [element])[0]) == list(range(10))
+
+
+def test_an_action_that_is_single_in_one_direction_is_refused() -> None:
+    lopsided = Discrete(Kind.VECTOR, (RIGHT, UP, LEFT, DOWN, RIGHT), ("e", "n", "w", "s", "push-e"))
+    with pytest.raises(ValueError, match="action 'push-e' turned by 90 degrees is no action"):
+        action_map(lopsided, [rotation(90)])
+
+
+def test_two_actions_of_one_name_are_refused() -> None:
+    with pytest.raises(ValueError, match="a name of its own"):
+        Discrete(Kind.VECTOR, (UP, DOWN), ("go", "go"))
