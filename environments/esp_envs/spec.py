@@ -16,6 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 from typing import ClassVar
 
 
@@ -133,7 +134,7 @@ class Layout:
         if len(set(names)) != len(names):
             raise ValueError(f"field names must differ, got {names}")
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Numbers in one row."""
         return sum(f.width for f in self.fields)

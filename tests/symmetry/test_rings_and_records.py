@@ -21,7 +21,8 @@ SEEN = (Field("way", Kind.VECTOR), Field("on_goal", Kind.SCALAR), Field("spin", 
 def lidar(points: list[tuple[float, float]]) -> torch.Tensor:
     """What 12 rays see of small bodies: how well a ray points at one, by plain geometry."""
     angles = [2 * math.pi * k / 12 for k in range(12)]
-    return torch.tensor([max(x * math.cos(a) + y * math.sin(a) for x, y in points) for a in angles])
+    rays = [max(x * math.cos(a) + y * math.sin(a) for x, y in points) for a in angles]
+    return torch.tensor(rays, dtype=torch.float32)
 
 
 @pytest.mark.parametrize("element", [rotation(30), rotation(90), rotation(210), mirror(0), mirror(15), mirror(90)])

@@ -1,0 +1,261 @@
+"""A VMAS scenario as a task: batched in torch, on CPU or GPU, with a layout that says what its numbers are.
+
+    class Passage(VmasTask):
+        scenario = "passage"
+        symmetry, convention = "flip-y", "vmas passage"
+        def seen(self): return layout(...)
+
+`esp_envs.adapters.vmas_scenarios` holds layouts for four scenarios. Needs the extra `vmas`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import torch
+from pydantic import Field as Setting
+from torch import Tensor
+
+from esp_envs.adapters import simulation
+from esp_envs.base import (
+    OTHER_SIZE,
+    Body,
+    Environment,
+    Observation,
+    Scene,
+    Step,
+    TaskSettings,
+    generator_states,
+    require_shape,
+    restore_generators,
+)
+from esp_envs.spec import Continuous, Field, Kind, Layout, TaskSpec, layout
+
+FORCE = Continuous(layout(Field("force", Kind.VECTOR, unit="share of the full force")))
+_KEPT_STARTS = 4
+"""Batches of starts that a seed keeps: worlds that end at different times often begin the same episode number."""
+
+
+class VmasSettings(TaskSettings):
+    """What a user may change of every VMAS task; a subclass adds the scenario's own arguments."""
+
+    num_agents: int = Setting(4, ge=1, le=64, description="N, agents of the team")
+    horizon: int = Setting(100, ge=1, description="steps of an episode (0.1 s each)")
+
+
+class VmasTask(Environment):
+    """Worlds of one VMAS scenario whose agents apply a force in the plane, one simulator for each seed.
+
+    A subclass sets the attributes below and implements `seen`. The global state holds what the physics moves: velocity
+    and position (and angle and spin where it turns) of each entity, and the `flags`. Chance inside of a step has to
+    come from torch; VMAS's own scenarios comply. On a GPU that chance is not part of a saved state.
+    """
+
+    Settings: ClassVar[type[TaskSettings]] = VmasSettings
+    settings: VmasSettings
+
+    scenario: ClassVar[Any]
+    """Name of a scenario that comes with VMAS, or a `BaseScenario`."""
+    symmetry: str
+    convention: str
+    own_goals: str = ""
+    """What the names of the landmarks begin with that belong to one agent each, in the agents' order."""
+    flags: tuple[str, ...] = ()
+    """Attributes of landmarks, 0 or 1 for each world, that belong to the state."""
+    terminates: bool = False
+    """Whether the scenario's `done` ends an episode; without it, `done` is a metric."""
+    shared_reward: bool = False
+    metrics: tuple[str, ...] = ()
+    """Names in the scenario's `info`; their mean over the agents is a metric."""
+
+    @abstractmethod
+    def seen(self) -> Layout:
+        """Return the layout of one agent's observation, after `reading`."""
+
+    def reading(self, obs: Tensor) -> Tensor:
+        """Turn the scenario's observations [E, N, width] into the numbers of the layout [E, N, D]."""
+        return obs
+
+    def arguments(self) -> dict[str, object]:
+        """Return the scenario's arguments; by default every setting but the horizon, agents as `n_agents`."""
+        own = self.settings.model_dump(exclude={"horizon", "num_agents"})
+        return {"n_agents": self.settings.num_agents} | own
+
+    def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
+        self._sims = [make() for _ in self.generators]
+        self._dice = [simulation.Dice(generator.initial_seed()) for generator in self.generators]
+        self._nursery = make()
+        self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags)
+        self.spec = TaskSpec(
+            name=f"vmas-{self.scenario}" if isinstance(self.scenario, str) else type(self).__name__.lower(),
+            version=1,
+            convention=self.convention,
+            num_agents=len(self._sims[0].agents),
+            horizon=self.settings.horizon,
+            observation=self.seen(),
+            state=self._entities.layout,
+            action=FORCE,
+            symmetry=self.symmetry,
+            shared_reward=self.shared_reward,
+            terminates=self.terminates,
+            totals=("done",) if self.terminates else (),
+            settings=settings.model_dump(),
+        )
+        self._range = torch.tensor([float(agent.u_range) for agent in self._sims[0].agents], device=self.device)
+        self._base = torch.zeros(self.num_seeds, dtype=torch.int64)
+        lead = (self.num_seeds, num_envs)
+        self._begun, self._time = torch.zeros(2, *lead, dtype=torch.int64).unbind()  # on the CPU: clocks are asked
+        self._starts: list[dict[int, simulation.Start]] = [{} for _ in self.generators]
+        width = self.reading(torch.stack(self._sims[0].reset(), 1)).shape[-1]
+        if width != self.spec.observation.width:
+            raise ValueError(
+                f"the scenario shows {width} numbers to an agent, but the layout has {self.spec.observation.width}"
+            )
+
+    def reset(self) -> Observation:
+        """Start a new episode in every world."""
+        for s, generator in enumerate(self.generators):
+            self._base[s] = torch.randint(2**31, (), generator=generator, device=self.device)
+            self._dice[s].throw_anew(int(self._base[s]))
+        self._starts = [{} for _ in self.generators]
+        self._begun.zero_()
+        every = torch.ones(self.num_envs, dtype=torch.bool)
+        return _joined([self._begin(s, every, None) for s in range(self.num_seeds)])
+
+    def step(self, action: Tensor) -> Step:
+        """Advance every world by one step.
+
+        Raises:
+            ValueError: the action has another shape than [S, E, N, 2].
+        """
+        require_shape("joint action", action, self.action_shape)
+        force = action / action.norm(dim=-1, keepdim=True).clamp_min(1.0) * self._range.unsqueeze(-1)
+        reached, following, rewards, ends, measured = [], [], [], [], []
+        self._time += 1
+        due = self._time == self.spec.horizon
+        for s, sim in enumerate(self._sims):
+            with self._dice[s].thrown():
+                obs, reward, done, infos = sim.step(list(force[s].unbind(1)))
+            here = self._look(sim, obs)
+            over = done.cpu() if self.terminates else torch.zeros(self.num_envs, dtype=torch.bool)
+            ends.append(over)
+            reached.append(here)
+            following.append(self._begin(s, over | due[s], here))
+            rewards.append(torch.stack(reward, 1))
+            measured.append([done.float(), *(_mean(infos, name, done) for name in self.metrics)])
+        terminated = torch.stack(ends)
+        final = _joined(reached) if self.terminates or bool(due.any()) else None
+        columns = (torch.stack(column) for column in zip(*measured, strict=True))
+        return Step(
+            next=_joined(following),
+            reward=torch.stack(rewards).float(),
+            terminated=terminated.to(self.device),
+            truncated=(due & ~terminated).to(self.device),
+            final=final,
+            metrics=dict(zip(("done", *self.metrics), columns, strict=True)),
+        )
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state at the start of an episode.
+
+        Raises:
+            ValueError: the state has another shape than [S, E, state width].
+        """
+        require_shape("state", state, self.state_shape)
+        self._time.zero_()
+        parts = []
+        for s, sim in enumerate(self._sims):
+            with self._dice[s].thrown():
+                self._entities.write(sim, state[s])
+                for agent in sim.agents:  # brings what rewards remember of the step before up to date
+                    sim.scenario.reward(agent)
+                self._entities.write(sim, state[s])
+            parts.append(self._look(sim, sim.get_from_scenario(True, False, False, False)[0]))
+        return _joined(parts)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return every simulator's tensors, its dice, clocks and generators."""
+        saved = {"base": self._base.clone(), "begun": self._begun.clone(), "time": self._time.clone()}
+        saved["dice"] = torch.stack([dice.state for dice in self._dice])
+        saved["generators"] = generator_states(self.generators)
+        for s, sim in enumerate(self._sims):
+            saved |= {f"{s}.{name}": tensor for name, tensor in simulation.snapshot(sim).items()}
+        return saved
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: the tensors belong to an environment of another size.
+        """
+        if tensors["time"].shape != self._time.shape or len(tensors["generators"]) != self.num_seeds:
+            raise ValueError(OTHER_SIZE)
+        self._base = tensors["base"].cpu().clone()
+        self._begun, self._time = (tensors[name].cpu().clone() for name in ("begun", "time"))
+        self._starts = [{} for _ in self.generators]
+        for s, (sim, dice) in enumerate(zip(self._sims, self._dice, strict=True)):
+            dice.state = tensors["dice"][s].cpu().clone()
+            own = {n.removeprefix(f"{s}."): t.to(self.device) for n, t in tensors.items() if n.startswith(f"{s}.")}
+            simulation.restore(sim, own)
+        restore_generators(self.generators, tensors["generators"])
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return every entity of one world as a disc or a square of its colour."""
+        sim = self._sims[world[0]]
+        bodies = [_body(entity, world[1], entity in sim.agents) for entity in [*sim.world.landmarks, *sim.agents]]
+        half = 1.2 * max(1.0, float(sim.world.x_semidim or 1), float(sim.world.y_semidim or 1))
+        return Scene(tuple(bodies), (-half, half, -half, half))
+
+    def _begin(self, s: int, over: Tensor, here: Observation | None) -> Observation:
+        """Start the next episode in some worlds [E] of one seed; the others keep what they see."""
+        for episode in self._begun[s][over].unique().tolist():
+            start = self._start(s, episode)
+            which = (over & (self._begun[s] == episode)).to(self.device)
+            simulation.copy_worlds(start.tensors, self._sims[s], which)
+            here = start.seen if here is None else _chosen(which, start.seen, here)
+        self._begun[s] += over
+        self._time[s][over] = 0
+        assert here is not None
+        return here
+
+    def _start(self, s: int, episode: int) -> simulation.Start:
+        """Return how all worlds of a seed begin an episode; a world takes its own row, whatever the others do."""
+        kept = self._starts[s]
+        if episode not in kept:
+            while len(kept) >= _KEPT_STARTS:
+                kept.pop(next(iter(kept)))
+            obs = self._nursery.reset(seed=simulation.seed_of(int(self._base[s]), episode))
+            kept[episode] = simulation.Start(simulation.snapshot(self._nursery), self._look(self._nursery, obs))
+        return kept[episode]
+
+    def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:
+        seen = self.reading(torch.stack(list(obs), 1).float())
+        return Observation(seen.unsqueeze(0), self._entities.read(sim).unsqueeze(0))
+
+
+def _joined(parts: Sequence[Observation]) -> Observation:
+    """Return the seeds' observations as memory of their own."""
+    return Observation(torch.cat([part.obs for part in parts]), torch.cat([part.state for part in parts]))
+
+
+def _chosen(which: Tensor, new: Observation, old: Observation) -> Observation:
+    obs = torch.where(which[None, :, None, None], new.obs, old.obs)
+    return Observation(obs, torch.where(which[None, :, None], new.state, old.state))
+
+
+def _mean(infos: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tensor:
+    found = [info[name].float().reshape(len(like)) for info in infos if name in info]
+    return torch.stack(found).mean(0) if found else torch.zeros_like(like, dtype=torch.float32)
+
+
+def _body(entity: Any, world: int, is_agent: bool) -> Body:
+    color = entity.color if not isinstance(entity.color, Tensor) else entity.color[world].tolist()
+    red, green, blue = (round(255 * float(part)) for part in list(color)[:3])
+    x, y = entity.state.pos[world].tolist()
+    shape = "square" if type(entity.shape).__name__ == "Box" else "disc"
+    radius = float(entity.shape.circumscribed_radius()) * (0.7071 if shape == "square" else 1.0)
+    return Body((x, y), max(radius, 0.01), f"#{red:02x}{green:02x}{blue:02x}", shape, trail=is_agent)

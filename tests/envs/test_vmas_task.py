@@ -1,0 +1,161 @@
+"""VMAS scenarios as tasks, held against VMAS itself."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+
+from esp_cli.symmetry import build_transform, environment_errors, parse_elements
+from esp_envs import Environment, Field, Kind, generators_for, layout, make, register
+from esp_envs.adapters import simulation
+from esp_envs.conformance import Subject, check
+from tests.own_tasks import save_page_files
+
+vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
+from esp_envs.adapters import vmas_scenarios  # noqa: E402
+
+CASES = [
+    ("Navigation", {}),
+    ("Navigation", {"num_agents": 3, "collisions": False}),
+    ("Transport", {"num_agents": 3}),
+    ("Transport", {"num_agents": 2, "n_packages": 2}),
+    ("Balance", {}),
+    ("Dispersion", {"num_agents": 3}),
+    ("Dispersion", {"n_food": 2, "share_reward": True}),
+]
+cases = pytest.mark.parametrize(("name", "settings"), CASES, ids=str)
+
+
+def worlds(name: str, settings, num_envs: int = 5, seeds=(3, 7), device: str = "cpu") -> Environment:
+    return make(register(f"esp_envs.adapters.vmas_scenarios:{name}"), num_envs, seeds, settings, device)
+
+
+@cases
+def test_a_scenario_keeps_every_promise(name: str, settings) -> None:
+    short = {**settings, "horizon": 12}
+    findings = list(check(Subject(lambda n, seeds: worlds(name, short, n, seeds), rounding=1e-4)))
+    assert [finding for finding in findings if finding.broken] == []
+    assert [f.not_asked for f in findings if f.not_asked] == ["each world ends for itself"]
+
+
+@cases
+def test_a_task_gives_the_numbers_of_vmas_itself(name: str, settings) -> None:
+    task = worlds(name, settings, 6, (5,))
+    start = task.reset()
+    theirs = vmas.make_env(task.scenario, 6, seed=0, **task.arguments())
+    seed = simulation.seed_of(int(task.state_dict()["base"][0]), 0)
+    seen = task.reading(torch.stack(theirs.reset(seed=seed), 1))
+    torch.testing.assert_close(start.obs[0], seen, rtol=0, atol=0)
+    for _ in range(20):
+        action = task.random_action()
+        force = action[0] / action[0].norm(dim=-1, keepdim=True).clamp_min(1.0)
+        step = task.step(action)
+        seen, reward, done, _ = theirs.step(
+            [f * a.u_range for f, a in zip(force.unbind(1), theirs.agents, strict=True)]
+        )
+        torch.testing.assert_close(step.final.obs[0], task.reading(torch.stack(seen, 1)), rtol=0, atol=0)
+        torch.testing.assert_close(step.reward[0], torch.stack(reward, 1), rtol=0, atol=0)
+        assert torch.equal(step.terminated[0], done)
+        if done.any():
+            break
+
+
+@cases
+def test_every_declared_element_holds(name: str, settings) -> None:
+    probe = worlds(name, settings, 1, (0,))
+    found = parse_elements(probe.spec.symmetry.replace("o2", "d4"), probe.spec.num_agents)
+    elements = found if isinstance(found, tuple) else found.witnesses()
+    elements = elements[:: max(1, len(elements) // 8)]
+    env = worlds(name, settings, 16, range(len(elements)))
+    state = env.reset().state
+    for _ in range(5):
+        state = env.step(env.random_action()).next.state
+    actions = [env.random_action() for _ in range(4)]
+    errors = environment_errors(env, build_transform(elements, env.spec), state, actions)
+    assert max(errors.values()) < 2e-3, errors
+
+
+def test_gravity_breaks_a_quarter_turn() -> None:
+    env = worlds("Balance", {}, 16, (0,))
+    state = env.reset().state
+    transform = build_transform(parse_elements("rot90", 3), env.spec)
+    errors = environment_errors(env, transform, state, [env.random_action() for _ in range(4)])
+    assert errors["next_state"] > 0.005
+
+
+def test_worlds_that_end_at_different_times_begin_their_own_episodes() -> None:
+    env = worlds("Balance", {"horizon": 60}, 20, (0,))
+    env.reset()
+    ended = torch.zeros(1, 20)
+    for _ in range(100):
+        step = env.step(env.random_action())
+        ended += step.terminated | step.truncated
+    assert ended.unique().numel() > 1
+    alone = worlds("Balance", {"horizon": 60}, 20, (0,))
+    first = alone.reset()
+    assert not torch.equal(first.state, step.next.state)
+
+
+def test_chance_inside_a_step_belongs_to_the_seed_and_is_saved() -> None:
+    class Noisy(vmas_scenarios.Transport):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            for sim in self._sims:
+                for agent in sim.agents:
+                    agent.action._u_noise = 0.5
+
+    settings = Noisy.Settings(num_agents=2, horizon=12)
+    subject = Subject(lambda n, seeds: Noisy(settings, n, generators_for(seeds)))
+    findings = {f.promise: f for f in check(subject)}
+    assert [f for f in findings.values() if f.broken] == []
+    assert findings["set state reproduces what follows"].not_asked == "the task has chance of its own"
+
+
+def test_a_layout_of_another_width_is_refused() -> None:
+    class Narrow(vmas_scenarios.Transport):
+        def seen(self):
+            return layout(Field("position", Kind.VECTOR))
+
+    with pytest.raises(ValueError, match="the scenario shows 11 numbers to an agent, but the layout has 2"):
+        Narrow(Narrow.Settings(), 2, generators_for([0]))
+
+
+def test_arguments_that_a_scenario_does_not_take_are_refused() -> None:
+    class Odd(vmas_scenarios.Balance):
+        def arguments(self):
+            return super().arguments() | {"n_agents": 1}
+
+    with pytest.raises(ValueError, match=r"VMAS does not make 'balance' with \{'n_agents': 1"):
+        Odd(Odd.Settings(), 2, generators_for([0]))
+
+
+def test_goals_that_are_not_one_for_each_agent_are_refused() -> None:
+    class Shared(vmas_scenarios.Transport):
+        own_goals = "package"
+
+    with pytest.raises(ValueError, match=r"1 landmarks are named 'package\.\.\.' for 4 agents"):
+        Shared(Shared.Settings(), 2, generators_for([0]))
+
+
+def test_without_vmas_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "vmas", None)
+    with pytest.raises(ValueError, match=r'pip install "esp-marl\[vmas\]"'):
+        worlds("Transport", {})
+
+
+def test_a_scenario_of_ones_own_layout_keeps_every_promise(tmp_path, monkeypatch) -> None:
+    save_page_files(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    name = register("passage:Passage")
+    findings = list(check(Subject(lambda n, seeds: make(name, n, seeds, {"horizon": 10}), rounding=1e-4)))
+    assert [finding for finding in findings if finding.broken] == []
+    assert [f.not_asked for f in findings if f.not_asked] == ["all worlds end together"]
+
+
+@pytest.mark.gpu
+@cases
+def test_a_gpu_runs_the_same_task(name: str, settings) -> None:
+    findings = list(check(Subject(lambda n, seeds: worlds(name, {**settings, "horizon": 8}, n, seeds, "cuda"), 1e-3)))
+    assert [finding for finding in findings if finding.broken] == []
