@@ -15,9 +15,8 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 from __future__ import annotations
 
 import os
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, HereCopies, Sizes, WorkerCopies, can_fork
-from esp_envs.adapters.stepper import Array, Copy, CopyStepper
+from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
 from esp_envs.base import (
     OTHER_SIZE,
     Environment,
@@ -36,7 +35,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
-from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
+from esp_envs.spec import Discrete, TaskSpec, joint_layout
 
 _FEW_COPIES = 8
 """Up to so many copies, worker processes cost more than they bring."""
@@ -51,58 +50,16 @@ class ParallelSettings(TaskSettings):
     )
 
 
-class ParallelTask(Environment):
+class ParallelTask(CopyHooks, Environment):
     """Copies of a PettingZoo environment, S x E of them.
 
-    A subclass sets the attributes below, implements `make_one`, and may override `reading`, `opponent` and `measure`.
-    These hooks may use `self.settings` alone: they run in worker processes. A copy must be repeatable: from
-    `reset(seed)` on, the same actions give the same numbers, since a saved run is restored by repeating its episode.
-
-    All learning agents of a copy must end together. Where they may end before the horizon, set `terminates`.
+    A subclass sets the attributes of `CopyHooks`, implements `make_one`, and may override `reading`, `opponent` and
+    `measure`. A copy must be repeatable: from `reset(seed)` on, the same actions give the same numbers, since a saved
+    run is restored by repeating its episode.
     """
 
     Settings: ClassVar[type[TaskSettings]] = ParallelSettings
     settings: ParallelSettings
-
-    observation: Layout
-    """What each learning agent sees, after `reading`."""
-    action: ActionSpace
-    """What each learning agent does; numbers in [-1, 1] are stretched to the bounds of a Box."""
-    symmetry: str
-    convention: str
-    state: Layout | None = None
-    """What `env.state()` returns; by default the global state is all agents' observations, one after the other."""
-    learners: str = ""
-    """What the names of the agents that learn begin with; the others act by `opponent`."""
-    terminates: bool = False
-    shared_reward: bool = False
-    metrics: tuple[str, ...] = ()
-    """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
-
-    @abstractmethod
-    def make_one(self) -> Any:
-        """Return one new copy, a PettingZoo `ParallelEnv`."""
-
-    def reading(self, agent: str, observation: Any) -> Array:
-        """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
-        return np.asarray(observation)
-
-    def opponent(self, agent: str, observation: Any, generator: np.random.Generator) -> Any:
-        """Return the action of an agent that does not learn, as its environment takes it.
-
-        Args:
-            agent: its name.
-            observation: what the environment gave it.
-            generator: of this copy, seeded with each episode.
-        """
-        raise ValueError(f"{type(self).__name__} does not say how {agent} acts; define 'opponent' or set 'learners'")
-
-    def measure(self, env: Any, infos: Mapping[str, Mapping[str, Any]]) -> Mapping[str, float]:
-        """Return the metrics of the step just made: the mean over the agents whose infos hold them."""
-        return {
-            name: float(np.mean([info[name] for info in infos.values() if name in info] or [0]))
-            for name in self.metrics
-        }
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)

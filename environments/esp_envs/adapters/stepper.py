@@ -2,25 +2,70 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board
-from esp_envs.spec import Discrete
-
-if TYPE_CHECKING:
-    from esp_envs.adapters.pettingzoo import ParallelTask
+from esp_envs.spec import ActionSpace, Discrete, Layout
 
 Array = NDArray[Any]
+
+
+class CopyHooks(ABC):
+    """What a task says about one copy of its environment. The hooks run in worker processes; they use settings alone.
+
+    All learning agents of a copy must end together. Where they may end before the horizon, set `terminates`.
+    """
+
+    observation: Layout
+    """What each learning agent sees, after `reading`."""
+    action: ActionSpace
+    """What each learning agent does; numbers in [-1, 1] are stretched to the bounds of a Box."""
+    symmetry: str
+    convention: str
+    state: Layout | None = None
+    """What `env.state()` returns; by default the global state is all agents' observations, one after the other."""
+    learners: str = ""
+    """What the names of the agents that learn begin with; the others act by `opponent`."""
+    terminates: bool = False
+    shared_reward: bool = False
+    metrics: tuple[str, ...] = ()
+    """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
+
+    @abstractmethod
+    def make_one(self) -> Any:
+        """Return one new copy, a PettingZoo `ParallelEnv`."""
+
+    def reading(self, agent: str, observation: Any) -> Array:
+        """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
+        return np.asarray(observation)
+
+    def opponent(self, agent: str, observation: Any, generator: np.random.Generator) -> Any:
+        """Return the action of an agent that does not learn, as its environment takes it.
+
+        Args:
+            agent: its name.
+            observation: what the environment gave it.
+            generator: of this copy, seeded with each episode.
+        """
+        raise ValueError(f"{type(self).__name__} does not say how {agent} acts; define 'opponent' or set 'learners'")
+
+    def measure(self, env: Any, infos: Mapping[str, Mapping[str, Any]]) -> Mapping[str, float]:
+        """Return the metrics of the step just made: the mean over the agents whose infos hold them."""
+        return {
+            name: float(np.mean([info[name] for info in infos.values() if name in info] or [0]))
+            for name in self.metrics
+        }
 
 
 class Copy:
     """One copy, its learning agents and how their numbers go in and out."""
 
-    def __init__(self, task: ParallelTask) -> None:
+    def __init__(self, task: CopyHooks) -> None:
         self._task = task
         self.env = task.make_one()
         agents = list(self.env.possible_agents)
@@ -67,7 +112,7 @@ class Copy:
 class CopyStepper:
     """Steps some copies of a board."""
 
-    def __init__(self, task: ParallelTask, board: Board, copies: range) -> None:
+    def __init__(self, task: CopyHooks, board: Board, copies: range) -> None:
         self._task, self._board = task, board
         self._copies = {k: Copy(task) for k in copies}
         self._seen: dict[int, Mapping[str, Any]] = {}
