@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from esp_cli.deploy.library import LoadedPolicy, load_policy
+    from esp_cli.loop.symmetry import Symmetry
+    from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, discrete_moves, layout
 
-__all__ = ["LoadedPolicy", "__version__", "load_policy"]
+__all__ = [
+    "Continuous",
+    "Discrete",
+    "Field",
+    "Items",
+    "Kind",
+    "Layout",
+    "LoadedPolicy",
+    "Symmetry",
+    "__version__",
+    "discrete_moves",
+    "layout",
+    "load_policy",
+]
 __version__ = "0.1.0"
+
+_HOMES = {
+    "LoadedPolicy": "esp_cli.deploy.library",
+    "Symmetry": "esp_cli.loop.symmetry",
+    "load_policy": "esp_cli.deploy.library",
+}
+"""Where a public name is defined; the others describe spaces."""
 
 
 def __getattr__(name: str) -> Any:
     """Import what other programs use when they ask for it: torch takes a second, `esp --help` a sixth of one."""
-    if name in ("LoadedPolicy", "load_policy"):
-        from esp_cli.deploy import library  # noqa: PLC0415 - see above
-
-        return getattr(library, name)
+    if name in __all__:
+        return getattr(import_module(_HOMES.get(name, "esp_envs.spec")), name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -26,6 +26,7 @@ RANKS = {
     "prior": 2,
     "networks": 2,
     "algorithms": 3,
+    "loop": 3,
     "training": 4,
     "evaluation": 5,
     "drawing": 6,

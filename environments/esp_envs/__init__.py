@@ -1,18 +1,8 @@
 """Batched, device-agnostic multi-agent environments whose numbers say what they are."""
 
-from esp_envs.base import (
-    Body,
-    Environment,
-    Observation,
-    Scene,
-    Step,
-    TaskSettings,
-    generator_states,
-    generators_for,
-    restore_generators,
-)
-from esp_envs.lockstep import BatchedTask, Outcome, World, to_others
-from esp_envs.registry import make, register, task_class, task_names
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from esp_envs.spec import (
     Continuous,
     Discrete,
@@ -25,6 +15,21 @@ from esp_envs.spec import (
     joint_layout,
     layout,
 )
+
+if TYPE_CHECKING:
+    from esp_envs.base import (
+        Body,
+        Environment,
+        Observation,
+        Scene,
+        Step,
+        TaskSettings,
+        generator_states,
+        generators_for,
+        restore_generators,
+    )
+    from esp_envs.lockstep import BatchedTask, Outcome, World, to_others
+    from esp_envs.registry import make, register, task_class, task_names
 
 __all__ = [
     "BatchedTask",
@@ -55,3 +60,12 @@ __all__ = [
     "task_names",
     "to_others",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what makes worlds when it is asked for; a spec alone needs the standard library alone."""
+    if name in __all__:
+        for module in map(import_module, ("esp_envs.base", "esp_envs.registry", "esp_envs.lockstep")):
+            if hasattr(module, name):
+                return getattr(module, name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

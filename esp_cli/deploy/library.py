@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.deploy.bundled import open_policy
 from esp_cli.training.loading import TrainedPolicy, single_seed
-from esp_envs.spec import Continuous, Layout, TaskSpec
+from esp_envs.spec import Continuous, TaskSpec
 
 Floats = NDArray[np.float32]
 Action = NDArray[np.int64] | NDArray[np.float32]
@@ -108,7 +108,7 @@ class LoadedPolicy:
 
     def _checked_obs(self, obs: ArrayLike) -> Floats:
         layout = self.spec.observation
-        rows = self._checked(obs, layout.width, "observation", field_list(layout))
+        rows = self._checked(obs, layout.width, "observation", layout.summary)
         if self.team > 1 and rows.shape[-2:-1] != (self.team,):
             raise ValueError(
                 f"the observation has shape {rows.shape}, but the agents of {self.source} exchange messages: give "
@@ -147,8 +147,3 @@ def load_policy(
         ValueError: nothing there, damaged, of another version, or no such seed.
     """
     return LoadedPolicy(open_policy(Path(where), algo, prior), seed)
-
-
-def field_list(layout: Layout) -> str:
-    """Return the fields of a layout in a few words: "heading 2, goal 2 (m)"."""
-    return ", ".join(f"{f.name} {f.width}" + (f" ({f.unit})" if f.unit else "") for f in layout.fields)

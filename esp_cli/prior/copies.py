@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Generic, Protocol
+from typing import TYPE_CHECKING, Generic, Protocol
 
 import torch
 from torch import Tensor
 
-from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
 from esp_cli.prior.seed_batch import Rows, mean_per_seed
 from esp_cli.symmetry import Transform
+
+if TYPE_CHECKING:
+    from esp_cli.prior.config import PriorConfig
 
 
 class Divergent(Protocol):

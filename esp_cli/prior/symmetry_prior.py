@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import torch
 from torch import Tensor
 
-from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.copies import Copies, Divergent
 from esp_cli.prior.seed_batch import Rows
 from esp_cli.symmetry import Transform, carried_groups, transform_set
 from esp_envs.spec import Spaces
+
+if TYPE_CHECKING:
+    from esp_cli.prior.config import PriorConfig
 
 
 class Answers(TypedDict, total=False):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from esp_cli.symmetry.transforms import Transform
-from esp_envs.base import Environment, Observation, Step
+
+if TYPE_CHECKING:
+    from esp_envs.base import Environment, Observation, Step
 
 Network = Callable[[Tensor], Tensor]
 

@@ -43,6 +43,11 @@ class Dense:
         """Return M^-1 x."""
         return torch.bmm(rows, self.matrix.to(rows.dtype))
 
+    @property
+    def squared(self) -> Dense:
+        """The map whose entries are squared: how variances of independent numbers move."""
+        return Dense(self.matrix.square())
+
     def apply(self, function: Callable[[Tensor], Tensor]) -> Dense:
         """Return the map whose tensors went through a function, which selects some of the stack or moves all."""
         return Dense(function(self.matrix))
@@ -77,6 +82,11 @@ class Gather:
         signed = rows if self.sign is None else rows * self.sign[:, None, :].to(rows.dtype)
         return signed.gather(2, self.back[:, None, :].expand(rows.shape))
 
+    @property
+    def squared(self) -> Gather:
+        """The map whose entries are squared: how variances of independent numbers move."""
+        return Gather(self.source, self.back)
+
     def inverse(self) -> Gather:
         """Return the unsigned map that undoes this one."""
         return Gather(self.back, self.source)
@@ -89,9 +99,9 @@ class Gather:
 Map = Dense | Gather
 
 
-def dense(matrix: Floats, device: torch.device | str = "cpu") -> Dense:
+def dense(matrix: Floats, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Dense:
     """Return the map of matrices [S, width, width]."""
-    return Dense(torch.as_tensor(matrix, dtype=torch.float32, device=device))
+    return Dense(torch.as_tensor(matrix, dtype=dtype, device=device))
 
 
 def gather(source: Indices, sign: Floats | None = None, device: torch.device | str = "cpu") -> Gather:
@@ -101,7 +111,13 @@ def gather(source: Indices, sign: Floats | None = None, device: torch.device | s
     return Gather(index, index.argsort(1), signs)
 
 
-def rows_map(layout: Layout, elements: tuple[Element, ...], num_agents: int, device: torch.device | str = "cpu") -> Map:
+def rows_map(
+    layout: Layout,
+    elements: tuple[Element, ...],
+    num_agents: int,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Map:
     """Return L_g on an agent's row, or on all agents' rows end to end where agents move.
 
     Raises:
@@ -109,4 +125,4 @@ def rows_map(layout: Layout, elements: tuple[Element, ...], num_agents: int, dev
     """
     if any(field.pixels is not None for field in layout.fields):
         return gather(*rows_permutation(layout, elements, num_agents), device)
-    return dense(rows_matrix(layout, elements, num_agents), device)
+    return dense(rows_matrix(layout, elements, num_agents), device, dtype)

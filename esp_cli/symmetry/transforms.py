@@ -56,6 +56,11 @@ class Transform:
         """S, or 1 for a transform that is the same for all seeds."""
         return len(self.elements)
 
+    @property
+    def num_outputs(self) -> int:
+        """Numbers that a policy says of one agent: one per discrete action, or those of a continuous one."""
+        return self.output_map.width // (1 if self.agents is None else self.agents.width)
+
     def select(self, indices: Sequence[int]) -> Transform:
         """Return the transform made of the elements at these positions, one per seed."""
         index = torch.tensor(indices, dtype=torch.int64)
@@ -84,7 +89,7 @@ class Transform:
     def action(self, action: Tensor) -> Tensor:
         """Apply K_g to actions: [S, ..., N] int64 (discrete) or [S, ..., N, width]."""
         if self.action_index is None:
-            return self._move(action, self.output_map.push, self.output_map.width, agent_axis=-2)
+            return self.push_outputs(action)
         flat = action.reshape(self._seeds_of(action), -1)
         return self.per_agent(self.action_index.gather(1, flat).reshape(action.shape))
 
@@ -93,6 +98,10 @@ class Transform:
         if self.agents is None or x.shape[-1] == 1:
             return x
         return self._move(x, self.agents.push, self.agents.width, agent_axis=-1)
+
+    def push_outputs(self, outputs: Tensor) -> Tensor:
+        """Apply K_g to one number per discrete action, or to those of a continuous one; undoes `pull_back`."""
+        return self._move(outputs, self.output_map.push, self.output_map.width, agent_axis=-2)
 
     def pull_back(self, outputs: Tensor) -> Tensor:
         """Apply K_g^-1 to a policy's outputs at L_g s, so that they compare with its outputs at s.
@@ -103,6 +112,14 @@ class Transform:
             [S, ..., N, A] or [S, ..., N, width] to the same.
         """
         return self._move(outputs, self.output_map.pull, self.output_map.width, agent_axis=-2)
+
+    def pull_back_variance(self, variance: Tensor) -> Tensor:
+        """Return the diagonal of K_g^-1 diag(variance) K_g: the variances of an action's numbers, pulled back.
+
+        Shape:
+            as of `pull_back`.
+        """
+        return self._move(variance, self.output_map.squared.pull, self.output_map.width, agent_axis=-2)
 
     def values(self, values: Tensor) -> Tensor:
         """Return values per agent [S, ..., N] to their agents; one value per world [S, ..., 1] stays."""
@@ -136,7 +153,12 @@ class Transform:
         return self.num_seeds
 
 
-def build_transform(elements: Sequence[Element], spaces: Spaces, device: torch.device | str = "cpu") -> Transform:
+def build_transform(
+    elements: Sequence[Element],
+    spaces: Spaces,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Transform:
     """Stack the representations of some elements, one per seed, on a task's spaces.
 
     Raises:
@@ -154,12 +176,12 @@ def build_transform(elements: Sequence[Element], spaces: Spaces, device: torch.d
             image = (places[:, :, None] * spaces.action.count + image[:, None, :]).reshape(len(chosen), -1)
         output_map: Map = gather(image, device=device).inverse()
     else:
-        output_map = rows_map(spaces.action.layout, chosen, num_agents, device)
+        output_map = rows_map(spaces.action.layout, chosen, num_agents, device, dtype)
     return Transform(
         elements=chosen,
         agents=None if places is None else gather(places, device=device).inverse(),
-        obs_map=rows_map(spaces.observation, chosen, num_agents, device),
-        state_map=dense(state_matrix(spaces, chosen), device),
+        obs_map=rows_map(spaces.observation, chosen, num_agents, device, dtype),
+        state_map=dense(state_matrix(spaces, chosen), device, dtype),
         output_map=output_map,
         action_index=index,
     )
@@ -174,9 +196,14 @@ class TransformSet:
         size: how many elements are listed, the identity not counted; 0 where the group is sampled.
     """
 
-    def __init__(self, elements: Sequence[Element] | Group, spaces: Spaces, device: torch.device | str = "cpu") -> None:
-        self.spaces = spaces
-        self.device = device
+    def __init__(
+        self,
+        elements: Sequence[Element] | Group,
+        spaces: Spaces,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.spaces, self.device, self.dtype = spaces, device, dtype
         self._group = elements if isinstance(elements, Group) else None
         self._elements = () if isinstance(elements, Group) else tuple(elements)
         self.is_finite = self._group is None
@@ -184,7 +211,7 @@ class TransformSet:
         self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
         # Built once where it fits: a draw is then a selection.
         stacked = 0 < self.size <= _STACK_LIMIT
-        self._stack = build_transform(self._elements, spaces, device) if stacked else None
+        self._stack = self._build(self._elements) if stacked else None
 
     def draw(self, generators: Sequence[torch.Generator]) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
@@ -197,11 +224,11 @@ class TransformSet:
             generators: one per seed, on the CPU.
         """
         if self._group is not None:
-            return build_transform([_draw_moving(self._group, g) for g in generators], self.spaces, self.device)
+            return self._build([_draw_moving(self._group, g) for g in generators])
         picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
         if self._stack is not None:
             return self._stack.select(picks)
-        return build_transform([self._elements[i] for i in picks], self.spaces, self.device)
+        return self._build([self._elements[i] for i in picks])
 
     def each(self) -> list[Transform]:
         """Return every element in order, each the same for all seeds.
@@ -213,21 +240,27 @@ class TransformSet:
             raise ValueError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
         if self._stack is not None:
             return [self._stack.select([i]) for i in range(self.size)]
-        return [build_transform([e], self.spaces, self.device) for e in self._elements]
+        return [self._build([e]) for e in self._elements]
+
+    def _build(self, elements: Sequence[Element]) -> Transform:
+        return build_transform(elements, self.spaces, self.device, self.dtype)
 
 
-def transform_set(text: str, spaces: Spaces, device: torch.device | str = "cpu") -> TransformSet:
+def transform_set(
+    text: str, spaces: Spaces, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> TransformSet:
     """Read transforms from text and build them for a task.
 
     Args:
         text: see `parse_elements`.
         spaces: of the task.
         device: where the tensors live.
+        dtype: of the matrices.
 
     Raises:
         ValueError: the text means nothing, or the task cannot carry what it means.
     """
-    return TransformSet(admitted_elements(text, spaces), spaces, device)
+    return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
 
 
 def _draw_moving(group: Group, generator: torch.Generator) -> Element:

@@ -1,0 +1,1 @@
+"""Symmetry inside training loops of others: plain PyTorch, TorchRL, BenchMARL."""

@@ -1,0 +1,137 @@
+"""How far a policy at L_g s is from the same policy at s, given as torch distributions (Eq. 8)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch import distributions as td
+
+from esp_cli.prior.losses import policy_consistency_loss
+from esp_cli.symmetry import Transform
+
+Policy = Any
+"""What a policy returns: a distribution, or a tensor (logits of discrete actions, continuous actions)."""
+
+SAMPLES = 8
+"""Actions drawn where a divergence has no closed form."""
+_FAR, _MARGIN = 30.0, 1e-6
+"""A latent action that a squash sends to the end of its box, and how near to the end, as a share, actions may come."""
+_KNOWN = "Categorical, OneHotCategorical, Normal, Independent, or a squashed Normal such as TanhNormal"
+
+
+def policy_divergence(transform: Transform, there: Policy, here: Policy, samples: int = SAMPLES) -> Tensor:
+    """Return KL[pi(K_g . | L_g s) || pi(. | s)] for each agent (Eq. 8).
+
+    Exact for Categorical and OneHotCategorical; for Normal, under every rotation; for Independent ones of these; and
+    for squashed Normals where the squash commutes with K_g, as tanh does with quarter turns and mirrors. Other squashed
+    Normals are compared by `samples` reparametrised actions; a turned action outside of the box is clipped to it, as
+    environments do. Tensors are logits of discrete actions, or continuous actions; of these it returns half the squared
+    distance, the divergence of two Normals of deviation 1.
+
+    Args:
+        transform: g, one element.
+        there: the policy at L_g s.
+        here: the policy at s.
+        samples: actions drawn where there is no closed form.
+
+    Returns:
+        [..., N], or [...] without an agent axis.
+
+    Raises:
+        ValueError: another kind of distribution, or another number of actions.
+    """
+    there, here = _bare(there), _bare(here)
+    if transform.action_index is not None:
+        if all(isinstance(p, Tensor | td.Categorical | td.OneHotCategorical) for p in (there, here)):
+            return policy_consistency_loss(_choices_apart, _pulled(transform, _logits(there)), _logits(here))
+    elif isinstance(there, Tensor) and isinstance(here, Tensor):
+        return policy_consistency_loss(_half_squared_distance, _pulled(transform, there), here)
+    elif isinstance(there, td.Normal) and isinstance(here, td.Normal):
+        return _normals_apart(transform, there, here)
+    elif _is_squashed(there) and _is_squashed(here):
+        inner, own = _bare(there.base_dist), _bare(here.base_dist)
+        if _commutes(transform, own.loc, here.transforms):
+            return _normals_apart(transform, inner, own)
+        return _samples_apart(transform, there, here, samples)
+    action = "discrete" if transform.action_index is not None else "continuous"
+    raise ValueError(f"the policy's {type(there).__name__} is not known for {action} actions; give {_KNOWN}")
+
+
+def _bare(policy: Policy) -> Policy:
+    """Return a distribution without `Independent` around it."""
+    if isinstance(policy, tuple | list):
+        raise ValueError(
+            f"the policy returned {len(policy)} things, but a stored hidden state cannot be transformed; give whole "
+            "histories from their first step, and return the distribution alone"
+        )
+    while isinstance(policy, td.Independent):
+        policy = policy.base_dist
+    return policy
+
+
+def _is_squashed(policy: Policy) -> bool:
+    return isinstance(policy, td.TransformedDistribution) and isinstance(_bare(policy.base_dist), td.Normal)
+
+
+def _pulled(transform: Transform, outputs: Tensor) -> Tensor:
+    """Return what a policy says at L_g s, pulled back, after checking its width."""
+    width = transform.num_outputs
+    if outputs.shape[-1:] != (width,):
+        what = "actions" if transform.action_index is not None else "numbers in an action"
+        raise ValueError(f"the policy's outputs have shape {list(outputs.shape)}, but there are {width} {what}")
+    return transform.pull_back(outputs)
+
+
+def _logits(policy: Policy) -> Tensor:
+    return policy if isinstance(policy, Tensor) else policy.logits
+
+
+def _choices_apart(p: Tensor, q: Tensor) -> Tensor:
+    """Return KL[softmax(p) || softmax(q)]; what p excludes by a logit of -inf adds nothing."""
+    p, q = p.log_softmax(-1), q.log_softmax(-1)
+    return (p.exp() * (p - q).masked_fill(p.isneginf(), 0.0)).sum(-1)
+
+
+def _half_squared_distance(p: Tensor, q: Tensor) -> Tensor:
+    return 0.5 * (p - q).square().sum(-1)
+
+
+def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> Tensor:
+    """Return KL[N(K^-1 m', K^-1 diag(v') K) || N(m, diag(v))].
+
+    It is sum((c + (m - K^-1 m')^2) / v - 1 + log v - log v') / 2 with c the diagonal of K^-1 diag(v') K, since the
+    determinant of a turned covariance is that of diag(v').
+    """
+    mean, variance = _pulled(transform, there.loc), transform.pull_back_variance(there.variance)
+    ratio = (variance + (here.loc - mean).square()) / here.variance
+    volume = transform.values(there.variance.log().sum(-1))
+    return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
+
+
+@torch.no_grad()
+def _commutes(transform: Transform, mean: Tensor, squash: list[td.Transform]) -> bool:
+    """Whether turning before a squash is turning after it, tried on a policy's own means."""
+    turned = _pulled(transform, mean)
+    for step in squash:
+        mean, turned = step(mean), step(turned)
+    return torch.allclose(transform.pull_back(mean), turned, rtol=1e-4, atol=1e-6)
+
+
+def _samples_apart(transform: Transform, there: Policy, here: Policy, samples: int) -> Tensor:
+    """Return the mean of log pi(a' | L_g s) - log pi(K_g^-1 a' | s) over drawn a'."""
+
+    def log_prob(policy: Policy, action: Tensor) -> Tensor:
+        density = policy.log_prob(action)
+        return density.sum(-1) if density.dim() == action.dim() else density
+
+    low, high = (torch.full_like(here.base_dist.mean, end) for end in (-_FAR, _FAR))
+    for step in here.transforms:
+        low, high = step(low), step(high)
+    margin = _MARGIN * (high - low)
+    gaps = []
+    for action in (there.rsample() for _ in range(samples)):
+        home = transform.pull_back(action).clamp(low + margin, high - margin)
+        gaps.append(transform.values(log_prob(there, action)) - log_prob(here, home))
+    return torch.stack(gaps).mean(0)

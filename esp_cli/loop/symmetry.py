@@ -1,0 +1,298 @@
+"""A symmetry for the training loop that you have: transformed copies of its data, and consistency losses.
+
+from esp_cli import Field, Kind, Symmetry, discrete_moves, layout
+
+symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
+obs, action, (log_prob, advantage) = symmetry.augment(obs, action, per_agent=(log_prob, advantage))
+loss += 0.1 * symmetry.policy_loss(policy, obs) + 0.1 * symmetry.value_loss(critic, state)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, overload
+
+import torch
+from torch import Tensor
+
+from esp_cli.loop.divergence import Policy, policy_divergence
+from esp_cli.prior.losses import value_consistency_loss
+from esp_cli.symmetry import Transform, TransformSet, transform_set
+from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
+
+_HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
+
+
+class Symmetry:
+    """A known symmetry of a task, as copies of data (Eq. 7) and as losses (Eq. 8, 9) in any training loop.
+
+    Shapes: `...` stands for any leading axes, the same in all arguments of a call. Where `num_agents` is 1, the agent
+    axis N is left out. Tensors may live on any device and have any floating-point type. Results are new tensors, and
+    gradients flow through them. What is invariant under the whole group needs no copy: rewards, dones, returns.
+
+    Whole histories of a recurrent policy are data like any other, with time among the leading axes. A stored hidden
+    state is refused: no layout says how its numbers transform.
+
+    Args:
+        observation: layout of one agent's D numbers.
+        action: of one agent.
+        group: the transforms under which dynamics and reward stay the same, as `esp train --transforms` reads them:
+            "d4", "o2", "d4*agents", "rot90,flip-x". The caller vouches for it.
+        num_agents: N; 1 also for rows of single agents.
+        state: layout of the Ds numbers of the global state; by default all observations end to end.
+        copies: "draw" draws one element for each call, "all" takes each element of a finite group.
+        seed: of the draws.
+
+    Attributes:
+        spaces: what the transforms act on.
+        copies: as given.
+        generator: draws the elements; its state belongs into a checkpoint.
+
+    Raises:
+        ValueError: the actions or layouts cannot carry the group, or all elements of an infinite group are asked for.
+    """
+
+    def __init__(
+        self,
+        *,
+        observation: Layout,
+        action: ActionSpace,
+        group: str = "d4",
+        num_agents: int = 1,
+        state: Layout | None = None,
+        copies: Literal["draw", "all"] = "draw",
+        seed: int = 0,
+    ) -> None:
+        joint = joint_layout(observation, num_agents)
+        self.spaces = Spaces(
+            num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="o2"
+        )
+        self.group, self.copies = group, copies
+        self.generator = torch.Generator().manual_seed(seed)
+        self._sets: dict[tuple[torch.device, torch.dtype], TransformSet] = {}
+        listed = self._set(torch.device("cpu"), torch.float32).is_finite
+        if copies == "all" and not listed:
+            raise ValueError(
+                f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'"
+            )
+
+    def transforms(self, like: Tensor) -> list[Transform]:
+        """Return the elements of one call, on the device of `like`: one that is drawn, or all."""
+        exact = torch.float64 if like.dtype == torch.float64 else torch.float32
+        chosen = self._set(like.device, exact)
+        return chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
+
+    @overload
+    def augment(
+        self, obs: Tensor, action: Tensor, *, per_agent: Sequence[Tensor] = (), dim: int = 0
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]: ...
+
+    @overload
+    def augment(
+        self, obs: Tensor, action: Tensor, *, state: Tensor, per_agent: Sequence[Tensor] = (), dim: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]: ...
+
+    def augment(
+        self,
+        obs: Tensor,
+        action: Tensor,
+        *,
+        state: Tensor | None = None,
+        per_agent: Sequence[Tensor] = (),
+        dim: int = 0,
+    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]] | tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+        """Return the data with its copies (L_g s, K_g a) behind it; a copy keeps the numbers of its original (Eq. 7).
+
+        Args:
+            obs: [..., N, D].
+            action: [..., N] indices of discrete actions, also [..., N, 1] or one-hot [..., N, A]; or [..., N, width].
+            state: [..., Ds].
+            per_agent: numbers [..., N] or [..., N, 1] that go with their agents (log-probability, advantage), or
+                [...] or [..., 1] of the whole team.
+            dim: the leading axis along which copies are added: 0, or that of the batch where time comes first.
+
+        Returns:
+            obs, action, (state where it is given,) and the tuple of numbers, with 1 + copies times the rows.
+
+        Raises:
+            ValueError: a shape that does not fit the layouts, or an action outside.
+        """
+        lead = self.lead_of(obs)
+        if not 0 <= dim < len(lead):
+            raise ValueError(
+                f"obs of shape {list(obs.shape)} has {len(lead)} leading axes; copies cannot go along {dim}"
+            )
+        transforms = self.transforms(obs)
+
+        def joined(x: Tensor, images: list[Tensor]) -> Tensor:
+            return torch.cat([x, *images], dim)
+
+        moved_obs = joined(obs, [g.obs(obs) for g in transforms])
+        moved_action = joined(action, [self.act(g, action, lead) for g in transforms])
+        numbers = tuple(
+            joined(x, [self.carry(g.per_agent, x, lead, f"per_agent[{i}]") for g in transforms])
+            for i, x in enumerate(per_agent)
+        )
+        if state is None:
+            return moved_obs, moved_action, numbers
+        self._check_rows("state", state, self.spaces.state, lead)
+        return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
+
+    def policy_loss(
+        self, policy: Callable[[Tensor], Policy], obs: Tensor, here: Policy = None, mask: Tensor | None = None
+    ) -> Tensor:
+        """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), averaged over rows, agents and elements.
+
+        Args:
+            policy: obs [..., N, D] to a distribution of actions, or to a tensor; see `policy_divergence` for which are
+                known, and where the divergence is exact.
+            obs: [..., N, D]; of a recurrent policy, whole histories.
+            here: what the policy says of `obs`, where it is known already; detached, it stays fixed.
+            mask: [...] which rows count.
+
+        Returns:
+            A scalar, 0 if and only if the policy turns with the scene.
+
+        Raises:
+            ValueError: a shape that does not fit, or a distribution that is not known.
+        """
+        self.lead_of(obs)
+        here = policy(obs) if here is None else here
+        return _mean([policy_divergence(g, policy(g.obs(obs)), here) for g in self.transforms(obs)], mask)
+
+    def value_loss(
+        self,
+        value: Callable[[Tensor], Tensor],
+        state: Tensor | None = None,
+        *,
+        obs: Tensor | None = None,
+        here: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> Tensor:
+        """Return S_V = (V(s) - V(L_g s))^2 (Eq. 9), averaged over rows, agents and elements.
+
+        Args:
+            value: the state, or the observations, to values [...], [..., 1], [..., N] or [..., N, 1].
+            state: [..., Ds], for a critic that takes the state.
+            obs: [..., N, D], for one that takes the observations; give one of the two.
+            here: the values of the originals, where they are known already.
+            mask: [...] which rows count.
+
+        Raises:
+            ValueError: a shape that does not fit.
+        """
+        if state is not None and obs is None:
+            lead = self._check_rows("state", state, self.spaces.state)
+            here = value(state) if here is None else here
+            moved = [(g, value(g.state(state))) for g in self.transforms(state)]
+        elif obs is not None and state is None:
+            lead = self.lead_of(obs)
+            here = value(obs) if here is None else here
+            moved = [(g, value(g.obs(obs))) for g in self.transforms(obs)]
+        else:
+            raise ValueError("value_loss takes either state or obs; give the one that the critic sees")
+        return _mean([value_consistency_loss(self.carry(g.values, x, lead, "value"), here) for g, x in moved], mask)
+
+    def action_value_loss(
+        self,
+        value: Callable[[Tensor], Tensor],
+        obs: Tensor,
+        here: Tensor | None = None,
+        mask: Tensor | None = None,
+    ) -> Tensor:
+        """Return S_Q = (Q(s, a) - Q(L_g s, K_g a))^2 over all discrete actions (supplement eq. 19), averaged.
+
+        Args:
+            value: obs [..., N, D] to one value per action [..., N, A].
+            obs: [..., N, D].
+            here: the values of the originals, where they are known already.
+            mask: [...] which rows count.
+
+        Raises:
+            ValueError: a shape that does not fit, or continuous actions.
+        """
+        if not isinstance(self.spaces.action, Discrete):
+            raise ValueError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
+        self.lead_of(obs)
+        here = value(obs) if here is None else here
+        gaps = [value_consistency_loss(g.pull_back(value(g.obs(obs))), here) for g in self.transforms(obs)]
+        return _mean(gaps, mask)
+
+    def lead_of(self, obs: Tensor) -> torch.Size:
+        """Return the leading axes of observations.
+
+        Raises:
+            ValueError: their shape or type does not fit.
+        """
+        return self._check_rows("obs", obs, self.spaces.observation, agents=self._agents)
+
+    def act(self, transform: Transform, action: Tensor, lead: torch.Size) -> Tensor:
+        """Return K_g a; shapes as of `augment`.
+
+        Raises:
+            ValueError: another shape or type, or an action outside.
+        """
+        space, axes, shape = self.spaces.action, (*lead, *self._agents), list(action.shape)
+        if not isinstance(space, Discrete):
+            if action.shape != (*axes, space.width):
+                raise ValueError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
+            return transform.action(action)
+        if action.shape == (*axes, space.count) and space.count > 1:
+            return transform.push_outputs(action)
+        if action.shape not in (axes, (*axes, 1)):
+            raise ValueError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
+        if action.is_floating_point() or action.dtype == torch.bool:
+            raise ValueError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
+        low, high = torch.aminmax(action) if action.numel() else (0, 0)
+        if low < 0 or high >= space.count:
+            outside = int(low if low < 0 else high)
+            raise ValueError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
+        return transform.action(action.reshape(axes).long()).reshape(action.shape).to(action.dtype)
+
+    def carry(self, move: Callable[[Tensor], Tensor], x: Tensor, lead: torch.Size, name: str) -> Tensor:
+        """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`.
+
+        Raises:
+            ValueError: another shape.
+        """
+        agents = (*lead, *self._agents)
+        if x.shape in (agents, (*agents, 1)) and self._agents:
+            return move(x.reshape(agents)).reshape(x.shape)
+        if x.shape in (lead, (*lead, 1)):
+            return x
+        reason = f"; {_HIDDEN}" if x.shape[: len(agents)] == agents else ""
+        raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
+
+    @property
+    def _agents(self) -> tuple[int, ...]:
+        """The agent axis, where there is one."""
+        return (self.spaces.num_agents,) if self.spaces.num_agents > 1 else ()
+
+    def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
+        key = (device, dtype)
+        if key not in self._sets:
+            self._sets[key] = transform_set(self.group, self.spaces, device, dtype)
+        return self._sets[key]
+
+    def _check_rows(
+        self, name: str, x: Tensor, layout: Layout, lead: torch.Size | None = None, agents: tuple[int, ...] = ()
+    ) -> torch.Size:
+        """Return the leading axes of rows [..., *agents, width] after checking that they are that."""
+        cut = x.dim() - 1 - len(agents)
+        found = x.shape[: max(cut, 0)]
+        if x.shape[-1:] != (layout.width,):
+            width = x.shape[-1] if x.dim() else 0
+            raise ValueError(f"{name} has rows of {width} numbers, but its layout has {layout.width}: {layout.summary}")
+        if cut < 0 or x.shape[cut:-1] != agents:
+            raise ValueError(f"{name} has shape {list(x.shape)}, but axis -2 must hold {self.spaces.num_agents} agents")
+        if lead is not None and found != lead:
+            raise ValueError(f"{name} has leading axes {list(found)}, but those of obs are {list(lead)}")
+        if not x.is_floating_point():
+            raise ValueError(f"{name} is {x.dtype}; give floating-point numbers")
+        return found
+
+
+def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
+    """Return the mean over elements, rows and agents, of the rows that count."""
+    gap = torch.stack(gaps)
+    return gap.mean() if mask is None else gap[:, mask].mean()

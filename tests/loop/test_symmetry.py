@@ -1,0 +1,261 @@
+"""The facade by hand-worked numbers: copies, losses, and what it refuses, each with a control that must differ."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from esp_cli import Continuous, Field, Items, Kind, Symmetry, discrete_moves, layout
+
+SEEN = layout(Field("velocity", Kind.VECTOR), Field("load", Kind.SCALAR))
+MOVES = discrete_moves(4)  # right, up, left, down
+FORCE = Continuous(layout(Field("force", Kind.VECTOR)))
+OTHERS = layout(Field("own", Kind.VECTOR), Field("others", Kind.VECTOR, 2, items=Items.OTHERS))
+
+
+def random(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(0))
+
+
+def quarter(num_agents: int = 1, **choice: object) -> Symmetry:
+    return Symmetry(observation=SEEN, action=MOVES, group="rot90", num_agents=num_agents, **choice)  # type: ignore[arg-type]
+
+
+def test_a_copy_turns_what_is_seen_and_done_and_keeps_the_numbers() -> None:
+    obs, action, (log_prob,) = quarter().augment(
+        torch.tensor([[1.0, 2.0, 5.0]]), torch.tensor([0]), per_agent=(torch.tensor([-0.7]),)
+    )
+    assert obs.tolist() == [[1.0, 2.0, 5.0], [-2.0, 1.0, 5.0]]
+    assert action.tolist() == [0, 1], "right becomes up"
+    assert log_prob.tolist() == pytest.approx([-0.7, -0.7])
+
+
+def test_all_copies_of_a_group_follow_their_originals() -> None:
+    symmetry = Symmetry(observation=SEEN, action=MOVES, group="c4", copies="all")
+    obs, action, () = symmetry.augment(torch.tensor([[1.0, 0.0, 5.0]]), torch.tensor([3]))
+    assert obs[:, :2].tolist() == [[1, 0], [0, 1], [-1, 0], [0, -1]]
+    assert action.tolist() == [3, 0, 1, 2]
+
+
+def test_a_state_is_all_observations_end_to_end_unless_it_says_otherwise() -> None:
+    obs, action = random(4, 2, 3), torch.zeros(4, 2, dtype=torch.int64)
+    moved, _, state, _ = quarter(2).augment(obs, action, state=obs.flatten(1))
+    assert torch.equal(state, moved.flatten(1))
+    other = quarter(2, state=layout(Field("goal", Kind.VECTOR)))
+    assert other.augment(obs, action, state=torch.tensor([[1.0, 0.0]] * 4))[2][4:].tolist() == [[0, 1]] * 4
+
+
+@pytest.mark.parametrize("lead", [(5,), (2, 5), (0,), (3, 2, 1)])
+@pytest.mark.parametrize("agents", [1, 3])
+def test_any_leading_axes_give_what_rows_give(lead: tuple[int, ...], agents: int) -> None:
+    axes = (*lead, *((agents,) if agents > 1 else ()))
+    obs, action = random(*axes, 3), torch.randint(4, axes)
+    got = quarter(agents).augment(obs, action, per_agent=(random(*axes, 1), random(*lead)), dim=len(lead) - 1)
+    want = quarter().augment(obs.reshape(-1, 3), action.reshape(-1))
+    count = math.prod(lead[-1:])
+    assert torch.equal(got[0].narrow(len(lead) - 1, count, count).reshape(-1, 3), want[0][obs[..., 0].numel() :])
+    assert torch.equal(got[1].narrow(len(lead) - 1, count, count).reshape(-1), want[1][action.numel() :])
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+def test_every_floating_type_is_turned_to_its_own_precision(dtype: torch.dtype) -> None:
+    symmetry = Symmetry(observation=SEEN, action=FORCE, group="rot30")
+    obs, action, _ = symmetry.augment(torch.tensor([[1, 0, 0]], dtype=dtype), torch.tensor([[0, 1]], dtype=dtype))
+    error = (obs[1] - torch.tensor([math.sqrt(3) / 2, 0.5, 0], dtype=torch.float64)).abs().max().item()
+    assert obs.dtype == action.dtype == dtype
+    assert error <= torch.finfo(dtype).eps
+
+
+def test_agents_that_change_places_take_their_numbers_along() -> None:
+    symmetry = Symmetry(observation=OTHERS, action=MOVES, group="agents-1-2-0", num_agents=3)
+    obs, action = random(2, 3, 6), torch.tensor([[0, 1, 2]] * 2)
+    numbers = torch.tensor([[10.0, 11.0, 12.0]] * 2)
+    moved, done, (per_agent, column, team) = symmetry.augment(
+        obs, action, per_agent=(numbers, numbers.unsqueeze(-1), numbers[:, :1])
+    )
+    assert per_agent[2].tolist() == column[2].flatten().tolist() == [12.0, 10.0, 11.0]
+    assert done[2].tolist() == [2, 0, 1]
+    assert team[2].tolist() == [10.0]
+    assert torch.equal(moved[2, 1, :2], obs[0, 0, :2])
+
+
+def test_actions_may_come_as_a_column_or_one_hot() -> None:
+    symmetry, obs, action = quarter(), random(4, 3), torch.arange(4)
+    plain = symmetry.augment(obs, action)[1]
+    assert torch.equal(symmetry.augment(obs, action.unsqueeze(-1))[1].squeeze(-1), plain)
+    one_hot = nn.functional.one_hot(action, 4)
+    assert torch.equal(symmetry.augment(obs, one_hot)[1].argmax(-1), plain)
+
+
+def test_drawn_elements_follow_the_seed_and_never_stand_still() -> None:
+    def drawn(seed: int) -> list[str]:
+        symmetry = Symmetry(observation=SEEN, action=MOVES, seed=seed)
+        return [symmetry.transforms(torch.zeros(()))[0].elements[0].name for _ in range(50)]
+
+    assert drawn(1) == drawn(1) != drawn(2)
+    assert len(set(drawn(1))) == 7
+    assert "identity" not in drawn(1)
+
+
+def test_a_policy_that_turns_with_the_scene_has_no_loss() -> None:
+    def heading(obs: Tensor) -> Tensor:
+        x, y = obs[..., 0], obs[..., 1]
+        return torch.stack([x, y, -x, -y], -1)
+
+    symmetry, obs = Symmetry(observation=SEEN, action=MOVES, copies="all"), random(6, 3)
+    assert symmetry.policy_loss(heading, obs).item() == pytest.approx(0, abs=1e-6)
+    stubborn = symmetry.policy_loss(lambda x: heading(x) + torch.tensor([1.0, 0, 0, 0]), obs)
+    assert stubborn.item() > 0.1, "a policy that prefers the right does not turn"
+
+
+def test_the_value_loss_is_the_squared_gap_and_zero_for_what_is_invariant() -> None:
+    state = torch.tensor([[1.0, 2.0, 5.0]])
+    symmetry = quarter()
+    assert symmetry.value_loss(lambda s: s[..., :2].square().sum(-1), state).item() == 0
+    assert symmetry.value_loss(lambda s: s[..., 0], state).item() == (1 - -2) ** 2
+    assert symmetry.value_loss(lambda o: o[..., :1], obs=state).item() == 9
+
+
+def test_values_of_agents_that_change_places_are_compared_with_their_own() -> None:
+    symmetry = Symmetry(observation=OTHERS, action=MOVES, group="agents", num_agents=3)
+    obs = random(4, 3, 6)
+    assert symmetry.value_loss(lambda o: o[..., 0], obs=obs).item() == 0
+    assert symmetry.value_loss(lambda o: o[..., 0] * torch.tensor([1.0, 2, 3]), obs=obs).item() > 0.1
+
+
+def test_action_values_are_pulled_back_before_they_are_compared() -> None:
+    obs, q = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[1.0, 2.0, 3.0, 4.0]])
+    # at L_g s the value of up stands for right: (2-1)^2, (3-2)^2, (4-3)^2, (1-4)^2
+    assert quarter().action_value_loss(lambda _: q, obs).item() == 12 / 4
+    assert quarter().action_value_loss(lambda o: q * 0 + o[..., 2:], obs).item() == 0
+    with pytest.raises(ValueError, match="action_value_loss needs discrete actions"):
+        Symmetry(observation=SEEN, action=FORCE).action_value_loss(lambda _: q, obs)
+
+
+def test_a_masked_row_does_not_count_and_a_known_answer_is_not_asked_again() -> None:
+    state, asked = torch.tensor([[1.0, 2.0, 5.0], [7.0, 7.0, 7.0]]), []
+
+    def value(s: Tensor) -> Tensor:
+        asked.append(s)
+        return s[..., 0]
+
+    assert quarter().value_loss(value, state, mask=torch.tensor([True, False])).item() == 9
+    assert quarter().value_loss(value, state, here=state[:, 0]).item() == (9 + 14**2) / 2
+    assert len(asked) == 3
+
+
+def test_gradients_reach_the_data_and_the_networks() -> None:
+    net, obs = nn.Linear(3, 4), random(5, 3).requires_grad_()
+    quarter().policy_loss(net, obs).backward()
+    assert net.weight.grad is not None
+    assert net.weight.grad.abs().sum() > 0
+    assert quarter().augment(obs, torch.zeros(5, dtype=torch.int64))[0].requires_grad
+
+
+def test_a_recurrent_policy_is_compared_over_its_whole_history() -> None:
+    """A running sum of the velocities turns with them: the loss is 0 on histories, and not for one that forgets."""
+    obs = random(6, 4, 3)  # [T, B, D]
+
+    def heading(history: Tensor, weight: float) -> Tensor:
+        total = history[..., :2].cumsum(0) + weight * history[..., :1]
+        return torch.cat([total, -total], -1)
+
+    symmetry = quarter()
+    assert symmetry.policy_loss(lambda h: heading(h, 0.0), obs).item() == pytest.approx(0, abs=1e-6)
+    assert symmetry.policy_loss(lambda h: heading(h, 1.0), obs).item() > 0.1
+    assert symmetry.augment(obs, torch.zeros(6, 4, dtype=torch.int64), dim=1)[0].shape == (6, 8, 3)
+
+
+def zeros(*shape: int) -> Tensor:
+    return torch.zeros(*shape, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (
+            lambda s: s.augment(random(5, 2, 4), zeros(5, 2)),
+            "obs has rows of 4 numbers, but its layout has 3: velocity",
+        ),
+        (lambda s: s.augment(random(5, 3, 3), zeros(5, 3)), r"\[5, 3, 3\], but axis -2 must hold 2 agents"),
+        (lambda s: s.augment(random(3), zeros(2)), "axis -2 must hold 2 agents"),
+        (lambda s: s.augment(random(2, 3), zeros(2)), "has 0 leading axes; copies cannot go along 0"),
+        (lambda s: s.augment(random(5, 2, 3), zeros(5, 2) + 4), "the action 4 is outside of the 4 actions, 0 to 3"),
+        (lambda s: s.augment(random(5, 2, 3), zeros(5, 2) - 1), "the action -1 is outside of the 4 actions"),
+        (lambda s: s.augment(random(5, 2, 3), random(5, 2)), "torch.float32, but indices of 4 actions are integers"),
+        (lambda s: s.augment(random(5, 2, 3), zeros(5, 3)), r"the action has shape \[5, 3\], but \[5, 2\] is needed"),
+        (lambda s: s.augment(zeros(5, 2, 3), zeros(5, 2)), "obs is torch.int64; give floating-point numbers"),
+        (
+            lambda s: s.augment(random(5, 2, 3), zeros(5, 2), state=random(5, 7)),
+            "state has rows of 7 numbers, but its layout has 6",
+        ),
+        (
+            lambda s: s.augment(random(5, 2, 3), zeros(5, 2), state=random(4, 6)),
+            r"state has leading axes \[4\], but those of obs are \[5\]",
+        ),
+        (
+            lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=(random(5, 2), random(5, 4))),
+            r"per_agent\[1\] has shape \[5, 4\], but \[5, 2\] or \[5\] is needed$",
+        ),
+        (
+            lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=(random(5, 2, 64),)),
+            "a stored hidden state cannot be transformed; give whole histories",
+        ),
+        (lambda s: s.value_loss(lambda x: x), "takes either state or obs"),
+        (lambda s: s.value_loss(lambda x: x, random(5, 6)), r"value has shape \[5, 6\], but \[5, 2\] or \[5\]"),
+        (lambda s: s.policy_loss(lambda o: o, random(5, 2, 3)), r"shape \[5, 2, 3\], but there are 4 actions"),
+        (lambda s: s.policy_loss(lambda o: (o, o), random(5, 2, 3)), "a stored hidden state cannot be transformed"),
+    ],
+)
+def test_what_does_not_fit_is_told_in_one_sentence(call, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence) as caught:
+        call(quarter(2))
+    assert "\n" not in str(caught.value)
+
+
+def test_continuous_actions_of_another_width_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"the action has shape \[5, 3\], but \[5, 2\] is needed"):
+        Symmetry(observation=SEEN, action=FORCE).augment(random(5, 3), random(5, 3))
+
+
+def test_a_group_that_the_actions_cannot_carry_is_refused() -> None:
+    with pytest.raises(ValueError, match="c8 cannot act on the task: action 'right' turned by 45 degrees is no action"):
+        Symmetry(observation=SEEN, action=MOVES, group="c8")
+    assert Symmetry(observation=SEEN, action=FORCE, group="c8")
+    with pytest.raises(ValueError, match="copies='all' needs a finite group, but 'so2' is infinite"):
+        Symmetry(observation=SEEN, action=FORCE, group="so2", copies="all")
+
+
+def test_moves_are_named_or_counted() -> None:
+    assert MOVES.names == ("right", "up", "left", "down")
+    assert discrete_moves(["stay", "left", "right"]).points == ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0))
+    assert discrete_moves(8).points[2] == pytest.approx((0, 1))
+    assert Symmetry(observation=SEEN, action=discrete_moves(8), group="d8")
+    for wrong, sentence in (
+        (["jump"], "does not know 'jump'"),
+        (0, "has no direction"),
+        (["up", "up"], "a meaning of"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            discrete_moves(wrong)
+
+
+IMPORTED = """
+import sys, torch, numpy
+before = {name.split(".")[0] for name in sys.modules}
+from esp_cli import Symmetry, Field, Kind, layout, discrete_moves
+print(sorted({name.split(".")[0] for name in sys.modules} - before - set(sys.stdlib_module_names)))
+"""
+
+
+def test_importing_it_imports_torch_and_numpy_alone() -> None:
+    done = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, check=True)
+    assert done.stdout == "['esp_cli', 'esp_envs']\n"
+    everything = IMPORTED.replace("import Symmetry", "import load_policy, Symmetry")
+    done = subprocess.run([sys.executable, "-c", everything], capture_output=True, text=True, check=True)
+    assert "pydantic" in done.stdout, "the check sees what is imported"
