@@ -1,11 +1,4 @@
-"""A symmetry for the training loop that you have: transformed copies of its data, and consistency losses.
-
-from esp_cli import Field, Kind, Symmetry, discrete_moves, layout
-
-symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
-obs, action, (log_prob, advantage) = symmetry.augment(obs, action, per_agent=(log_prob, advantage))
-loss += 0.1 * symmetry.policy_loss(policy, obs) + 0.1 * symmetry.value_loss(critic, state)
-"""
+"""A symmetry for the training loop that you have: transformed copies of its data, and consistency losses."""
 
 from __future__ import annotations
 
@@ -20,11 +13,16 @@ from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
 from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
 
-_HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
+HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
+"""What messages advise where numbers look like memory."""
 
 
 class Symmetry:
     """A known symmetry of a task, as copies of data (Eq. 7) and as losses (Eq. 8, 9) in any training loop.
+
+    symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
+    obs, action, (log_prob, advantage) = symmetry.augment(obs, action, per_agent=(log_prob, advantage))
+    loss += 0.1 * symmetry.policy_loss(policy, obs) + 0.1 * symmetry.value_loss(critic, state)
 
     Shapes: `...` stands for any leading axes, the same in all arguments of a call. Where `num_agents` is 1, the agent
     axis N is left out. Tensors may live on any device and have any floating-point type. Results are new tensors, and
@@ -65,21 +63,19 @@ class Symmetry:
     ) -> None:
         joint = joint_layout(observation, num_agents)
         self.spaces = Spaces(
-            num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="o2"
+            num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="o2*agents"
         )
         self.group, self.copies = group, copies
         self.generator = torch.Generator().manual_seed(seed)
         self._sets: dict[tuple[torch.device, torch.dtype], TransformSet] = {}
-        listed = self._set(torch.device("cpu"), torch.float32).is_finite
-        if copies == "all" and not listed:
+        if not self._set(torch.device("cpu"), torch.float32).is_finite and copies == "all":
             raise ValueError(
                 f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'"
             )
 
     def transforms(self, like: Tensor) -> list[Transform]:
         """Return the elements of one call, on the device of `like`: one that is drawn, or all."""
-        exact = torch.float64 if like.dtype == torch.float64 else torch.float32
-        chosen = self._set(like.device, exact)
+        chosen = self._set(like.device, torch.float64 if like.dtype == torch.float64 else torch.float32)
         return chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
 
     @overload
@@ -135,7 +131,7 @@ class Symmetry:
         )
         if state is None:
             return moved_obs, moved_action, numbers
-        self._check_rows("state", state, self.spaces.state, lead)
+        self.check_state(state, lead)
         return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
 
     def policy_loss(
@@ -182,7 +178,7 @@ class Symmetry:
             ValueError: a shape that does not fit.
         """
         if state is not None and obs is None:
-            lead = self._check_rows("state", state, self.spaces.state)
+            lead = self.check_state(state)
             here = value(state) if here is None else here
             moved = [(g, value(g.state(state))) for g in self.transforms(state)]
         elif obs is not None and state is None:
@@ -226,6 +222,14 @@ class Symmetry:
         """
         return self._check_rows("obs", obs, self.spaces.observation, agents=self._agents)
 
+    def check_state(self, state: Tensor, lead: torch.Size | None = None) -> torch.Size:
+        """Return the leading axes of states.
+
+        Raises:
+            ValueError: their shape or type does not fit, or the leading axes are not those of the observations.
+        """
+        return self._check_rows("state", state, self.spaces.state, lead)
+
     def act(self, transform: Transform, action: Tensor, lead: torch.Size) -> Tensor:
         """Return K_g a; shapes as of `augment`.
 
@@ -255,12 +259,12 @@ class Symmetry:
         Raises:
             ValueError: another shape.
         """
-        agents = (*lead, *self._agents)
-        if x.shape in (agents, (*agents, 1)) and self._agents:
-            return move(x.reshape(agents)).reshape(x.shape)
-        if x.shape in (lead, (*lead, 1)):
+        agents, tail = (*lead, *self._agents), x.shape[len(lead) :]
+        if x.shape[: len(lead)] == lead and tail.numel() == 1:
             return x
-        reason = f"; {_HIDDEN}" if x.shape[: len(agents)] == agents else ""
+        if x.shape in (agents, (*agents, 1)):
+            return move(x.reshape(agents)).reshape(x.shape)
+        reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
         raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
 
     @property

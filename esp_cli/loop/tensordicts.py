@@ -1,0 +1,97 @@
+"""Transformed copies of TensorDicts, whose keys say what their numbers are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from esp_cli.loop.symmetry import Symmetry
+from esp_cli.symmetry import Transform
+
+Role = Literal["observation", "state", "action", "same", "drop"]
+"""What the numbers under a key are: rows of a layout, actions (or one number per action), unchanged, left out."""
+Key = str | tuple[str, ...]
+
+ROLES: Mapping[str, Role] = {
+    "observation": "observation",
+    "obs": "observation",
+    "state": "state",
+    "action": "action",
+    "action_mask": "action",
+    "action_value": "drop",
+    "logits": "drop",
+    "loc": "drop",
+    "scale": "drop",
+    "info": "drop",
+    "index": "same",
+}
+"""The role of a key by its last part; "drop" applies to whatever lies below it too.
+
+Other keys hold numbers that go with their agents, or one for each row (rewards, dones, advantages).
+"""
+
+
+def augmented(symmetry: Symmetry, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
+    """Return a TensorDict with its transformed copies behind it, along the first axis of its batch.
+
+    Args:
+        symmetry: says what the numbers are.
+        data: TensorDict [B, ...], agents in nested groups or not, also below "next".
+        roles: of keys by their last part, where they differ from `ROLES`.
+
+    Raises:
+        ValueError: the numbers under a key do not fit, or have no role.
+    """
+    return torch.cat(with_copies(symmetry, data, roles)[0], 0)
+
+
+def with_copies(
+    symmetry: Symmetry, data: Any, roles: Mapping[str, Role] | None = None
+) -> tuple[list[Any], list[Transform]]:
+    """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
+
+    Arguments and errors as of `augmented`.
+    """
+    named: Mapping[str, Role] = {**ROLES, **(roles or {})}
+    leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
+    data = data.exclude(*(path for path in leaves if any(named.get(part) == "drop" for part in path)))
+    kept = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
+    seen = [value for path, value in kept.items() if named.get(path[-1]) in ("observation", "state")]
+    if not seen:
+        names = ", ".join(".".join(path) for path in leaves)
+        raise ValueError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
+    transforms, copies = symmetry.transforms(seen[0]), []
+    for transform in transforms:
+        copy = data.clone(False)
+        for path, value in kept.items():
+            copy.set(path, _moved(symmetry, transform, value, named.get(path[-1]), data.batch_size, ".".join(path)))
+        copies.append(copy)
+    return [data, *copies], transforms
+
+
+def _moved(
+    symmetry: Symmetry, transform: Transform, x: Tensor, role: Role | None, lead: torch.Size, name: str
+) -> Tensor:
+    """Return the numbers of one key in a copy."""
+    try:
+        if role == "observation":
+            symmetry.lead_of(x)
+            return transform.obs(x)
+        if role == "state":
+            symmetry.check_state(x)
+            return transform.state(x)
+        if role == "action":
+            # a group of one agent has an agent axis all the same
+            alone = symmetry.spaces.num_agents == 1 and x.shape[len(lead) : -1] == (1,)
+            return symmetry.act(transform, x, torch.Size((*lead, 1)) if alone else lead)
+        return x if role == "same" else symmetry.carry(transform.per_agent, x, lead, "it")
+    except ValueError as error:
+        advice = "" if role else "; name its role, 'same' or 'drop' for example"
+        raise ValueError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None
+
+
+def _path(key: Key) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key

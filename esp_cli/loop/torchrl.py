@@ -1,0 +1,165 @@
+"""TorchRL: copies in a replay buffer or collector, and a loss with the prior around `ClipPPOLoss` and its like.
+
+symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
+loss = SymmetricLoss(MAPPOLoss(actor, critic), symmetry, coefficient=0.1)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.transforms import Transform as TorchRLTransform
+from torchrl.objectives import LossModule
+
+from esp_cli.loop.divergence import Policy, policy_divergence, split_policy
+from esp_cli.loop.symmetry import Symmetry
+from esp_cli.loop.tensordicts import Role, augmented, with_copies
+from esp_cli.prior.losses import value_consistency_loss
+
+
+class SymmetricCopies(TorchRLTransform):
+    """Adds transformed copies to what a replay buffer samples, or a collector delivers (as its `postproc`).
+
+    `TensorDictReplayBuffer` refuses samples that grow; take `ReplayBuffer`, or extend it by `augmented` data.
+
+    Args:
+        symmetry: says what the numbers are.
+        roles: of keys by their last part, where they differ from `esp_cli.loop.tensordicts.ROLES`.
+    """
+
+    def __init__(self, symmetry: Symmetry, roles: Mapping[str, Role] | None = None) -> None:
+        super().__init__()
+        self.symmetry, self.roles = symmetry, roles
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the data with its copies behind it, along the first axis."""
+        return augmented(self.symmetry, tensordict, self.roles)
+
+
+class _Answers(NamedTuple):
+    """Losses, the policy's distribution (None of action values) and values [B, ...]."""
+
+    losses: TensorDictBase
+    policy: Policy
+    value: Tensor
+
+
+_TERMS = {"policy": "loss_objective", "value": "loss_critic"}
+"""Which loss of PPO each term is added to."""
+
+
+class SymmetricLoss(nn.Module):
+    """A loss of TorchRL with both parts of the prior: copies of its data, and consistency (Eq. 10).
+
+    Around `ClipPPOLoss`, `MAPPOLoss` and `IPPOLoss`, S_pi (Eq. 8) is added to "loss_objective" and S_V (Eq. 9) to
+    "loss_critic". Around `QMixerLoss`, S_Q of the mixed value (supplement eq. 19) is added to "loss". The networks are
+    asked once: what they say of the originals and of the copies is taken from the loss's own pass.
+
+    Args:
+        loss: any of these, its keys set.
+        symmetry: says what the numbers are.
+        coefficient: c of Eq. 10.
+        augment: whether the copies enter the loss itself too; without, they are compared alone. Without copies and with
+            c = 0, the loss is the plain one, bit for bit.
+        roles: of keys by their last part, where they differ from `esp_cli.loop.tensordicts.ROLES`.
+
+    Raises:
+        ValueError: the loss is of another kind.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        symmetry: Symmetry,
+        coefficient: float = 0.1,
+        augment: bool = True,
+        roles: Mapping[str, Role] | None = None,
+    ) -> None:
+        super().__init__()
+        self.mixes = hasattr(loss, "mixer_network")
+        if not self.mixes and not (hasattr(loss, "actor_network") and hasattr(loss, "critic_network")):
+            raise ValueError(f"{type(loss).__name__} is not known; give a loss of PPO's family, or QMixerLoss")
+        self.loss, self.symmetry, self.coefficient = loss, symmetry, coefficient
+        self.augment, self.roles = augment, roles
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses, with consistency inside, and "policy_symmetry" and "value_symmetry" beside them.
+
+        Args:
+            tensordict: [B, ...] as the loss takes it.
+
+        Raises:
+            ValueError: the numbers under a key do not fit.
+        """
+        if not self.augment and not self.coefficient:
+            return self.loss(tensordict)
+        parts, transforms = with_copies(self.symmetry, self._needed(tensordict), self.roles)
+        batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
+        said = [self._ask(batch) for batch in batches]
+        losses, size = said[0].losses, len(tensordict)
+        if (priority := self._priority_key) in batches[0].keys(True):
+            tensordict.set(priority, batches[0].get(priority)[:size])
+        gaps = {}
+        if not self.mixes:
+            here, *there = (part for answer in said for part in split_policy(answer.policy, size))
+            gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
+        own, *moved = (part for answer in said for part in answer.value.split(size))
+        gaps["value"] = [
+            value_consistency_loss(self.symmetry.carry(g.values, v, tensordict.batch_size, "the value"), own)
+            for g, v in zip(transforms, moved, strict=True)
+        ]
+        for name, gap in gaps.items():
+            mean = torch.stack(gap).mean()
+            losses.set(f"{name}_symmetry", mean.detach())
+            key = "loss" if self.mixes else _TERMS[name]
+            losses.set(key, losses.get(key) + self.coefficient * mean)
+        return losses
+
+    def _needed(self, data: TensorDictBase) -> TensorDictBase:
+        """Return what the loss reads: with advantages at hand, PPO needs nothing of the next step."""
+        keys = self.loss.tensor_keys
+        if self.mixes or keys.advantage not in data.keys(True):
+            return data
+        read = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
+        read += [keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value]
+        return data.select(*read, strict=False)
+
+    @property
+    def _priority_key(self) -> Any:
+        return getattr(self.loss.tensor_keys, "priority", "td_error")
+
+    def _ask(self, data: TensorDictBase) -> _Answers:
+        """Return the losses of data, and what the networks said of it on the way."""
+        policy: Policy = None
+        value: Tensor | None = None
+        critic = self.loss.mixer_network if self.mixes else self.loss.critic_network
+        key = self.loss.tensor_keys.global_value if self.mixes else self.loss.tensor_keys.value
+
+        def hear_value(_: nn.Module, __: Any, output: TensorDictBase) -> None:
+            nonlocal value
+            if value is None or output.get(key).requires_grad:  # not what targets are made of
+                value = output.get(key)
+
+        hook = critic.register_forward_hook(hear_value)
+        actor: Any = None if self.mixes else self.loss.actor_network
+
+        def hear_policy(tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Policy:
+            nonlocal policy
+            policy = type(actor).get_dist(actor, tensordict, *args, **kwargs)
+            return policy
+
+        if actor is not None:
+            actor.get_dist = hear_policy
+        try:
+            losses = self.loss(data)
+        finally:
+            hook.remove()
+            if actor is not None:
+                del actor.get_dist
+        if value is None:
+            raise ValueError(f"{type(self.loss).__name__} did not ask its critic; give it one")
+        return _Answers(losses, policy, value)
