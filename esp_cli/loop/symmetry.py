@@ -140,8 +140,7 @@ class Symmetry:
         """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), averaged over rows, agents and elements.
 
         Args:
-            policy: obs [..., N, D] to a distribution of actions, or to a tensor; see `policy_divergence` for which are
-                known, and where the divergence is exact.
+            policy: obs [..., N, D] to a distribution of actions, or to a tensor, as `policy_divergence` knows them.
             obs: [..., N, D]; of a recurrent policy, whole histories.
             here: what the policy says of `obs`, where it is known already; detached, it stays fixed.
             mask: [...] which rows count.
@@ -190,11 +189,7 @@ class Symmetry:
         return _mean([value_consistency_loss(self.carry(g.values, x, lead, "value"), here) for g, x in moved], mask)
 
     def action_value_loss(
-        self,
-        value: Callable[[Tensor], Tensor],
-        obs: Tensor,
-        here: Tensor | None = None,
-        mask: Tensor | None = None,
+        self, value: Callable[[Tensor], Tensor], obs: Tensor, here: Tensor | None = None, mask: Tensor | None = None
     ) -> Tensor:
         """Return S_Q = (Q(s, a) - Q(L_g s, K_g a))^2 over all discrete actions (supplement eq. 19), averaged.
 
