@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from esp_cli.deploy.library import LoadedPolicy, load_policy
     from esp_cli.loop.symmetry import Symmetry
-    from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, discrete_moves, layout
+    from esp_envs.moves import discrete_moves
+    from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, layout
 
 __all__ = [
     "Continuous",
@@ -29,6 +30,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "LoadedPolicy": "esp_cli.deploy.library",
     "Symmetry": "esp_cli.loop.symmetry",
+    "discrete_moves": "esp_envs.moves",
     "load_policy": "esp_cli.deploy.library",
 }
 """Where a public name is defined; the others describe spaces."""

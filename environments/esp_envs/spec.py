@@ -217,30 +217,6 @@ class Continuous:
 ActionSpace = Discrete | Continuous
 
 RIGHT, LEFT, DOWN, UP = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
-_MOVES = {"stay": (0.0, 0.0), "right": RIGHT, "up": UP, "left": LEFT, "down": DOWN}
-
-
-def discrete_moves(moves: int | Sequence[str]) -> Discrete:
-    """Return the actions of an agent that moves in one of some directions of the plane.
-
-    Args:
-        moves: how many directions, counter-clockwise from the right (4: right, up, left, down), or their names in the
-            order of the action's index, of "stay", "right", "up", "left" and "down".
-
-    Raises:
-        ValueError: an unknown or repeated name, or no direction.
-    """
-    if isinstance(moves, int):
-        if moves < 1:
-            raise ValueError(f"discrete_moves({moves}) has no direction; give 1 or more, or names")
-        if moves == 4:
-            return discrete_moves(tuple(_MOVES)[1:])
-        angles = [2 * math.pi * k / moves for k in range(moves)]
-        names = tuple(f"{360 * k / moves:g} degrees" for k in range(moves))
-        return Discrete(Kind.VECTOR, tuple((math.cos(a), math.sin(a)) for a in angles), names)
-    if unknown := [name for name in moves if name not in _MOVES]:
-        raise ValueError(f"discrete_moves does not know '{unknown[0]}'; write {', '.join(_MOVES)}, or a number")
-    return Discrete(Kind.VECTOR, tuple(_MOVES[name] for name in moves), tuple(moves))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ MOVES = discrete_moves(4)
 
 def element(name: str, action: ActionSpace, num_agents: int = 1) -> Transform:
     state = layout(Field("agents", Kind.VECTOR, num_agents, items=Items.AGENTS))
-    spaces = Spaces(num_agents=num_agents, observation=SEEN, state=state, action=action, symmetry="o2")
+    spaces = Spaces(num_agents=num_agents, observation=SEEN, state=state, action=action, symmetry="o2*agents")
     return transform_set(name, spaces).each()[0]
 
 

@@ -239,7 +239,7 @@ def test_moves_are_named_or_counted() -> None:
     for wrong, sentence in (
         (["jump"], "does not know 'jump'"),
         (0, "has no direction"),
-        (["up", "up"], "a meaning of"),
+        (["up", "up"], "twice 'up'"),
     ):
         with pytest.raises(ValueError, match=sentence):
             discrete_moves(wrong)
