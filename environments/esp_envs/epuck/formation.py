@@ -21,17 +21,14 @@ from esp_envs.base import (
 )
 from esp_envs.epuck import steering
 from esp_envs.epuck.engines import make_physics
-from esp_envs.epuck.formation_spec import LEVELS, WHEEL_PAIRS, FormationSettings, formation_spec
+from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
+from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
 from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness
 from esp_envs.lockstep import LockstepTask, Outcome
 
-RISKY_GAP_M = 0.05
-"""Gap between two robots below which a state is risky (supplement of the paper)."""
-CONTACT_GAP_M = 0.001
-"""Gap below which two bodies count as touching."""
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
@@ -111,6 +108,7 @@ class Formation(LockstepTask):
         self._own = torch.eye(settings.num_agents, others, dtype=torch.bool)
         radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
         self._reach = torch.tensor(radii, dtype=torch.float64) + BODY_RADIUS_M
+        self._contact = self._reach + CONTACT_GAP_M
         pose = torch.cat([posts, torch.zeros(*robots, 1, dtype=torch.float64)], -1)
         self._place(pose, torch.zeros_like(pose))
 
@@ -147,13 +145,13 @@ class Formation(LockstepTask):
         self.physics.place(Bodies(*(part.numpy() for part in parts)))
         self._arrived.zero_()
         self._look()
-        self._touching = self._touches()
+        self._touching = self._apart < self._contact
 
     def _play(self, action: Tensor) -> Outcome:
         before, distance_before = self._position, self._distance
         self.physics.advance(self._wheel_speeds(action).numpy())
         self._look()
-        reward = self._reward(distance_before)
+        reward = step_reward(self.settings, distance_before - self._distance, self._apart)
         ended = self._time + 1 == self.spec.horizon
         metrics = self._measure((self._position - before).norm(dim=-1), ended)
         return self._per_world(reward), {name: self._per_world(value) for name, value in metrics.items()}
@@ -180,17 +178,6 @@ class Formation(LockstepTask):
         # hypot: MKL's square root wakes threads for a handful of numbers and took a third of a step
         self._apart = torch.hypot(*self._ways.unbind(-1)).masked_fill_(self._own, torch.inf)
 
-    def _touches(self) -> Tensor:
-        """Return which bodies touch each robot: [W, N, N + M]."""
-        return self._apart < self._reach + CONTACT_GAP_M
-
-    def _reward(self, distance_before: Tensor) -> Tensor:
-        """Return g_i + c_i: [W, N]."""
-        near = self._apart < self.settings.radius
-        count = near.any(-1).double() if self.settings.penalty_counts == "any" else near.sum(-1).double()
-        progress = distance_before - self._distance
-        return self.settings.progress_weight * progress - self.settings.penalty * count
-
     def _measure(self, way: Tensor, ended: bool) -> dict[str, Tensor]:
         """Return the metrics of the step just made, each [W].
 
@@ -198,21 +185,12 @@ class Formation(LockstepTask):
             way: [W, N] length of every robot's way in this step, m.
             ended: whether this was the last step.
         """
-        robots = self.settings.num_agents
         here = self._distance < self.settings.arrival_radius_m
         new, self._arrived = here & ~self._arrived, here | self._arrived
-        touching = self._touches()
-        begun = touching & ~self._touching
-        self._touching = touching
-        risky = self._apart[..., :robots] < RISKY_GAP_M + 2 * BODY_RADIUS_M
-        return {
-            "arrival_rate": new.double().mean(-1),
-            "time_to_arrival_s": (~self._arrived).double().mean(-1) * self.settings.control_period_s,
-            "collisions": begun[..., :robots].sum((1, 2)) / 2 + begun[..., robots:].sum((1, 2)),
-            "risky_rate": risky.any(-1).any(-1).double(),
-            "path_length_m": way.mean(-1),
-            "final_distance_m": self._distance.mean(-1) * ended,
-        }
+        touching = self._apart < self._contact
+        begun, self._touching = touching & ~self._touching, touching
+        final_distance = self._distance * ended
+        return step_metrics(self.settings, new, self._arrived, begun, self._apart, way, final_distance)
 
     def _seen(self) -> Observation:
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
@@ -309,8 +287,7 @@ class Formation(LockstepTask):
         wheels = steering.towards(wish, self._heading, self.settings.control_period_s)
         lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
         if self.settings.actions == "discrete":
-            level = ((wheels + 1) * 5).round().long()
-            return (level[..., 0] * len(LEVELS) + level[..., 1]).view(lead).to(self.device)
+            return nearest_pair(wheels).view(lead).to(self.device)
         return wheels.float().view(*lead, 2).to(self.device)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:

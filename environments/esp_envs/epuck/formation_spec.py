@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field as Setting
 from pydantic import model_validator
+from torch import Tensor
 
 from esp_envs.base import TaskSettings
 from esp_envs.epuck.arena import Arena
@@ -144,3 +145,9 @@ def _observation_layout(settings: FormationSettings) -> Layout:
         # Sorted by distance, so that no permutation of the robots moves them.
         fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, unit))
     return layout(*fields)
+
+
+def nearest_pair(wheels: Tensor) -> Tensor:
+    """Return the index [...] of the action nearest to wheel speeds [..., 2] in [-1, 1]."""
+    level = ((wheels + 1) * 5).round().long()
+    return level[..., 0] * len(LEVELS) + level[..., 1]
