@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -18,6 +19,7 @@ from esp_cli.commands.options import (
 
 if TYPE_CHECKING:
     from esp_cli.deploy.export import Exported
+    from esp_cli.deploy.manifest import Entry
     from esp_cli.training.loading import TrainedPolicy
 
 EPILOG = """Examples:\n
@@ -76,11 +78,7 @@ def export(
         console.note(text)
     if "policy" in formats:
         entry = bundle(trained, out, episodes, seed, name)
-        low, high = entry.score.ci95
-        console.note(
-            f"{entry.name}: seed {entry.seed} of {entry.chosen_from}, return {entry.score.mean:.2f} "
-            f"[{low:.2f}, {high:.2f}] over {entry.score.episodes} episodes -> {out / entry.file}"
-        )
+        _announce(entry, out)
         if json is not None:
             console.write_json(json, entry.model_dump(mode="json"))
         return
@@ -91,6 +89,14 @@ def export(
         console.note(f"{out} has a README, and the worked example in policy.json")
     if json is not None:
         console.write_json(json, exported)
+
+
+def _announce(entry: Entry, out: Path) -> None:
+    low, high = entry.score.ci95
+    console.note(
+        f"{entry.name}: seed {entry.seed} of {entry.chosen_from}, return {entry.score.mean:.2f} "
+        f"[{low:.2f}, {high:.2f}] over {entry.score.episodes} episodes -> {out / entry.file}"
+    )
 
 
 def _best(trained: TrainedPolicy, episodes: int) -> int:

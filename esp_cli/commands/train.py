@@ -85,22 +85,24 @@ def train(
 
     if resume is not None:
         _refuse_beside_resume(context)
-        folder = RunFolder.open(resume)
-    else:
-        chosen = {
-            "prior.kind": prior,
-            "prior.transforms": transforms,
-            "prior.consistency_coef": consistency_coef,
-            "network.name": network,
-            "task.physics": physics,
-        }
-        given = {name: value for name, value in chosen.items() if value is not None}
-        overrides = {**given, **parse_assignments(settings or [])}
-        config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), overrides)
-        build_learner(config)  # refuses settings that do not fit together before a run folder exists
-        name = f"{task}-{algo}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
-        folder = RunFolder.create(out or Path("runs") / name, config.model_dump(mode="json"))
+        train_folder(RunFolder.open(resume), tensorboard)
+        return
+    chosen = {
+        "prior.kind": prior,
+        "prior.transforms": transforms,
+        "prior.consistency_coef": consistency_coef,
+        "network.name": network,
+        "task.physics": physics,
+    }
+    overrides = {name: value for name, value in chosen.items() if value is not None} | parse_assignments(settings or [])
+    config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), overrides)
+    build_learner(config)  # refuses settings that do not fit together before a run folder exists
+    folder = RunFolder.create(out or _new_folder(config), config.model_dump(mode="json"))
     train_folder(folder, tensorboard)
+
+
+def _new_folder(config: RunConfig) -> Path:
+    return Path("runs") / f"{config.task}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:

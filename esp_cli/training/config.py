@@ -102,23 +102,12 @@ def resolve_config(
     Raises:
         ValueError: an unknown name or a value out of range, in one sentence.
     """
-    if algorithm not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm '{algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
-    presets = PRESETS.get(algorithm, {"default": {}})
-    if preset not in presets:
-        raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(presets)}")
-    names = {"task": "task", algorithm: algorithm, "network": "network", "prior": "prior", "evaluation": "evaluation"}
-    sections: dict[str, dict[str, object]] = {name: {} for name in names}
-    asked = ALGORITHMS[algorithm].task_settings
-    sections["task"] = {name: asked[name] for name in asked if name in task_class(task).Settings.model_fields}
-    tuned = TUNED.get(algorithm, {}).get(task, {}) if preset == "default" else {}
-    for layer in (presets[preset], tuned):
-        for section, values in layer.items():
-            sections[section].update(values)
+    sections = _preset_sections(task, algorithm, preset)
     for dotted, value in (overrides or {}).items():
         section, dot, key = dotted.partition(".")
         if not dot or section not in sections:
-            raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {', '.join(names)}")
+            known = ", ".join(sections)
+            raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {known}")
         sections[section][key] = read = _read(value)
         if isinstance(read, float) and not math.isfinite(read):
             raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
@@ -145,6 +134,28 @@ def resolve_config(
         "device": device,
     }
     return validated(RunConfig, values, "run")
+
+
+def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:
+    """Return the settings, by section, that a preset and the task change.
+
+    Raises:
+        ValueError: there is no such algorithm, or it has no such preset.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm '{algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    presets = PRESETS.get(algorithm, {"default": {}})
+    if preset not in presets:
+        raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(presets)}")
+    asked = ALGORITHMS[algorithm].task_settings
+    known = task_class(task).Settings.model_fields
+    sections: dict[str, dict[str, object]] = {"task": {name: asked[name] for name in asked if name in known}}
+    sections |= {name: {} for name in (algorithm, "network", "prior", "evaluation")}
+    tuned = TUNED.get(algorithm, {}).get(task, {}) if preset == "default" else {}
+    for layer in (presets[preset], tuned):
+        for section, values in layer.items():
+            sections[section].update(values)
+    return sections
 
 
 def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str, Any]:
