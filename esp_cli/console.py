@@ -178,7 +178,7 @@ class TrainingProgress:
 
         Args:
             done: steps per seed so far, those before a resume included.
-            metrics: the latest values to show beside the bar; those told earlier stay until told anew.
+            metrics: the latest values to show beside the bar; earlier ones stay until a new value is told.
         """
         now = self._clock()
         self._done = done

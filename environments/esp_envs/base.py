@@ -45,7 +45,7 @@ class Step:
         truncated: [S, E] bool; the horizon cut the episode: bootstrap from `final`.
         final: the last observation of the episodes that ended in this step (elsewhere equal to `next`), or None
             where no world can have ended; known without looking at the device.
-        metrics: task measures of this step, each [S, E] float32; whoever evaluates averages them over an episode, or
+        metrics: task measures of this step, each [S, E] float32; an evaluation averages them over an episode, or
             adds up those that `spec.totals` names.
     """
 
@@ -266,7 +266,7 @@ class Scene:
 
 
 class Painter(Protocol):
-    """Whoever draws scenes.
+    """What draws scenes.
 
     Attributes:
         note: a sentence for the user about how it draws, or None.

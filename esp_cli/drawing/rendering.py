@@ -84,7 +84,7 @@ def record(
             observation = step.next
             ended = bool((step.terminated | step.truncated)[world])
             if ended and step.final is not None:
-                env.set_state(step.final.state)  # the world has begun anew by itself; show how it ended
+                env.set_state(step.final.state)  # the world has reset itself; show how the episode ended
             scenes.append(env.scene(world))
             if ended:
                 break

@@ -93,7 +93,7 @@ class Network(nn.Module, ABC):
 
         Args:
             x: [S, B, T, in].
-            truncation: cut the gradient through time every so many steps; 0 never does.
+            truncation: steps after which the gradient through time is cut; 0 never cuts it.
 
         Returns:
             y: [S, B, T, out].

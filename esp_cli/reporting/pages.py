@@ -23,7 +23,7 @@ _BLOCK = re.compile(
 
 
 def filled(page: Path) -> str:
-    """Return the text of a page with every such table computed anew.
+    """Return the text of a page with every such table recomputed.
 
     Raises:
         ValueError: the page, a file or a table is not there, or a file is damaged.

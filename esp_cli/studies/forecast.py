@@ -1,4 +1,4 @@
-"""What is left of a study: time and disk of each of its runs, and of them all on so many cores."""
+"""What is left of a study: time and disk of each run, and of all runs on a number of cores."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ class Scheduler:
         else:
             run.status, arguments = "training", ["train", "--resume", path]
         try:
-            if run.status != "training":  # a damaged evaluation is made anew, and a link there is not followed
+            if run.status != "training":  # a damaged evaluation is made again, and a link there is not followed
                 remove_file(folder.evaluation_path(cell))
             run.job = self.engine.start(arguments, folder.log_path(cell))
         except OSError as error:

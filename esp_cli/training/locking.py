@@ -44,7 +44,7 @@ def acquire(file: Path) -> int:
 
 
 def is_held(file: Path) -> bool:
-    """Return whether a process holds a lock; only for whoever alone may start those that take it."""
+    """Return whether a process holds a lock; only for a caller that alone starts the processes that take it."""
     try:
         descriptor = os.open(file, os.O_RDONLY)
     except OSError:

@@ -54,7 +54,7 @@ class MetricsWriter:
         path: the JSONL file; made if missing.
         tensorboard: folder for TensorBoard event files, or None. It gets the mean over seeds, and a sub-folder
             ``seed-k`` per seed, which TensorBoard lays over the mean under the same name.
-        first_step: rows of TensorBoard from this step on are hidden, as a resumed run writes them anew.
+        first_step: rows of TensorBoard from this step on are hidden, as a resumed run writes them again.
 
     Raises:
         MetricsError: the file cannot be opened, or TensorBoard is asked for and not installed.

@@ -89,7 +89,7 @@ class RunFolder:
 
     @property
     def tensorboard_path(self) -> Path:
-        """The folder for TensorBoard, made by whoever writes there."""
+        """The folder for TensorBoard, made by its writer."""
         return self.path / "tensorboard"
 
     @classmethod
@@ -99,7 +99,7 @@ class RunFolder:
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
             config: resolved configuration, JSON-able; the keys ``format`` and ``version`` are the folder's own.
-            force: start an existing run anew: its metrics, checkpoints and policy go, other files stay.
+            force: restart an existing run: its metrics, checkpoints and policy go, other files stay.
 
         Raises:
             RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
@@ -289,7 +289,7 @@ def _refuse_taken(path: Path, force: bool) -> None:
             raise RunFolderError(
                 f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
             )
-        # forcing starts a run anew; it is no licence to write over somebody else's configuration
+        # forcing restarts a run; it must not overwrite another run's configuration
         RunFolder.open(path)
         return
     foreign = sorted(entry.name for entry in path.iterdir() if not _is_leftover(entry))

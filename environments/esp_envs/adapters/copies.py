@@ -97,7 +97,7 @@ class Board:
 
 
 class Stepper(Protocol):
-    """Whoever resets and steps the copies of a board that are `active`."""
+    """What resets and steps the copies of a board that are `active`."""
 
     def reset(self) -> None:
         """Start an episode in the active copies."""

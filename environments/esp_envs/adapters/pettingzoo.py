@@ -38,7 +38,7 @@ from esp_envs.base import (
 from esp_envs.spec import Discrete, TaskSpec, joint_layout
 
 _FEW_COPIES = 8
-"""Up to so many copies, worker processes cost more than they bring."""
+"""Up to this number of copies, worker processes cost more time than they save."""
 
 
 class ParallelSettings(TaskSettings):

@@ -63,7 +63,7 @@ def worlds_do_not_touch_each_other(subject: Subject) -> None:
 
 
 def results_are_memory_of_their_own(subject: Subject) -> None:
-    """Whoever overwrites a result or an action changes neither the simulation nor another result."""
+    """Overwriting a result or an action changes neither the simulation nor another result."""
     env, twin = subject.worlds(), subject.worlds()
     env.reset()
     start = twin.reset()
@@ -140,7 +140,7 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
 
 
 def set_state_starts_an_episode(subject: Subject) -> None:
-    """The clock begins anew, and a state of another width is refused."""
+    """The clock starts at 0, and a state of another width is refused."""
     env = subject.worlds()
     require_set_state(env)
     observation = env.reset()

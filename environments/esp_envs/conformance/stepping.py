@@ -62,7 +62,7 @@ def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -
 
 
 def episodes_end_together_at_the_horizon(subject: Subject) -> None:
-    """Where no world ends of its own: truncated in the last step alone, then elsewhere, and anew after a reset."""
+    """Where no world ends of its own: truncated in the last step alone, then elsewhere, and again after a reset."""
     env = subject.worlds()
     if env.spec.terminates:
         raise NotAsked("each world ends for itself")

@@ -7,7 +7,7 @@ into another is taken back in the same time step.
 The state of a world is an array; a Chipmunk space is only what turns it into the next one. Chipmunk remembers contact
 impulses and corrections of the step before, and searches trees whose shape is history; so that nothing but the array
 counts, each control period begins with one step with everything far apart, which drops both, and shapes are found on a
-grid that is filled anew at every step.
+grid that is filled again at every step.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, 
 
 TIMESTEP_S = 0.01
 ITERATIONS = 100
-"""Of the solver, which treats contacts in turn: so many that their order leaves no trace."""
+"""Iterations of the solver, which treats contacts in turn; with these many their order does not matter."""
 CONTACT_SLOP_M = 1e-4
 """Overlap that is left alone."""
 WALL_THICKNESS_M = 1.0

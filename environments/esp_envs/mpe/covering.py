@@ -74,7 +74,7 @@ def shared_out(position: Tensor, landmark: Tensor) -> Tensor:
 
     An agent with one landmark goes to it; with two, to the nearest point between them (every point of the segment has
     the same sum of distances); with more, to the one of them with the least sum of distances. Among all sharings the
-    one with the least remaining distance plus TRAVEL_WEIGHT times the way there is taken.
+    one with the least remaining distance plus TRAVEL_WEIGHT times the distance to travel is taken.
 
     Args:
         position: [N, 2, W].

@@ -60,7 +60,7 @@ class NavigationSettings(ParticleSettings):
 class Navigation(ParticleTask):
     """Cooperative navigation, MPE's `simple_spread`.
 
-    N agents (discs of radius 0.15, mass 1) shall between them stand on L landmarks and not touch each other. The plane
+    N agents (discs of radius 0.15, mass 1) cover L landmarks together and avoid contact. The plane
     is unbounded; lengths have no physical unit, a step is 0.1 s. The physics stands in `esp_envs.mpe.particles`.
 
     Actions:

@@ -80,8 +80,8 @@ class ParticleWorlds:
         squared_contact_distance: [contacts, W'] of the pairs in `bodies.contacts`, for the present positions.
         squared_watched_distance: [watched, W'] of the pairs in `bodies.watched`.
 
-    All of these stay the same memory for good, so that a task may keep views of them. Whoever writes to `physics` calls
-    `measure` afterwards.
+    All of these stay the same memory for good, so that a task may keep views of them. Code that writes to
+    `physics` calls `measure` afterwards.
     """
 
     def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:

@@ -57,7 +57,7 @@ class PredatorPrey(ParticleTask):
             below 1, then min(exp(2u - 2), 10).
 
     Prey, when the predators learn:
-        random: one of the five moves drawn anew each step; with continuous actions no-op with probability 1/5, else
+        random: one of the five moves, drawn at each step; with continuous actions no-op with probability 1/5, else
             full force in a uniform direction. All are drawn at the start of an episode: `prey_moves`.
         fleeing: runs from the nearest predator, and back to the origin when farther than 0.9 from it.
         still: exerts no force (it can be pushed).
@@ -187,7 +187,7 @@ class PredatorPrey(ParticleTask):
         self._prey_plan[:, :, lanes] = plan
 
     def _drive(self) -> None:
-        """Set the controls of whoever does not learn."""
+        """Set the controls of the bodies that do not learn."""
         predators = self.settings.num_predators
         if self._prey_learns:
             self._control[:predators] = self._as_control(self._chase())

@@ -1,4 +1,4 @@
-"""Wildlife monitoring (van der Pol et al., 2022): drones on a torus of cells trap a poacher between them."""
+"""Wildlife monitoring (van der Pol et al., 2022): drones on a torus of cells trap a poacher together."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class Wildlife(Environment):
         )
 
     def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode; the plan stays, and begins anew."""
+        """Put every world into a global state at the start of an episode; the plan stays and restarts."""
         require_shape("state", state, self.state_shape)
         self._clock = 0
         self._time.zero_()
