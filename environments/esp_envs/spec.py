@@ -166,6 +166,11 @@ def layout(*fields: Field) -> Layout:
     return Layout(tuple(fields))
 
 
+def filled_layout(*fields: Field) -> Layout:
+    """Build a layout from those of the fields that have items."""
+    return layout(*(field for field in fields if field.count))
+
+
 def joint_layout(observation: Layout, num_agents: int) -> Layout:
     """Return the layout of all agents' observations one after the other (width N * D)."""
     return Layout(tuple(replace(f, name=f"agent{i}.{f.name}") for i in range(num_agents) for f in observation.fields))

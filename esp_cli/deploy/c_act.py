@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
+from esp_cli.deploy import layers
 from esp_cli.deploy.c_parts import literal
-from esp_cli.deploy.program import (
-    SQUASH_EPSILON,
-    Activation,
-    Affine,
-    Convolution,
-    Layer,
-    MessageAggregation,
-    Norm,
-    Program,
-    Recurrent,
-    Slice,
-)
+from esp_cli.deploy.program import Program
 
 
 def seen(program: Program) -> str:
@@ -84,22 +74,22 @@ class _Row:
         self.name, self.other = self.other, self.name
 
 
-def _layer_lines(k: int, layer: Layer, row: _Row) -> list[str]:
-    if isinstance(layer, Activation):
+def _layer_lines(k: int, layer: layers.Layer, row: _Row) -> list[str]:
+    if isinstance(layer, layers.Activation):
         return [row.each(f"apply_{layer.name}({row.here}, {layer.width});")]
-    if isinstance(layer, Norm):
+    if isinstance(layer, layers.Norm):
         return [row.each(f"normalise(w{k}_0, w{k}_1, {layer.weight.size}, {row.here});")]
-    if isinstance(layer, Recurrent):
+    if isinstance(layer, layers.Recurrent):
         return _recur_lines(k, layer, row.name)
-    if isinstance(layer, Slice):
+    if isinstance(layer, layers.Slice):
         moved = f"memmove({row.here}, {row.here} + {layer.begin}, sizeof(float) * {layer.end - layer.begin});"
         return [row.each(moved)] if layer.begin else []
-    if isinstance(layer, MessageAggregation):
+    if isinstance(layer, layers.MessageAggregation):
         line = f"    aggregate(observation + {layer.begin}, {layer.width}, {row.name}, {row.other});"
-    elif isinstance(layer, Affine):
+    elif isinstance(layer, layers.Affine):
         inputs, outputs = layer.weight.shape
         line = row.each(f"affine(w{k}_0, w{k}_1, {inputs}, {outputs}, {row.here}, {row.there});")
-    elif isinstance(layer, Convolution):
+    elif isinstance(layer, layers.Convolution):
         shape = f"{layer.channels}, {layer.rows}, {layer.columns}, {layer.side}, {layer.stride}, {layer.outputs}"
         line = row.each(f"convolve(w{k}_0, w{k}_1, {shape}, {row.here}, {row.there});")
     else:
@@ -108,7 +98,7 @@ def _layer_lines(k: int, layer: Layer, row: _Row) -> list[str]:
     return [line]
 
 
-def _recur_lines(k: int, layer: Recurrent, here: str) -> list[str]:
+def _recur_lines(k: int, layer: layers.Recurrent, here: str) -> list[str]:
     inputs, wide = layer.input.weight.shape
     return [
         f"    affine(w{k}_0, w{k}_1, {inputs}, {wide}, {here}, into);",
@@ -131,7 +121,7 @@ def _squash_lines(program: Program, here: str) -> list[str]:
     lines, place = [], 0
     for width in program.groups:
         squares = " + ".join(f"{here}[{i}] * {here}[{i}]" for i in range(place, place + width))
-        lines.append(f"    length = sqrtf({squares} + {literal(SQUASH_EPSILON)});")
+        lines.append(f"    length = sqrtf({squares} + {literal(layers.SQUASH_EPSILON)});")
         lines.append(
             f"    for (k = {place}; k < {place + width}; k++) action[k] = {here}[k] * (tanhf(length) / length);"
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from esp_cli.deploy.program import NORM_EPSILON, Convolution, Floats, GlobalMaxPool, MessageAggregation, Norm
+from esp_cli.deploy.layers import NORM_EPSILON, Convolution, Floats, GlobalMaxPool, MessageAggregation, Norm
 
 AFFINE = """static void affine(const float *weight, const float *bias, int inputs, int outputs,
                    const float *x, float *y)

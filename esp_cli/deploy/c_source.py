@@ -5,16 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from esp_cli.deploy import c_parts
+from esp_cli.deploy import c_parts, layers
 from esp_cli.deploy.c_act import act_function, seen, signature
 from esp_cli.deploy.c_parts import array, numbers
-from esp_cli.deploy.program import (
-    Activation,
-    Affine,
-    Convolution,
-    MessageAggregation,
-    Program,
-)
+from esp_cli.deploy.program import Program
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 """The source compiles without warnings under these."""
@@ -67,9 +61,9 @@ class _Scratch:
     @property
     def row(self) -> int:
         widths = [self.program.num_inputs + self.program.previous, self.program.num_outputs, self.program.hidden]
-        widths += [layer.weight.shape[1] for layer in self.program.layers if isinstance(layer, Affine)]
-        widths += [layer.weight.shape[0] for layer in self.program.layers if isinstance(layer, Affine)]
-        widths += [layer.width for layer in self.program.layers if isinstance(layer, Convolution)]
+        widths += [layer.weight.shape[1] for layer in self.program.layers if isinstance(layer, layers.Affine)]
+        widths += [layer.weight.shape[0] for layer in self.program.layers if isinstance(layer, layers.Affine)]
+        widths += [layer.width for layer in self.program.layers if isinstance(layer, layers.Convolution)]
         return max(widths)
 
     @property
@@ -182,7 +176,7 @@ def _outputs(program: Program) -> str:
 
 def _source(program: Program, scratch: _Scratch) -> str:
     kinds = {type(layer) for layer in program.layers}
-    names = {layer.name for layer in program.layers if isinstance(layer, Activation)}
+    names = {layer.name for layer in program.layers if isinstance(layer, layers.Activation)}
     parts = ['#include "policy.h"\n\n#include <math.h>\n#include <string.h>\n']
     parts += [array(f"w{k}_{i}", a) for k, layer in enumerate(program.layers) for i, a in enumerate(layer.arrays)]
     row = str(scratch.row)
@@ -196,7 +190,7 @@ def _source(program: Program, scratch: _Scratch) -> str:
     parts.append(c_parts.AFFINE)
     parts += [c_parts.ACTIVATIONS[name] for name in sorted(names)]
     parts += [code for kind, code in c_parts.LAYERS.items() if kind in kinds]
-    parts += [c_parts.aggregate(layer) for layer in program.layers if isinstance(layer, MessageAggregation)][:1]
+    parts += [c_parts.aggregate(layer) for layer in program.layers if isinstance(layer, layers.MessageAggregation)][:1]
     parts += [c_parts.RECUR.replace("HIDDEN", str(program.hidden))] if program.hidden else []
     parts += [c_parts.CHOOSE] if program.head == "choose" else []
     parts.append(act_function(program))

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from esp_cli.deploy.c_source import FLAGS
+from esp_cli.deploy.layers import Floats
 from esp_cli.deploy.onnx_file import library
-from esp_cli.deploy.program import Floats, Program
+from esp_cli.deploy.program import Program
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy

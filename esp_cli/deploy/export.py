@@ -83,18 +83,6 @@ class _Job:
         return json.dumps(self.description)
 
 
-def _onnx(job: _Job) -> Files:
-    return {"policy.onnx": onnx_model(job.program, job.text)}
-
-
-def _torch(job: _Job) -> Files:
-    return {"policy.pt2": torch_archive(job.program, job.text)}
-
-
-def _numpy(job: _Job) -> Files:
-    return {"policy.py": numpy_source(job.program, job.comment, job.text).encode()}
-
-
 def _c(job: _Job) -> Files:
     written, example = c_source(job.program, job.comment), job.description["example"]
     observation, action = (np.ravel(example[name]).tolist() for name in ("observation", "action"))
@@ -105,36 +93,28 @@ def _c(job: _Job) -> Files:
     }
 
 
-def _epuck(job: _Job) -> Files:
+def _numpy(job: _Job) -> Files:
+    return {"policy.py": numpy_source(job.program, job.comment, job.text).encode()}
+
+
+def _epuck(job: _Job, driver: str) -> Files:
     """Return the numpy policy with what a robot's program needs beside it."""
     spec = job.alone.spec
     if "robot" not in job.description:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
     if job.program.memory_width:
         raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
-    return {**_numpy(job), "esp_epuck.py": _runtime_file("esp_epuck.py")}
-
-
-def _runtime_file(name: str) -> bytes:
-    # read, not imported: it imports what only a robot's machine has
-    return (Path(__file__).parent / "runtime" / name).read_bytes()
-
-
-def _webots(job: _Job) -> Files:
-    return {**_epuck(job), "esp_epuck_webots.py": _runtime_file("esp_epuck_webots.py")}
-
-
-def _ros2(job: _Job) -> Files:
-    return {**_epuck(job), "esp_epuck_ros2.py": _runtime_file("esp_epuck_ros2.py")}
+    runtime = Path(__file__).parent / "runtime"  # read, not imported: it imports what only a robot's machine has
+    return _numpy(job) | {name: (runtime / name).read_bytes() for name in ("esp_epuck.py", driver)}
 
 
 WRITERS: dict[str, Callable[[_Job], Files]] = {
-    "onnx": _onnx,
-    "torch": _torch,
+    "onnx": lambda job: {"policy.onnx": onnx_model(job.program, job.text)},
+    "torch": lambda job: {"policy.pt2": torch_archive(job.program, job.text)},
     "c": _c,
     "numpy": _numpy,
-    "webots": _webots,
-    "ros2": _ros2,
+    "webots": lambda job: _epuck(job, "esp_epuck_webots.py"),
+    "ros2": lambda job: _epuck(job, "esp_epuck_ros2.py"),
 }
 """Format -> what writes its files. Adding one is a line here, one in `_runner` and one in `_USE`."""
 

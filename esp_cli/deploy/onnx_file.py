@@ -9,21 +9,8 @@ from typing import Any
 import numpy as np
 
 from esp_cli import __version__
-from esp_cli.deploy.program import (
-    NORM_EPSILON,
-    SQUASH_EPSILON,
-    Activation,
-    Affine,
-    Convolution,
-    Floats,
-    GlobalMaxPool,
-    Layer,
-    MessageAggregation,
-    Norm,
-    Program,
-    Recurrent,
-    Slice,
-)
+from esp_cli.deploy import layers
+from esp_cli.deploy.program import Program
 
 OPSET = 17
 """The first with layer normalisation; runtimes since 2022 read it."""
@@ -70,7 +57,7 @@ def onnx_model(program: Program, description: str) -> bytes:
     if program.previous:
         x = graph.node("Concat", [x, graph.cut("memory", program.hidden, program.memory_width)], axis=1)
     for layer in program.layers:
-        if isinstance(layer, Recurrent):
+        if isinstance(layer, layers.Recurrent):
             x = hidden = graph.recur(graph.affine(x, layer.input), graph.affine(hidden, layer.recurrent), hidden)
         else:
             x = graph.layer(x, layer)
@@ -126,25 +113,25 @@ class _Graph:
         bounds = [self.constant(np.array([k], np.int64)) for k in (begin, end, 1)]
         return self.node("Slice", [value, *bounds])
 
-    def affine(self, x: str, layer: Affine) -> str:
+    def affine(self, x: str, layer: layers.Affine) -> str:
         return self.node("Gemm", [x, self.constant(layer.weight), self.constant(layer.bias)])
 
-    def layer(self, x: str, layer: Layer) -> str:
+    def layer(self, x: str, layer: layers.Layer) -> str:
         """Return what a layer without memory makes of x."""
         writers: dict[type, Callable[[str, Any], str]] = {
-            Affine: self.affine,
-            Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
-            Norm: self.normalise,
-            Slice: lambda x, layer: self.cut(x, layer.begin, layer.end),
-            Convolution: self.convolve,
-            GlobalMaxPool: self.global_max_pool,
-            MessageAggregation: self.aggregate,
+            layers.Affine: self.affine,
+            layers.Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
+            layers.Norm: self.normalise,
+            layers.Slice: lambda x, layer: self.cut(x, layer.begin, layer.end),
+            layers.Convolution: self.convolve,
+            layers.GlobalMaxPool: self.global_max_pool,
+            layers.MessageAggregation: self.aggregate,
         }
         return writers[type(layer)](x, layer)
 
-    def normalise(self, x: str, layer: Norm) -> str:
+    def normalise(self, x: str, layer: layers.Norm) -> str:
         arrays = [self.constant(array) for array in layer.arrays]
-        return self.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=NORM_EPSILON)
+        return self.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=layers.NORM_EPSILON)
 
     def reshape(self, value: str, *shape: int) -> str:
         return self.node("Reshape", [value, self.constant(np.array(shape, np.int64))])
@@ -154,18 +141,18 @@ class _Graph:
             return self.node(kind, [value, self.constant(np.array([axis], np.int64))], keepdims=keepdims)
         return self.node(kind, [value], axes=[axis], keepdims=keepdims)
 
-    def convolve(self, x: str, layer: Convolution) -> str:
+    def convolve(self, x: str, layer: layers.Convolution) -> str:
         shape = (layer.outputs, layer.channels, layer.side, layer.side)
         weight = self.constant(layer.weight.T.reshape(shape))
         pictures = self.reshape(x, -1, layer.channels, layer.rows, layer.columns)
         out = self.node("Conv", [pictures, weight, self.constant(layer.bias)], strides=[layer.stride, layer.stride])
         return self.reshape(out, -1, layer.width)
 
-    def global_max_pool(self, x: str, layer: GlobalMaxPool) -> str:
+    def global_max_pool(self, x: str, layer: layers.GlobalMaxPool) -> str:
         """Take the largest number of each channel."""
         return self.reduce("ReduceMax", self.reshape(x, -1, layer.channels, layer.places), 2)
 
-    def aggregate(self, x: str, layer: MessageAggregation) -> str:
+    def aggregate(self, x: str, layer: layers.MessageAggregation) -> str:
         """Return own features beside the means over the near."""
         number = [self.constant(np.array(value, np.float32)) for value in (1, layer.reach_squared, layer.reach)]
         one, reach_squared, reach = number
@@ -198,13 +185,14 @@ class _Graph:
     def squash(self, x: str, groups: tuple[int, ...]) -> str:
         """Return u tanh|u| / |u| for each group."""
         width = sum(groups)
-        same: Floats = np.zeros((width, width), np.float32)
+        same: layers.Floats = np.zeros((width, width), np.float32)
         place = 0
         for size in groups:
             same[place : place + size, place : place + size] = 1
             place += size
         squares = self.node("MatMul", [self.node("Mul", [x, x]), self.constant(same)])
-        length = self.node("Sqrt", [self.node("Add", [squares, self.constant(np.array(SQUASH_EPSILON, np.float32))])])
+        epsilon = self.constant(np.array(layers.SQUASH_EPSILON, np.float32))
+        length = self.node("Sqrt", [self.node("Add", [squares, epsilon])])
         return self.node("Mul", [x, self.node("Div", [self.node("Tanh", [length]), length])])
 
     def encode(self, action: str, program: Program) -> str:

@@ -7,20 +7,8 @@ from io import BytesIO
 import torch
 from torch import Tensor, nn
 
-from esp_cli.deploy.program import (
-    NORM_EPSILON,
-    SQUASH_EPSILON,
-    Activation,
-    Affine,
-    Convolution,
-    GlobalMaxPool,
-    Layer,
-    MessageAggregation,
-    Norm,
-    Program,
-    Recurrent,
-    Slice,
-)
+from esp_cli.deploy import layers
+from esp_cli.deploy.program import Program
 
 
 class TorchProgram(nn.Module):
@@ -47,7 +35,7 @@ class TorchProgram(nn.Module):
             x = torch.cat([x, memory[:, program.hidden :]], 1)
         for k, layer in enumerate(program.layers):
             arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
-            if isinstance(layer, Recurrent):
+            if isinstance(layer, layers.Recurrent):
                 x = hidden = _recur(x, hidden, arrays)
             else:
                 x = _apply(x, layer, arrays, observation)
@@ -80,32 +68,32 @@ def torch_archive(program: Program, description: str) -> bytes:
     return content.getvalue()
 
 
-def _apply(x: Tensor, layer: Layer, arrays: list[Tensor], observation: Tensor) -> Tensor:
+def _apply(x: Tensor, layer: layers.Layer, arrays: list[Tensor], observation: Tensor) -> Tensor:
     """Apply a layer without memory."""
-    if isinstance(layer, Affine):
+    if isinstance(layer, layers.Affine):
         return torch.addmm(arrays[1], x, arrays[0])
-    if isinstance(layer, Activation):
+    if isinstance(layer, layers.Activation):
         return torch.relu(x) if layer.name == "relu" else torch.tanh(x)
-    if isinstance(layer, Norm):
-        return nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], NORM_EPSILON)
-    if isinstance(layer, Slice):
+    if isinstance(layer, layers.Norm):
+        return nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], layers.NORM_EPSILON)
+    if isinstance(layer, layers.Slice):
         return x[:, layer.begin : layer.end]
-    if isinstance(layer, Convolution):
+    if isinstance(layer, layers.Convolution):
         return _convolve(x, layer, arrays)
-    if isinstance(layer, MessageAggregation):
+    if isinstance(layer, layers.MessageAggregation):
         return _hear(x, observation, layer)
-    assert isinstance(layer, GlobalMaxPool)
+    assert isinstance(layer, layers.GlobalMaxPool)
     return x.unflatten(1, (layer.channels, layer.places)).amax(2)
 
 
-def _convolve(x: Tensor, layer: Convolution, arrays: list[Tensor]) -> Tensor:
+def _convolve(x: Tensor, layer: layers.Convolution, arrays: list[Tensor]) -> Tensor:
     """Apply filters to rows that hold pictures."""
     weight = arrays[0].T.reshape(layer.outputs, layer.channels, layer.side, layer.side)
     pictures = x.unflatten(1, (layer.channels, layer.rows, layer.columns))
     return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
 
 
-def _hear(x: Tensor, observation: Tensor, layer: MessageAggregation) -> Tensor:
+def _hear(x: Tensor, observation: Tensor, layer: layers.MessageAggregation) -> Tensor:
     """Put what the near ones say beside each agent's own features."""
     ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
     near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()
@@ -126,5 +114,5 @@ def _recur(x: Tensor, hidden: Tensor, arrays: list[Tensor]) -> Tensor:
 def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
     """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
     parts = x.split(list(groups), -1)
-    lengths = [(part.square().sum(-1, keepdim=True) + SQUASH_EPSILON).sqrt() for part in parts]
+    lengths = [(part.square().sum(-1, keepdim=True) + layers.SQUASH_EPSILON).sqrt() for part in parts]
     return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from esp_cli.deploy.program import (
+from esp_cli.deploy.layers import (
     Activation,
     Affine,
     Convolution,
@@ -14,10 +14,10 @@ from esp_cli.deploy.program import (
     Layer,
     MessageAggregation,
     Norm,
-    Program,
     Recurrent,
     Slice,
 )
+from esp_cli.deploy.program import Program
 from esp_cli.networks.constrained import ConstrainedLinear, Equivariant
 from esp_cli.networks.contract import Network
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical

@@ -16,7 +16,7 @@ from esp_cli.deploy import check, onnx_file
 from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.check import compare, take_sample
 from esp_cli.deploy.export import WRITERS, export
-from esp_cli.deploy.program import Affine, Recurrent
+from esp_cli.deploy.layers import Affine, Recurrent
 from esp_cli.deploy.runtime.numpy_policy import NumpyPolicy
 from esp_cli.deploy.translate import program_of
 from esp_cli.training.build import build_environment

@@ -13,8 +13,9 @@ import torch
 from esp_cli.deploy import check
 from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.export import export
+from esp_cli.deploy.layers import Affine, Convolution, GlobalMaxPool, MessageAggregation, Slice
 from esp_cli.deploy.library import LoadedPolicy
-from esp_cli.deploy.program import Affine, Convolution, GlobalMaxPool, MessageAggregation, Program, Slice
+from esp_cli.deploy.program import Program
 from esp_cli.deploy.runtime.numpy_policy import NumpyPolicy
 from esp_cli.deploy.torch_file import TorchProgram
 from esp_cli.deploy.translate import program_of

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from esp_envs import Items, make
-from esp_envs.mpe.chase import chase, flee
-from esp_envs.mpe.predator_prey import out_of_bounds
+from esp_envs.mpe.predator_prey import chase, flee, out_of_bounds
 from esp_envs.mpe.task import nearest_move
 from tests.envs.playing import episode_return
 

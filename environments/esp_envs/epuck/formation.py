@@ -130,9 +130,8 @@ class Formation(LockstepTask):
         robots = (self.num_envs, self.settings.num_agents)
 
         def uniform(*shape: int) -> Tensor:
-            return (
-                torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device).cpu() * 2 - 1
-            )
+            drawn = torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device)
+            return drawn.cpu() * 2 - 1
 
         start, heading = uniform(2), uniform()
         factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu()
@@ -179,12 +178,7 @@ class Formation(LockstepTask):
         self._apart = torch.hypot(*self._ways.unbind(-1)).masked_fill_(self._own, torch.inf)
 
     def _measure(self, way: Tensor, ended: bool) -> dict[str, Tensor]:
-        """Return the metrics of the step just made, each [W].
-
-        Args:
-            way: [W, N] length of every robot's way in this step, m.
-            ended: whether this was the last step.
-        """
+        """Return the metrics of the step just made, each [W]; `way` [W, N] is what every robot drove in it, m."""
         here = self._distance < self.settings.arrival_radius_m
         new, self._arrived = here & ~self._arrived, here | self._arrived
         touching = self._apart < self._contact
@@ -219,12 +213,9 @@ class Formation(LockstepTask):
 
     def _disturbed(self, heading: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
         """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
-        lead = (self.num_envs, self.settings.num_agents)
-        shape = (*lead, 1 + 2 * seen.shape[2])
-        draws = [
-            torch.randn(shape, generator=g, dtype=torch.float64, device=self.device).cpu() for g in self.generators
-        ]
-        noise = torch.cat(draws)
+        shape = (self.num_envs, self.settings.num_agents, 1 + 2 * seen.shape[2])
+        draws = (torch.randn(shape, generator=g, dtype=torch.float64, device=self.device) for g in self.generators)
+        noise = torch.cat([drawn.cpu() for drawn in draws])
         offsets = noise[..., 1:].unflatten(-1, (-1, 2)) * self.settings.sensor_noise_m
         return heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
 
@@ -275,11 +266,7 @@ class Formation(LockstepTask):
         self._look()
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `avoid` (default) or `straight`.
-
-        Raises:
-            ValueError: no such heuristic.
-        """
+        """Return the joint action of `avoid` (default) or `straight`."""
         name = self.named_heuristic(name)
         wish = self._to_goal
         if name == "avoid":

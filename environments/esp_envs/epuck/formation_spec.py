@@ -10,7 +10,7 @@ from torch import Tensor
 
 from esp_envs.base import TaskSettings
 from esp_envs.epuck.arena import Arena
-from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, TaskSpec, layout
+from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, TaskSpec, filled_layout, layout
 
 WHEELS = Continuous(layout(Field("wheels", Kind.WHEELS, 1, "share of full speed")))
 """Left and right wheel speed in [-1, 1], times 6.28 rad/s."""
@@ -106,15 +106,7 @@ class FormationSettings(TaskSettings):
 def formation_spec(settings: FormationSettings) -> TaskSpec:
     """Return the spec that follows from the settings."""
     robots, pillars = settings.num_agents, settings.num_obstacles
-    state = [
-        Field("heading", Kind.VECTOR, robots, "direction", Items.AGENTS),
-        Field("position", Kind.VECTOR, robots, "m", Items.AGENTS),
-        Field("velocity", Kind.VECTOR, robots, "m/s", Items.AGENTS),
-        Field("spin", Kind.PSEUDOSCALAR, robots, "rad/s", Items.AGENTS),
-        Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS),
-    ]
-    if pillars:
-        state.append(Field("obstacles", Kind.VECTOR, pillars, "m"))
+    unit = "m" if settings.seen_as == "offset" else "nearness"
     counts = "once" if settings.penalty_counts == "any" else "each"
     penalty = f"{settings.penalty:g} {counts} a step within {settings.radius:g} m"
     return TaskSpec(
@@ -123,8 +115,21 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}",
         num_agents=robots,
         horizon=settings.horizon,
-        observation=_observation_layout(settings),
-        state=Layout(tuple(state)),
+        observation=filled_layout(
+            Field("heading", Kind.VECTOR, 1, "direction"),
+            Field("obstacle", Kind.VECTOR, min(pillars, 1), unit),
+            Field("goal", Kind.VECTOR, 1, "m"),
+            # Sorted by distance, so that no permutation of the robots moves them.
+            Field("robots", Kind.VECTOR, settings.seen_robots, unit),
+        ),
+        state=filled_layout(
+            Field("heading", Kind.VECTOR, robots, "direction", Items.AGENTS),
+            Field("position", Kind.VECTOR, robots, "m", Items.AGENTS),
+            Field("velocity", Kind.VECTOR, robots, "m/s", Items.AGENTS),
+            Field("spin", Kind.PSEUDOSCALAR, robots, "rad/s", Items.AGENTS),
+            Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS),
+            Field("obstacles", Kind.VECTOR, pillars, "m"),
+        ),
         action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
         symmetry="d4*agents",
         shared_reward=False,
@@ -133,18 +138,6 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         settings=settings.model_dump()
         | {"penalty_radius_m": settings.radius, "collision_penalty": settings.penalty, "sight": settings.seen_as},
     )
-
-
-def _observation_layout(settings: FormationSettings) -> Layout:
-    unit = "m" if settings.seen_as == "offset" else "nearness"
-    fields = [Field("heading", Kind.VECTOR, 1, "direction")]
-    if settings.num_obstacles:
-        fields.append(Field("obstacle", Kind.VECTOR, 1, unit))
-    fields.append(Field("goal", Kind.VECTOR, 1, "m"))
-    if settings.seen_robots:
-        # Sorted by distance, so that no permutation of the robots moves them.
-        fields.append(Field("robots", Kind.VECTOR, settings.seen_robots, unit))
-    return layout(*fields)
 
 
 def nearest_pair(wheels: Tensor) -> Tensor:

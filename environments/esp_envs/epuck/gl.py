@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -31,11 +31,9 @@ class NoGraphicsError(ValueError):
 def is_installed(backend: str) -> bool:
     """Say whether the library of "osmesa" or "egl" can be loaded; MuJoCo's own message does not name the library."""
     for name in _LIBRARIES[backend][1]:
-        try:
+        with suppress(OSError):
             ctypes.CDLL(name)
-        except OSError:
-            continue
-        return True
+            return True
     return False
 
 

@@ -29,7 +29,6 @@ class MujocoPlanar(MujocoWorlds):
         super().__init__(model_of(arena), arena, num_worlds, control_period_s, num_threads)
 
     def _move(self, pose: Array, velocity: Array) -> None:
-        """Write poses and velocities into the joints."""
         self._qpos[:], self._qvel[:] = pose, velocity
 
     def _adapt_wheels(self, mass: Array, friction: Array) -> None:

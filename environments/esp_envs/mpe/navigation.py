@@ -13,7 +13,7 @@ from esp_envs.base import Body, Scene
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
-from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
+from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
 AGENT_RADIUS = 0.15
 _LANDMARK_RADIUS = 0.05
@@ -181,7 +181,6 @@ class Navigation(ParticleTask):
 
 
 def _spec(settings: NavigationSettings) -> TaskSpec:
-    """Return the spec that follows from the settings."""
     agents, landmarks = settings.num_agents, settings.landmarks
     discrete = settings.actions == "discrete"
     esp = settings.convention == "esp"
@@ -192,7 +191,12 @@ def _spec(settings: NavigationSettings) -> TaskSpec:
         convention=f"{settings.convention}: {reward}",
         num_agents=agents,
         horizon=settings.horizon,
-        observation=_observation_layout(agents, landmarks),
+        observation=filled_layout(
+            Field("velocity", Kind.VECTOR, 1, "length/s"),
+            Field("position", Kind.VECTOR, 1, "length"),
+            Field("landmarks", Kind.VECTOR, landmarks, "length"),
+            Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS),
+        ),
         state=layout(
             Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
             Field("position", Kind.VECTOR, agents, "length", Items.AGENTS),
@@ -203,14 +207,3 @@ def _spec(settings: NavigationSettings) -> TaskSpec:
         shared_reward=esp,
         settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
     )
-
-
-def _observation_layout(agents: int, landmarks: int) -> Layout:
-    fields = [
-        Field("velocity", Kind.VECTOR, 1, "length/s"),
-        Field("position", Kind.VECTOR, 1, "length"),
-        Field("landmarks", Kind.VECTOR, landmarks, "length"),
-    ]
-    if agents > 1:
-        fields.append(Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS))
-    return layout(*fields)

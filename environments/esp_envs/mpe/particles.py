@@ -183,11 +183,9 @@ def linear_matrix(function: Callable[[Tensor], Tensor], num_inputs: int) -> Tens
 
 def _difference_matrix(pairs: Sequence[tuple[int, int]], num_entities: int) -> Tensor:
     """Return [pairs, entities] with +1 at a and -1 at b: times the positions it gives position[a] - position[b]."""
-    matrix = torch.zeros(len(pairs), num_entities)
-    for row, (a, b) in enumerate(pairs):
-        matrix[row, a] += 1
-        matrix[row, b] -= 1
-    return matrix
+    first, second = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(1)
+    basis = torch.eye(num_entities)
+    return basis[first] - basis[second]
 
 
 def _rows(values: Tensor, lanes: int) -> Tensor:

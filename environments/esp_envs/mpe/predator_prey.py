@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import Body, Scene
-from esp_envs.mpe.chase import chase, flee
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
@@ -23,6 +22,14 @@ PREDATOR_MAX_SPEED, PREY_MAX_SPEED = 1.0, 1.3
 """length / s."""
 OBSTACLE_EXTENT = 0.9
 TOUCH_REWARD = 10.0
+PREY_LEAD_S, OWN_LEAD_S = 0.25, 0.15
+"""A predator aims from where it will be in OWN_LEAD_S at where the prey will be in PREY_LEAD_S; found by search."""
+URGENCY = 10.0
+"""Full force beyond 1 / URGENCY lengths of aiming error."""
+BOUND = 0.9
+"""The fleeing prey heads for the origin when farther from it than this (lengths)."""
+_FAR = 1e3
+_TINY = 1e-12
 
 
 class PredatorPrey(ParticleTask):
@@ -226,3 +233,30 @@ def out_of_bounds(position: Tensor) -> Tensor:
     """Return MPE's penalty per coordinate: 0 below 0.9, 10 (u - 0.9) below 1, then min(exp(2u - 2), 10), u = |x|."""
     u = position.abs()
     return torch.where(u < 1.0, (u - 0.9).clamp_min(0.0) * 10, (2 * u - 2).exp().clamp_max(10.0))
+
+
+def chase(predator: Tensor, predator_velocity: Tensor, prey: Tensor, prey_velocity: Tensor) -> Tensor:
+    """Return the wishes [N, 2, W] of predators that run at the prey.
+
+    Args:
+        predator: [N, 2, W].
+        predator_velocity: [N, 2, W].
+        prey: [2, W].
+        prey_velocity: [2, W].
+    """
+    return URGENCY * (prey + PREY_LEAD_S * prey_velocity - predator - OWN_LEAD_S * predator_velocity)
+
+
+def flee(predator: Tensor, prey: Tensor) -> Tensor:
+    """Return the wish [2, W] of a prey that runs from the nearest predator, and back when it is out of bounds.
+
+    Args:
+        predator: [N, 2, W].
+        prey: [2, W].
+    """
+    away = prey - predator
+    squared = away.square().sum(1, keepdim=True)
+    nearest = squared.argmin(0, keepdim=True).expand(1, 2, -1)
+    direction = away.gather(0, nearest)[0] / squared.amin(0).clamp_min(_TINY).sqrt()
+    outside = prey.square().sum(0) > BOUND**2
+    return _FAR * torch.where(outside, -prey, direction)

@@ -8,7 +8,7 @@ from pydantic import Field as Setting
 from pydantic import model_validator
 
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
-from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, layout
+from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
 
 class PredatorPreySettings(ParticleSettings):
@@ -58,7 +58,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
 
 
 def _predator_layout(settings: PredatorPreySettings) -> Layout:
-    return _fields(
+    return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
         Field("position", Kind.VECTOR, 1, "length"),
         Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
@@ -70,7 +70,7 @@ def _predator_layout(settings: PredatorPreySettings) -> Layout:
 
 def prey_layout(settings: PredatorPreySettings) -> Layout:
     """Return what a prey observes."""
-    return _fields(
+    return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
         Field("position", Kind.VECTOR, 1, "length"),
         Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
@@ -81,15 +81,10 @@ def prey_layout(settings: PredatorPreySettings) -> Layout:
 def _state_layout(settings: PredatorPreySettings) -> Layout:
     predators = settings.num_predators
     hunters, hunted = (Items.FIXED, Items.AGENTS) if settings.control == "prey" else (Items.AGENTS, Items.FIXED)
-    return _fields(
+    return filled_layout(
         Field("velocity", Kind.VECTOR, predators, "length/s", hunters),
         Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted),
         Field("position", Kind.VECTOR, predators, "length", hunters),
         Field("prey_position", Kind.VECTOR, 1, "length", hunted),
         Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
     )
-
-
-def _fields(*fields: Field) -> Layout:
-    """Build a layout without its empty fields."""
-    return layout(*(f for f in fields if f.count))
