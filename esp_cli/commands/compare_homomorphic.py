@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 
@@ -42,6 +43,7 @@ def compare_homomorphic(
     """
     names = parse_names([methods]) if methods is not None else None
     limits = [] if threshold is None else [threshold]
+    check_finite("--threshold", *limits)
     given = {"--drones": (drones, DRONES), "--grid": (grid, GRID), "--group": (group, GROUP), "--mode": (mode, None)}
     words = ["--methods", ",".join(names)] if names else []
     words += [word for flag, (value, default) in given.items() if value != default for word in (flag, str(value))]

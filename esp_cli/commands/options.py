@@ -189,7 +189,9 @@ JsonOption = Annotated[
     ),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
-EpisodesOption = Annotated[int, typer.Option("--episodes", "-e", min=1, help="Episodes per seed.", metavar="COUNT")]
+EpisodesOption = Annotated[
+    int, typer.Option("--episodes", "-e", min=1, max=1_000_000, help="Episodes per seed.", metavar="COUNT")
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Change one setting, as mappo.learning_rate=5e-4; repeatable.", metavar="NAME=VALUE"),

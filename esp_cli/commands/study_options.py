@@ -57,7 +57,8 @@ PresetOption = Annotated[
     str, typer.Option("--preset", help="'default' (measured best) or 'paper' (the paper's settings).")
 ]
 JobsOption = Annotated[
-    int | None, typer.Option("--jobs", "-j", min=1, help="Runs side by side, one thread each; by default one a core.")
+    int | None,
+    typer.Option("--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."),
 ]
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")

@@ -77,7 +77,7 @@ class DocumentFormat:
         """
         content = self.read(path)
         try:
-            return model.model_validate(content)
+            return validate(model, content)
         except ValidationError as error:
             raise self.error(f"{path} is damaged: {one_sentence(error, model)}") from None
 
@@ -91,6 +91,15 @@ class DocumentFormat:
         if "format" in content or "version" in content:
             raise self.error(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
         replace_file(path, encode({"format": self.name, "version": self.version, **content}, path, self.error))
+
+
+def validate(model: type[Model], content: object) -> Model:
+    """Validate content of a document; a value of another type is refused, not converted (true is not 1).
+
+    Raises:
+        ValidationError: it is not what the model asks for.
+    """
+    return model.model_validate_json(json.dumps(content), strict=True)
 
 
 def encode(value: object, path: str | os.PathLike[str], error: type[ValueError] = DocumentError) -> bytes:

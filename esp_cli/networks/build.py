@@ -11,6 +11,7 @@ from typing import Annotated
 import torch
 from pydantic import BeforeValidator, SerializeAsAny
 
+from esp_cli.files.documents import validate
 from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.contract import ActivationName, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
@@ -50,7 +51,7 @@ def _stored(data: object) -> object:
         return data
     cls = network_class(data.get("name", "mlp"))
     excess = _FLAT_FIELDS - set(cls.model_fields)
-    return cls.model_validate({name: value for name, value in data.items() if name not in excess})
+    return validate(cls, {name: value for name, value in data.items() if name not in excess})
 
 
 AnyNetworkConfig = Annotated[SerializeAsAny[NetworkConfig], BeforeValidator(_stored)]

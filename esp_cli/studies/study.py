@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli import __version__
 from esp_cli.evaluation.final import FinalEvaluation
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.config import RunConfig
@@ -243,5 +243,5 @@ def read_evaluation(run: Path) -> FinalEvaluation | None:
     for name in (_FINAL, _OLD_FINAL):
         with contextlib.suppress(OSError, ValueError):
             text = read_regular(run / name, MAX_DOCUMENT_BYTES) or b""
-            return FinalEvaluation.model_validate(parse_object(text, "text"))
+            return validate(FinalEvaluation, parse_object(text, "text"))
     return None

@@ -27,7 +27,7 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentError, parse_object, shortened
 from esp_cli.files.failures import attempting
 from esp_cli.files.writing import replace_file
-from esp_envs.policy_format import METADATA_KEY
+from esp_envs.policy_format import METADATA_KEY, digest
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
 CHECKPOINT_VERSION = 1
@@ -85,7 +85,7 @@ def save_checkpoint(
         raise CheckpointError(f"cannot write {path}: its description is not JSON ({error})") from None
     stored = _storable(path, tensors)
     described = {"format": format_name, "version": version, **described}
-    described["sha256"] = _digest(stored, described)
+    described["sha256"] = digest(stored, described)
     content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
         raise CheckpointError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
@@ -144,21 +144,6 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     return stored
 
 
-def _digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:
-    """Return the SHA-256, as hex, of the description and of each tensor's name, dtype, shape and bytes by name."""
-    digest = hashlib.sha256(_canonical(description))
-    for name in sorted(tensors):
-        tensor = tensors[name]
-        digest.update(_canonical([name, str(tensor.dtype), list(tensor.shape)]))
-        if tensor.numel():
-            digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
-    return digest.hexdigest()
-
-
-def _canonical(value: Any) -> bytes:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
-
-
 def _read(path: Path) -> bytes:
     """Return the bytes of a plain file whose header, as declared, fits into it."""
     # a pipe or a device would block or never end, so only plain files are opened
@@ -190,7 +175,7 @@ def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, T
         raise CheckpointError(f"is damaged: {shortened(str(error))}") from None
     _check_bools(tensors)
     expected = description.pop("sha256")
-    if _digest(tensors, description) != expected:
+    if digest(tensors, description) != expected:
         raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
     # Copies, since the loader's tensors are not aligned to 64 bytes as torch's own are; only now, since the copy of a
     # damaged truth value is a sound one.

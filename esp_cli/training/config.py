@@ -189,7 +189,9 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
         raise ValueError(one_sentence(error, model, section, owner)) from None
     for name, value in values.items():
         taken = list(_numbers(getattr(built, name)))
-        if any(isinstance(number, float) and not math.isfinite(number) for number in taken):
+        if any(not abs(number) < 2**63 for number in taken if not isinstance(number, float)):
+            raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has more than 64 bits")
+        if not all(map(math.isfinite, taken)):
             raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number")
         # pydantic takes true for 1
         if _count_flags(_numbers(value)) > _count_flags(taken):

@@ -10,19 +10,20 @@ from shlex import quote
 from typing import Any
 
 import torch
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from torch import Tensor
 
 from esp_cli import __version__
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.files.documents import one_sentence
+from esp_cli.files.documents import one_sentence, validate
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import build_environment
-from esp_cli.training.config import RunConfig, resolve_task_settings, validated
+from esp_cli.training.config import RunConfig, resolve_task_settings
 from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
+from esp_envs.registry import task_class
 from esp_envs.spec import TaskSpec
 
 
@@ -59,19 +60,24 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         ValueError: it is damaged or of another version.
     """
     try:
-        config = RunConfig.model_validate(data)
+        config = validate(RunConfig, data)
     except ValidationError as error:
         # Another version may have had another name for a setting; of one version that is damage.
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
         raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     if config.algorithm not in ALGORITHMS:
         raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
-    try:
-        resolve_task_settings(config.task, config.task_settings)
-        validated(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm)
-    except ValueError as error:
-        raise ValueError(f"{source}: {error}") from None
+    _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
+    _check_settings(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm, source)
     return config
+
+
+def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:
+    """Refuse stored settings that a task or an algorithm does not have."""
+    try:
+        validate(model, settings)
+    except ValidationError as error:
+        raise ValueError(f"{source}: {one_sentence(error, model, section)}") from None
 
 
 def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:

@@ -162,6 +162,8 @@ class RunFolder:
         try:
             with attempting("tidy up", self.path, RunFolderError):
                 self._remove_half_written()
+                if self.policy_path.is_file():  # a process was killed before it came to this
+                    self._remove_superseded()
             yield
         finally:
             os.close(descriptor)
@@ -228,12 +230,7 @@ class RunFolder:
         """
         reach("policy")
         write_policy(self.policy_path, tensors, meta)
-        files = self.checkpoints()
-        if any(map(_is_final, files)):
-            with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):
-                for file in files:
-                    if not _is_final(file):
-                        remove_file(file)
+        self._remove_superseded()
         return self.policy_path
 
     def latest_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
@@ -275,6 +272,15 @@ class RunFolder:
         if not self.metrics_path.exists():
             os.close(open_own(self.metrics_path, os.O_WRONLY))
         return truncate_metrics(self.metrics_path, after_step)
+
+    def _remove_superseded(self) -> None:
+        """Remove the checkpoints before the final one, if there is a final one."""
+        files = self.checkpoints()
+        if any(map(_is_final, files)):
+            with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):
+                for file in files:
+                    if not _is_final(file):
+                        remove_file(file)
 
     def _remove_half_written(self) -> None:
         for folder in (self.path, self.path / _CHECKPOINTS):

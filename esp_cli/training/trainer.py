@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from esp_cli.files.faults import reach
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
@@ -174,6 +175,7 @@ class Trainer:
 
     def _evaluate(self) -> dict[str, Tensor]:
         """Play greedy and stochastic episodes; every seed's worlds depend on its seed and the step alone."""
+        reach("evaluation")
         env, row = self._eval_env, {}
         for mode in ("greedy", "stochastic"):
             stream = ("evaluation", mode, self.step)

@@ -276,7 +276,7 @@ def test_a_newer_format_and_another_task_version_are_explained(tmp_path: Path) -
         (
             meta | {"task_version": 9},
             1,
-            "was trained on navigation version 9, but this is version 1, in which a policy",
+            "was trained on navigation version 9, but this is version 1, in which observations",
         ),
         (
             meta | {"esp_version": "7.0", "config": meta["config"] | {"mood": 1}},

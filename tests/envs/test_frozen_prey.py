@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from esp_envs import make
+from esp_envs.policy_format import digest
 
 HEADER = {"format": "esp-policy", "version": 1, "task": "predator-prey", "network": "mlp", "activation": "tanh"}
 NUM_INPUTS, HIDDEN, NUM_MOVES, SEEDS = 14, 8, 5, 2
@@ -33,7 +34,8 @@ def network() -> dict[str, torch.Tensor]:
 
 def write(path: Path, tensors: dict[str, torch.Tensor] | None = None, **changes: Any) -> str:
     header = {key: value for key, value in (HEADER | changes).items() if value is not None}
-    save_file(network() if tensors is None else tensors, path, {"esp": json.dumps(header)})
+    tensors = network() if tensors is None else tensors
+    save_file(tensors, path, {"esp": json.dumps(header | {"sha256": digest(tensors, header)})})
     return str(path)
 
 
@@ -78,6 +80,14 @@ def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
     path = Path(write(tmp_path / "prey.safetensors"))
     path.write_bytes(path.read_bytes()[:-50])
     assert "is not an intact safetensors file" in refused(str(path))
+
+
+def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    path = Path(write(tmp_path / "prey.safetensors"))
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    assert "does not match its checksum" in refused(str(path))
 
 
 def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None:

@@ -169,6 +169,10 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
             "bad value inf for 'mappo.learning_rate': it has to be a finite",
         ),
         ({"overrides": {"mappo.learning_rate": "1e999"}}, "bad value 1e999 for 'mappo.learning_rate': it has to be a"),
+        (
+            {"overrides": {"evaluation.every_steps": "9" * 400}},
+            "for 'evaluation.every_steps': it has more than 64 bits",
+        ),
         ({"overrides": {"mappo.num_envs": "true"}}, "bad value true for 'mappo.num_envs': it has to be a number"),
         ({"overrides": {"mappo.gamma": "true"}}, "bad value true for 'mappo.gamma': it has to be a number"),
         ({"overrides": {"task.horizon": "true"}}, "bad value true for 'task.horizon': it has to be a number"),

@@ -12,6 +12,7 @@ import sys
 import pytest
 import torch
 
+from esp_cli.files import faults
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
 from esp_cli.training.metrics import MetricsWriter, read_metrics
@@ -190,6 +191,19 @@ def test_only_the_final_checkpoint_stays_beside_the_trained_policy(folder):
     folder.write_policy(weights(300), {})
     assert names(folder) == ["step-000000000300-final.safetensors"]
     assert folder.latest_checkpoint()[1]["step"] == 300
+
+
+@pytest.mark.parametrize("place", ["renamed", "unlink"])
+def test_checkpoints_that_a_kill_left_beside_the_trained_policy_go_at_the_next_start(folder, monkeypatch, place):
+    write_checkpoints(folder, 100, 200)
+    folder.write_checkpoint(300, weights(300), {}, final=True)
+    monkeypatch.setattr(faults, "planned", faults.Fault.parse(f"{place}:1:EIO"))
+    with pytest.raises(OSError, match="Input/output error"):
+        folder.write_policy(weights(300), {})
+    assert len(names(folder)) == 3
+    with folder.lock():
+        pass
+    assert names(folder) == ["step-000000000300-final.safetensors"]
 
 
 def test_the_latest_checkpoint_is_that_of_the_highest_step(folder):

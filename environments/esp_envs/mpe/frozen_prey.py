@@ -14,7 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION
+from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION, digest
 
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 _TASK, _NETWORK = "predator-prey", "mlp"
@@ -62,16 +62,22 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            names = [name for name in file.keys() if name.startswith("actor.layers.")]  # noqa: SIM118 - no iterator
-            tensors = {name: file.get_tensor(name) for name in names}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterator
         header = json.loads(metadata.get(METADATA_KEY, "null"))
-    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError, RuntimeError) as error:
         raise ValueError(
-            f"the prey policy {path} is not an intact safetensors file ({error}); export it again"
+            f"the prey policy {path} is not an intact safetensors file ({_short(error)}); export it again"
         ) from error
     if not isinstance(header, dict):
         raise ValueError(f"the file {path} has no 'esp' entry, so it is not a policy of this project; export a prey")
-    return header, tensors
+    description = {key: value for key, value in header.items() if key != "sha256"}
+    try:
+        intact = header.get("sha256") == digest(tensors, description)
+    except (ValueError, TypeError, RecursionError):  # what no digest was ever made of
+        intact = False
+    if not intact:
+        raise ValueError(f"the prey policy {path} does not match its checksum; export it again")
+    return header, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.layers.")}
 
 
 def _checked(header: dict[str, object], path: str) -> str:
@@ -79,10 +85,12 @@ def _checked(header: dict[str, object], path: str) -> str:
     wanted = {"format": POLICY_FORMAT, "version": POLICY_VERSION, "task": _TASK, "network": _NETWORK}
     for key, value in wanted.items():
         if header.get(key) != value:
-            raise ValueError(f"the prey policy {path} has {key} {header.get(key)!r}, but a prey needs {value!r}")
+            found = _short(repr(header.get(key)))
+            raise ValueError(f"the prey policy {path} has {key} {found}, but a prey needs {value!r}")
     activation = header.get("activation")
     if not isinstance(activation, str) or activation not in _ACTIVATIONS:
-        raise ValueError(f"the prey policy {path} has activation {activation!r}; known are {', '.join(_ACTIVATIONS)}")
+        found = _short(repr(activation))
+        raise ValueError(f"the prey policy {path} has activation {found}; known are {', '.join(_ACTIVATIONS)}")
     return activation
 
 
@@ -106,3 +114,9 @@ def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tens
     if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
         raise ValueError(f"the prey policy {path} holds numbers that are not finite; export it again")
     return layers
+
+
+def _short(value: object) -> str:
+    """Return the first line of a text, cut to a length that fits into a sentence."""
+    text = next(iter(str(value).splitlines()), "")
+    return text if len(text) <= 80 else f"{text[:77]}..."
