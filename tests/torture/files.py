@@ -1,0 +1,326 @@
+"""Spoilt files of every kind that is read: only the right content or one sentence, in bounded time and memory."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import resource
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from typer.testing import CliRunner
+
+from esp_cli.app import app
+from esp_cli.deploy.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
+from esp_cli.files.documents import DocumentFormat, parse_object
+from esp_cli.reporting.pages import filled
+from esp_cli.reporting.results import read_results
+from esp_cli.reporting.tables import all_tables
+from esp_cli.studies.catalogue import plan
+from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
+from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
+from esp_cli.training.config import resolve_config
+from esp_cli.training.loading import load_policy, parse_config
+from esp_cli.training.metrics import MetricsError, column, read_last_row, read_metrics
+from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
+from esp_cli.training.trainer import Trainer
+from esp_envs.registry import make
+from tests.studies.small_studies import request
+from tests.torture.junk import spoil_bytes, spoil_header, spoil_json, spoil_value
+from tests.training.runs import TINY, tiny_folder
+
+BATCH = 100
+LIMIT_S = 10.0
+LIMIT_BYTES = 10**9
+COMMAND_SHARE = 1 / 2000
+FORGED_SHARE = 1 / 100
+"""Of policies and checkpoints whose checksum is right: for them networks are built, which takes milliseconds."""
+RUN, STUDY = "run", "study"
+
+
+class TooLongError(BaseException):
+    """A file took longer than is allowed; no code may catch this."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes:
+        path: of the sound file, below the scratch folder.
+        load: reads the spoilt file as the application does; returns why what it got is wrong, or None.
+        command: a command line that reads it.
+        spoil: damage by structure.
+    """
+
+    path: str
+    load: Callable[[Path], str | None]
+    command: tuple[str, ...]
+    spoil: Callable[[bytes, random.Random], bytes]
+
+
+class Files:
+    """Batches of spoilt files; see `Part`."""
+
+    def __init__(self, scratch: Path, seed: int) -> None:
+        self.scratch, self.seed = scratch / "files", seed
+        _make_sound_files(self.scratch)
+        self.sound = {name: (self.scratch / kind.path).read_bytes() for name, kind in KINDS.items()}
+        self._originals = self._load_originals()
+        self._most_bytes = _resident_bytes() + LIMIT_BYTES
+        self._done = 0
+
+    def count(self) -> int:
+        """Return the files since the last call."""
+        done, self._done = self._done, 0
+        return done
+
+    def run(self, number: int) -> str | None:
+        """Try a batch of one kind; its numbers follow from the seed and the number of the batch."""
+        rng = random.Random(f"{self.seed} {number}")
+        name = list(KINDS)[number % len(KINDS)]
+        path = self.scratch / KINDS[name].path
+        try:
+            for index in range(BATCH):
+                found = self._try(name, path, rng)
+                self._done += 1
+                if found is not None:
+                    keep = Path.cwd() / f"torture-{name}-{self.seed}-{number}-{index}"
+                    shutil.copyfile(path, keep)
+                    return f"{name} {index}: {found} (kept as {keep.name})"
+        finally:
+            path.write_bytes(self.sound[name])
+        if _resident_bytes() > self._most_bytes:
+            self._most_bytes = _resident_bytes() + LIMIT_BYTES
+            return f"{name}: a file took more than {LIMIT_BYTES / 1e9} GB of memory"
+        return None
+
+    def _try(self, name: str, path: Path, rng: random.Random) -> str | None:
+        kind, sound = KINDS[name], self.sound[name]
+        forged = name in self._originals and rng.random() < FORGED_SHARE
+        if forged:
+            self._forge(name, path, rng)
+        else:
+            spoil = rng.choice((spoil_bytes, kind.spoil))
+            path.write_bytes(spoil(sound, rng))
+        command = kind.command if rng.random() < COMMAND_SHARE else None
+        begun = time.monotonic()
+        try:
+            with _time_limit():
+                if command is not None:
+                    return _run_command([part.format(scratch=self.scratch) for part in command])
+                wrong = kind.load(path)
+                if name in self._originals and not forged:
+                    wrong = _differs(load_checkpoint(path, _format(name)), self._originals[name])
+        except (ValueError, OSError) as failure:
+            return _not_one_sentence(failure)
+        except TooLongError:
+            return f"takes longer than {time.monotonic() - begun:.1f} s"
+        except BaseException as failure:  # what is no sentence is a finding, MemoryError and the like too
+            return f"{type(failure).__name__}: {failure}"
+        return wrong
+
+    def _load_originals(self) -> dict[str, Any]:
+        return {
+            name: load_checkpoint(self.scratch / KINDS[name].path, _format(name))
+            for name in ("policy", "checkpoint", "prey")
+        }
+
+    def _forge(self, name: str, path: Path, rng: random.Random) -> None:
+        """Write a file whose checksum is right and whose tensors or description are not."""
+        tensors, meta = self._originals[name]
+        tensors, described = dict(tensors), dict(meta)
+        if rng.random() < 0.5:
+            spoilt = spoil_value(described, rng)
+            described = spoilt if isinstance(spoilt, dict) else {}
+            described = {key: value for key, value in described.items() if key not in ("format", "version", "sha256")}
+        else:
+            chosen = rng.choice(list(tensors))
+            tensor = tensors.pop(chosen)
+            changes: list[Callable[[torch.Tensor], torch.Tensor]] = [
+                lambda t: t.unsqueeze(0),
+                lambda t: t.flatten()[:1].clone(),
+                lambda t: t.to(torch.float64),
+                lambda t: t.to(torch.bool),
+                lambda t: torch.full_like(t, 7),
+                lambda t: torch.cat([t.flatten(), t.flatten()]),
+            ]
+            if rng.random() < 0.8:
+                tensors[rng.choice((chosen, chosen, chosen, "x", f"{chosen}.x"))] = rng.choice(changes)(tensor)
+        with contextlib.suppress(ValueError):
+            save_checkpoint(path, tensors, described, _format(name))
+
+
+def _make_sound_files(scratch: Path) -> None:
+    """Write one sound file of each kind, as the application does."""
+    folder = tiny_folder(scratch / RUN, steps=100)
+    with folder.lock():
+        Trainer(parse_config(folder.config, folder.path), folder).run(lambda news: True)
+    config = resolve_config("predator-prey", steps=50, overrides=TINY | {"task.control": "prey"})
+    prey = RunFolder.create(scratch / "prey", config.model_dump(mode="json"))
+    with prey.lock():
+        Trainer(config, prey).run(lambda news: True)
+    hunters = {"task.prey": "policy", "task.prey_policy": str(scratch / KINDS["prey"].path)}
+    hunt = RunFolder.create(
+        scratch / "hunt", resolve_config("predator-prey", steps=50, overrides=TINY | hunters).model_dump(mode="json")
+    )
+    with hunt.lock():
+        Trainer(parse_config(hunt.config, hunt.path), hunt).run(lambda news: True)
+    study = StudyFolder.create(
+        scratch / STUDY, plan("table1", request(tasks=("navigation",), seeds=(0,), steps=((None, 100),)))
+    )
+    for cell in study.study.cells:
+        run = study.prepare(cell)
+        with run.lock():
+            Trainer(cell.config, run).run(lambda news: True)
+        _run_command(["eval", str(run.path), "--episodes", "4", "--json", str(study.evaluation_path(cell))])
+    (scratch / "results").mkdir()
+    _run_command(["report", str(study.path), "--results", str(scratch / KINDS["results"].path), "--json", "-"])
+    (scratch / "results" / "page.md").write_text("<!-- results: results.json returns -->\n<!-- end of results -->\n")
+    (scratch / "bundled").mkdir()
+    shutil.copyfile(bundled_folder() / MANIFEST, scratch / KINDS["manifest"].path)
+    cells = study.study.cells
+    (scratch / "evaluation").symlink_to(study.evaluation_path(cells[0]).parent)
+
+
+def _run_command(arguments: list[str]) -> str | None:
+    """Run a command line in this process; return why it is not one sentence, or None."""
+    result = CliRunner().invoke(app, arguments)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        return f"esp {' '.join(arguments)}: {type(result.exception).__name__}: {result.exception}"
+    if result.exit_code not in (0, 2):
+        return f"esp {' '.join(arguments)}: exit code {result.exit_code}: {result.stderr[-500:]}"
+    last = result.stderr.splitlines()[-1] if result.stderr else ""
+    if result.exit_code and not last.startswith("error: "):
+        return f"esp {' '.join(arguments)}: {last!r} is not a sentence"
+    return None
+
+
+def _not_one_sentence(failure: Exception) -> str | None:
+    text = str(failure)
+    if not text or len(text) > 1000:  # the console joins lines
+        return f"{type(failure).__name__} is not one sentence: {text[:300]!r}"
+    if type(failure).__module__.split(".")[0] in ("pydantic_core", "torch", "safetensors", "json"):
+        return f"{type(failure).__name__} of a library: {text[:300]!r}"
+    return None
+
+
+def _differs(found: tuple[dict[str, Any], Any], original: tuple[dict[str, Any], Any]) -> str | None:
+    same = found[1] == original[1] and found[0].keys() == original[0].keys()
+    same = same and all(_bits(found[0][name]) == _bits(original[0][name]) for name in found[0])
+    return None if same else "another content was loaded"
+
+
+def _bits(tensor: torch.Tensor) -> tuple[Any, ...]:
+    return tensor.dtype, tensor.shape, tensor.numpy().tobytes()
+
+
+def _agrees(text: Any, taken: Any) -> bool:
+    """Return whether what was taken says what the file says, wherever it says something."""
+    if isinstance(text, dict) and isinstance(taken, dict):
+        return all(_agrees(value, taken[key]) for key, value in text.items() if key in taken)
+    if isinstance(text, list) and isinstance(taken, list):
+        return len(text) == len(taken) and all(map(_agrees, text, taken))
+    return isinstance(text, bool) == isinstance(taken, bool) and text == taken
+
+
+def _document(kind: DocumentFormat, path: Path, taken: Any) -> str | None:
+    """Say whether a document was taken for something else than it says."""
+    return None if _agrees(kind.read(path), taken) else "something else was taken than the file says"
+
+
+def _policy(path: Path) -> None:
+    load_policy(path)
+
+
+def _checkpoint(path: Path) -> None:
+    load_checkpoint(path)
+    folder = RunFolder.open(path.parents[1])
+    Trainer(parse_config(folder.config, folder.path), folder)
+
+
+def _config(path: Path) -> str | None:
+    config = parse_config(RunFolder.open(path.parent).config, path.parent)
+    return _document(RUN_FORMAT, path, config.model_dump(mode="json"))
+
+
+def _metrics(path: Path) -> None:
+    read_last_row(path)
+    with contextlib.suppress(MetricsError):
+        column(read_metrics(path), "eval/return_greedy")
+
+
+def _study(path: Path) -> str | None:
+    folder = StudyFolder.open(path.parent)
+    return _document(STUDY_FORMAT, path, folder.study.model_dump(mode="json"))
+
+
+def _evaluation(path: Path) -> str | None:
+    found = read_evaluation(path.parent)
+    if found is None:
+        return None
+    taken = found.model_dump(mode="json")
+    return None if _agrees(parse_object(path.read_bytes(), "text"), taken) else "something else was taken"
+
+
+def _results(path: Path) -> str | None:
+    results = read_results(path)
+    all_tables(results)
+    filled(path.parent / "page.md")
+    return None
+
+
+def _manifest(path: Path) -> str | None:
+    return _document(MANIFEST_FORMAT, path, MANIFEST_FORMAT.parse(path, Manifest).model_dump(mode="json"))
+
+
+def _prey(path: Path) -> None:
+    make("predator-prey", 1, [0], {"prey": "policy", "prey_policy": str(path)})
+
+
+def _format(name: str) -> str:
+    return "esp-checkpoint" if name == "checkpoint" else "esp-policy"
+
+
+_FINAL = "checkpoints/step-000000000100-final.safetensors"
+_ALL = (
+    (f"{RUN}/policy.safetensors", _policy, "eval {scratch}/run/policy.safetensors -e 2", spoil_header),
+    (f"{RUN}/{_FINAL}", _checkpoint, "train --resume {scratch}/run", spoil_header),
+    (f"{RUN}/config.json", _config, "render {scratch}/run -o {scratch}/x.png", spoil_json),
+    (f"{RUN}/metrics.jsonl", _metrics, "report {scratch}/run", spoil_json),
+    (f"{STUDY}/study.json", _study, "report {scratch}/study --json -", spoil_json),
+    ("evaluation/final-evaluation.json", _evaluation, "report {scratch}/study", spoil_json),
+    ("results/results.json", _results, "report --fill {scratch}/results/page.md", spoil_json),
+    (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
+    ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
+)
+_NAMES = ("policy", "checkpoint", "config", "metrics", "study", "evaluation", "results", "manifest", "prey")
+KINDS = {
+    name: Kind(path, load, tuple(command.split()), spoil)
+    for name, (path, load, command, spoil) in zip(_NAMES, _ALL, strict=True)
+}
+
+
+@contextlib.contextmanager
+def _time_limit() -> Iterator[None]:
+    def stop(number: int, frame: object) -> None:
+        raise TooLongError
+
+    old = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, old)
+
+
+def _resident_bytes() -> int:
+    """Return the most memory that this process ever held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,215 @@
+"""Wrong command lines, from the commands' own parameters and the settings' own models: each ends in one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shlex
+import shutil
+import signal
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from types import NoneType
+from typing import Any, Literal
+
+from pydantic import BaseModel
+from typer.testing import CliRunner
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.app import app, build_command
+from esp_cli.commands import COMMANDS, train
+from esp_cli.networks.build import NETWORKS
+from esp_cli.prior import PriorConfig
+from esp_cli.training.config import EvaluationConfig
+from esp_envs.registry import task_class, task_names
+
+LIMIT_S = 10.0
+BATCH = 10
+WORDS = ("x", "-", "--", "é", "a b", "../../x", "$(x)", "`x`", "x" * 3000, "\udcff", "[bold]", "0x10", "1,", ",", "=a")
+INTEGERS = ("x", "1.5", "nan", "inf", "-1", "1e30", "9" * 400, "0x1", "1_", "true", "[1]", "--", "é")
+FLOATS = ("x", "nan", "inf", "-inf", "1e999", "true", "[1]", "1,5", "é")
+VALUES = (
+    '"x"',
+    "x",
+    "NaN",
+    "Infinity",
+    "1e999",
+    "9" * 400,
+    "[]",
+    "{}",
+    '{"a":1}',
+    "[" * 20_000,
+    "[1",
+    '"',
+    "\udcff",
+    "null",
+)
+
+
+class Lines:
+    """Batches of wrong command lines; see `Part`."""
+
+    def __init__(self, scratch: Path, seed: int) -> None:
+        self.scratch, self.seed = scratch / "lines", seed
+        self.scratch.mkdir()
+        self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
+        self.settings = dict(_settings())
+        self._runner, self._done = CliRunner(), 0
+        train.train_folder = lambda folder, tensorboard: None  # what can be begun is not a wrong line
+
+    def count(self) -> int:
+        """Return the command lines since the last call."""
+        done, self._done = self._done, 0
+        return done
+
+    def run(self, number: int) -> str | None:
+        """Try a batch."""
+        rng = random.Random(f"{self.seed} {number}")
+        for _ in range(BATCH):
+            with _inside(self.scratch):
+                words = self._setting_line(rng) if rng.random() < 0.5 else self._option_line(rng)
+                self._done += 1
+                wrong = self._try(words)
+                left = [entry.name for entry in self.scratch.iterdir()]
+                if left:
+                    shutil.rmtree(self.scratch)
+                    self.scratch.mkdir()
+                if wrong or left:
+                    return f"esp {shlex.join(words)[:600]}: {wrong or f'leaves {left}'}"
+        return None
+
+    def _try(self, words: list[str]) -> str | None:
+        try:
+            with _time_limit():
+                result = self._runner.invoke(app, words)
+        except TimeoutError:
+            return f"takes longer than {LIMIT_S} s"
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            return f"{type(result.exception).__name__}: {str(result.exception)[:300]}"
+        lines = result.stderr.splitlines()
+        if result.exit_code != 2:
+            return f"exit code {result.exit_code}: {result.stderr[-300:]}"
+        if result.stdout or len(lines) != 1 or not lines[0].startswith("error: ") or len(lines[0]) > 8000:
+            return f"is not one sentence: {result.output[:300]!r}"
+        return None
+
+    def _option_line(self, rng: random.Random) -> list[str]:
+        """Return a command with one bad option or argument among good ones."""
+        name = rng.choice(list(self.commands))
+        command = self.commands[name]
+        options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
+        words = []
+        for argument in command.params:
+            if argument.param_type_name == "argument":
+                sound = typing.get_args(argument.type_descriptor.annotation) or ("nowhere", "no/such/place", "x" * 300)
+                words += [rng.choice(("nowhere", *sound)) if str not in sound else "nowhere"]
+        words += _NEEDED.get(name, [])
+        choice = rng.random()
+        if choice < 0.1:
+            return [rng.choice((name.upper(), name[:-1] + "_", f"{name}x", *WORDS[:6])), *words]
+        if choice < 0.2:
+            return [name, *words, f"--{rng.choice(('no-such', 'x', 'Steps', 'out-', 'set='))}x"]
+        option = rng.choice(options)
+        bad = _bad_value(option, rng)
+        if bad is None:
+            return [name, *words, *([] if words else ["nowhere"]), "surplus", f"--{option.name}-x"]
+        return [name, *words, f"{option.opts[0]}={bad}"]
+
+    def _setting_line(self, rng: random.Random) -> list[str]:
+        """Return a training command with one bad setting."""
+        task, algorithm, network = rng.choice(task_names()), rng.choice(list(ALGORITHMS)), rng.choice(list(NETWORKS))
+        words = ["train", "--task", task, "--algo", algorithm, "--network", network, "--steps", "100", "--out", "out"]
+        section = rng.choice(["task", algorithm, "network", "prior", "evaluation"])
+        model = self.settings[{"task": f"task {task}", "network": f"network {network}"}.get(section, section)]
+        name = rng.choice(list(model.model_fields))
+        if rng.random() < 0.1:
+            name = rng.choice((f"{name}x", name.upper(), "", "__class__", "model_config", "é"))
+        return [*words, "--set", f"{section}.{name}={_bad_setting(model, name, rng)}"]
+
+
+def _settings() -> Iterator[tuple[str, type[BaseModel]]]:
+    yield from ((name, cls.config_class) for name, cls in ALGORITHMS.items())
+    yield from ((f"task {name}", task_class(name).Settings) for name in task_names())
+    yield from ((f"network {name}", cls) for name, cls in NETWORKS.items())
+    yield from (("prior", PriorConfig), ("evaluation", EvaluationConfig))
+
+
+def _bad_setting(model: type[BaseModel], name: str, rng: random.Random) -> str:
+    """Return a value that a setting cannot have."""
+    annotation = model.model_fields[name].annotation if name in model.model_fields else str
+    kinds = set(typing.get_args(annotation)) or {annotation}
+    values = [value for value in VALUES if not (value == "null" and NoneType in kinds)]
+    if bool in kinds:
+        values += ["2", "-1", "0.5"]
+    elif int in kinds or float in kinds:
+        values += ["true", "false", "1e400"]
+        values += ["0.5", "1e30", "-1000000000000"] if int in kinds and float not in kinds else []
+    return rng.choice(values)
+
+
+def _bad_value(option: Any, rng: random.Random) -> str | None:
+    """Return a value that an option cannot have; None where any text is one."""
+    kind = option.type_descriptor.annotation
+    if option.name in _NUMBERS:
+        return rng.choice(_NUMBERS[option.name])
+    if kind in (int, float, list[float], tuple[float, float]):
+        return rng.choice(INTEGERS if kind is int else FLOATS)
+    if typing.get_origin(kind) is Literal or option.name in _NAMES:
+        return rng.choice(WORDS[:8])
+    return None
+
+
+_NEEDED = {
+    "export": ["-f", "c", "-o", "out"],
+    "render": ["-o", "x.gif"],
+    "reproduce": ["--dry-run"],
+    "ablate": ["--dry-run"],
+    "compare-homomorphic": ["--dry-run"],
+    "train": ["--out", "out"],
+}
+_NAMES = (
+    "task",
+    "tasks",
+    "algo",
+    "algos",
+    "preset",
+    "transforms",
+    "physics",
+    "network",
+    "methods",
+    "formats",
+    "reference",
+)
+_NUMBERS: dict[str, tuple[str, ...]] = {
+    "steps": ("0", "-1", "1e30", "x", "1.5", "nan", "1kk", "500x", "9" * 300),
+    "at": ("0", "-1", "1e30", "x", "1.5", "nan", "1kk", "500x", "9" * 300),
+    "seeds": ("0", "-1", "x", "1,1", "5000", "1.5", "9" * 300, ",", "1,,2"),
+    "speed": ("0", "nan", "x", "-1", "1e9", "xx"),
+    "settings": ("x", "=1", "task.x=1", "mappo=1", "x.y=2", ".=1", "task.=1"),
+}
+
+
+@contextlib.contextmanager
+def _inside(folder: Path) -> Iterator[None]:
+    old = Path.cwd()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(old)
+
+
+@contextlib.contextmanager
+def _time_limit() -> Iterator[None]:
+    def stop(number: int, frame: object) -> None:
+        raise TimeoutError
+
+    old = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, old)

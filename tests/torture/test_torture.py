@@ -1,0 +1,78 @@
+"""A small part of the assault in every test run, and the assault's own negative controls."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.files import writing
+from esp_cli.training import run_folder
+from tests.torture.files import KINDS, Files
+from tests.torture.kills import Kills
+from tests.torture.lines import Lines
+from tests.torture.record import Record
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return Files(tmp_path_factory.mktemp("files"), 1)
+
+
+def test_spoilt_files_of_every_kind_are_the_right_content_or_one_sentence(files, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert [files.run(number) for number in range(2 * len(KINDS))] == [None] * 2 * len(KINDS)
+    assert files.count() == 200 * len(KINDS)
+
+
+def test_a_loader_that_lets_damage_through_is_found(files, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    right = type("Right", (), {"__ne__": lambda self, other: False})()
+    monkeypatch.setattr("esp_cli.training.checkpoint.digest", lambda tensors, description: right)
+    monkeypatch.setattr("esp_cli.training.checkpoint._check_tensors", lambda header, size: None)
+    assert any(files.run(number) for number in range(0, 20 * len(KINDS), len(KINDS)))
+
+
+def test_wrong_command_lines_end_in_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr("esp_cli.commands.train.train_folder", None)  # put back after the test
+    lines = Lines(tmp_path, 1)
+    assert [lines.run(number) for number in range(10)] == [None] * 10
+
+
+@pytest.fixture(scope="module")
+def kills(tmp_path_factory):
+    return Kills(tmp_path_factory.mktemp("kills"), 1)
+
+
+def test_runs_that_were_killed_end_as_runs_that_were_not(kills, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert [kills.run(number) for number in range(4)] == [None] * 4
+    assert kills.count() >= 4
+
+
+def test_a_run_folder_that_forgets_a_checkpoint_is_found(kills, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(run_folder.RunFolder, "truncate_metrics", lambda self, after_step: 0)
+    assert any(kills.run(number) for number in range(100, 110))
+
+
+def test_a_record_goes_on_where_it_ended(tmp_path):
+    class Part:
+        def __init__(self):
+            self.seen = []
+
+        def run(self, number):
+            self.seen.append(number)
+            return "bad" if number == 1 else None
+
+        def count(self):
+            return 10
+
+    first, second = Part(), Part()
+    Record.open(tmp_path / "r.json", 3).run("x", first, float("inf"), 30)
+    record = Record.open(tmp_path / "r.json", 3)
+    record.run("x", second, float("inf"), 50)
+    assert (first.seen, second.seen) == ([0, 1, 2], [3, 4])
+    assert record.counts == {"x": 50}
+    assert [finding.number for finding in record.findings] == [1]
+    assert writing.TEMPORARY_PREFIX not in "".join(entry.name for entry in tmp_path.iterdir())
+    with pytest.raises(SystemExit, match="is the record of seed 3"):
+        Record.open(tmp_path / "r.json", 4)
