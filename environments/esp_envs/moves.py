@@ -1,4 +1,4 @@
-"""Discrete actions that move an agent in the plane, in a line."""
+"""Actions that move an agent in one of some directions of the plane."""
 
 from __future__ import annotations
 
