@@ -2,7 +2,7 @@
 
 python tests/benchmarks/benchmarl_navigation.py --frames 300000 --seeds 0 1 2 --out runs/benchmarl
 
-Writes one JSON file: returns of evaluation episodes by frames, and seconds of training, for each seed and both learners.
+Writes one JSON file: mean returns of training episodes by frames and seconds of training, for each seed and learner.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Record(Callback):
         self.rows.append((self.experiment.total_frames, returns, self.trained_s))
         self.since = time.perf_counter()
 
-    def on_train_end(self, training_td: Any, group: str) -> None:  # noqa: ARG002 - BenchMARL's signature
+    def on_train_end(self, training_td: Any, group: str) -> None:
         """Add the time of the update."""
         self.trained_s += time.perf_counter() - self.since
 
@@ -79,10 +79,10 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, dict[int, list[tuple[int, float, float]]]] = {"plain": {}, "esp": {}}
     for seed in given.seeds:
-        for name in results:
+        for name, by_seed in results.items():
             symmetry = Symmetry(observation=SEEN, action=FORCE, group="d4", num_agents=3, seed=seed)
             callbacks = [SymmetryCallback(symmetry, given.coefficient)] if name == "esp" else []
-            results[name][seed] = run(seed, given.frames, callbacks, given.out)
+            by_seed[seed] = run(seed, given.frames, callbacks, given.out)
             (given.out / "results.json").write_text(json.dumps(results))
 
 
