@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from esp_cli.deploy.library import LoadedPolicy, load_policy
+    from esp_cli.library.metrics import Metrics
+    from esp_cli.library.run import Run, train
     from esp_cli.loop.symmetry import Symmetry
+    from esp_cli.training.trainer import Progress
     from esp_envs.moves import discrete_moves
     from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, layout
 
@@ -19,19 +22,27 @@ __all__ = [
     "Kind",
     "Layout",
     "LoadedPolicy",
+    "Metrics",
+    "Progress",
+    "Run",
     "Symmetry",
     "__version__",
     "discrete_moves",
     "layout",
     "load_policy",
+    "train",
 ]
 __version__ = "0.1.0"
 
 _HOMES = {
     "LoadedPolicy": "esp_cli.deploy.library",
+    "Metrics": "esp_cli.library.metrics",
+    "Progress": "esp_cli.training.trainer",
+    "Run": "esp_cli.library.run",
     "Symmetry": "esp_cli.loop.symmetry",
     "discrete_moves": "esp_envs.moves",
     "load_policy": "esp_cli.deploy.library",
+    "train": "esp_cli.library.run",
 }
 """Where a public name is defined; the others describe spaces."""
 

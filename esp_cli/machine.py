@@ -25,3 +25,17 @@ def prepare() -> None:
     libc.mallopt(_M_MMAP_THRESHOLD, 1024 * _MEBIBYTE)
     libc.mallopt(_M_TRIM_THRESHOLD, 2047 * _MEBIBYTE)
     libc.mallopt(_M_TOP_PAD, 64 * _MEBIBYTE)
+
+
+def resolve_device(wanted: str) -> str:
+    """Return "cpu" or "cuda" for what --device asks for.
+
+    Raises:
+        ValueError: a GPU is asked for and there is none.
+    """
+    import torch  # noqa: PLC0415 - takes a second
+
+    available = torch.cuda.is_available()
+    if wanted == "cuda" and not available:
+        raise ValueError("there is no CUDA device here; use --device cpu or auto")
+    return "cuda" if wanted != "cpu" and available else "cpu"

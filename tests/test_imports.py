@@ -33,7 +33,8 @@ RANKS = {
     "studies": 6,
     "deploy": 7,
     "reporting": 7,
-    "": 7.5,  # esp_cli itself: the version, and what other programs use of deploy
+    "library": 7.5,
+    "": 7.7,  # esp_cli itself: the version, and what other programs use of deploy
     "commands": 8,
     "app": 9,
 }

@@ -123,20 +123,6 @@ def check_finite(option: str, *values: float) -> None:
             raise ValueError(f"{option} {value} is not a finite number; write for example {option} -125")
 
 
-def resolve_device(wanted: str) -> str:
-    """Return "cpu" or "cuda" for what --device asks for.
-
-    Raises:
-        ValueError: a GPU is asked for and there is none.
-    """
-    import torch
-
-    available = torch.cuda.is_available()
-    if wanted == "cuda" and not available:
-        raise ValueError("there is no CUDA device here; use --device cpu or auto")
-    return "cuda" if wanted != "cpu" and available else "cpu"
-
-
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     """Wrap a parser so that its message names the option."""
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import os
-from pathlib import Path
+from contextlib import ExitStack
 from typing import Annotated, Literal
 
 import typer
@@ -27,8 +25,6 @@ EPILOG = """Examples:\n
     esp render runs/cn-mappo -o cn.gif --episodes 5 --size 320 --speed 0.5\n
     esp render runs/fc-mappo -o formation.gif --speed 4x\n
     esp render runs/fc-mappo -o formation.png --view top"""
-
-FILMS, PICTURE = (".gif", ".mp4"), ".png"
 
 
 def parse_speed(value: str | float) -> float:
@@ -73,43 +69,37 @@ def render(
     prior: BundledPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
-    kind = _kind_of(out, episodes)
     from esp_cli.deploy.bundled import open_policy
-    from esp_cli.drawing import films, rendering
-    from esp_cli.training.build import build_environment
+    from esp_cli.drawing.draw import check_target, draw
     from esp_cli.training.loading import transfer
 
+    kind = check_target(out, episodes)
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
-    seed = trained.config.seeds[0] if seed is None else seed
-    env = build_environment(trained.config, 1, "film")
-    count = 1 if kind == PICTURE else episodes or rendering.default_episodes(trained.spec)
-    with rendering.open_painter(env, view, size) as painter:
-        recorded = rendering.record(trained, env, seed, count, not stochastic)
-        if painter.note:
-            console.note(painter.note)
-        if kind == PICTURE:
-            rendering.write_picture(out, painter, recorded[0], f"{trained.config.task}, seed {seed}", size)
-            console.note(f"episode of {len(recorded[0]) - 1} steps -> {out}")
-            return
-        rate = fps or rendering.FRAMES_PER_SECOND
-        if kind == ".gif":
-            rate = min(rate, films.GIF_FRAMES_PER_SECOND)
-        period = trained.spec.control_period_s
-        taken = rendering.shots(recorded, rendering.stride(period, speed, rate))
-        with console.TrainingProgress(len(taken), description="draw") as progress:
-            rendering.write_film(out, painter, taken, period / speed, progress.update)
-    console.note(f"{len(taken)} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
+    with ExitStack() as showing:
+        progress: list[console.TrainingProgress] = []
 
+        def watch(done: int, total: int) -> None:
+            if not progress:
+                progress.append(showing.enter_context(console.TrainingProgress(total, description="draw")))
+            progress[0].update(done)
 
-def _kind_of(out: Path, episodes: int | None) -> str:
-    """Return the ending of a file that can be drawn into."""
-    kind = out.suffix.lower()
-    if kind not in (*FILMS, PICTURE):
-        raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
-    if kind == PICTURE and episodes is not None and episodes > 1:
-        raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
-    if out.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
-    return kind
+        drawing = draw(
+            trained,
+            out,
+            seed=seed,
+            episodes=episodes,
+            view=view,
+            size=size,
+            speed=speed,
+            fps=fps,
+            greedy=not stochastic,
+            watch=watch,
+        )
+    if drawing.note:
+        console.note(drawing.note)
+    if kind == ".png":
+        console.note(f"episode of {drawing.steps} steps -> {out}")
+    else:
+        console.note(f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")

@@ -20,7 +20,6 @@ from esp_cli.commands.options import (
     SetOption,
     parse_assignments,
     parse_count,
-    resolve_device,
 )
 
 if TYPE_CHECKING:
@@ -125,6 +124,7 @@ class StudyChoices:
         Raises:
             ValueError: a name, number or setting that cannot be read.
         """
+        from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
         return Request(

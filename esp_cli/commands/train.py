@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shlex
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -21,13 +20,12 @@ from esp_cli.commands.options import (
     TaskOption,
     TransformsOption,
     parse_assignments,
-    resolve_device,
 )
 from esp_cli.commands.stopping import stop_requests
 
 if TYPE_CHECKING:
+    from esp_cli.library.run import Run
     from esp_cli.training.config import RunConfig
-    from esp_cli.training.run_folder import RunFolder
     from esp_cli.training.trainer import Progress, Trainer
 
 EPILOG = """Examples:\n
@@ -79,13 +77,11 @@ def train(
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard files too.")] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
-    from esp_cli.training.build import build_learner
-    from esp_cli.training.config import resolve_config
-    from esp_cli.training.run_folder import RunFolder
+    from esp_cli.library.run import Run, start
 
     if resume is not None:
         _refuse_beside_resume(context)
-        train_folder(RunFolder.open(resume), tensorboard)
+        _train(Run(resume), tensorboard)
         return
     chosen = {
         "prior.kind": prior,
@@ -95,14 +91,8 @@ def train(
         "task.physics": physics,
     }
     overrides = {name: value for name, value in chosen.items() if value is not None} | parse_assignments(settings or [])
-    config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), overrides)
-    build_learner(config)  # refuses settings that do not fit together before a run folder exists
-    folder = RunFolder.create(out or _new_folder(config), config.model_dump(mode="json"))
-    train_folder(folder, tensorboard)
-
-
-def _new_folder(config: RunConfig) -> Path:
-    return Path("runs") / f"{config.task}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    run = start(task, algo, steps=steps, seeds=seeds, preset=preset, settings=overrides, device=device, out=out)
+    _train(run, tensorboard)
 
 
 def _refuse_beside_resume(context: typer.Context) -> None:
@@ -119,19 +109,14 @@ def _refuse_beside_resume(context: typer.Context) -> None:
         )
 
 
-def train_folder(folder: RunFolder, tensorboard: bool) -> None:
-    """Train in a locked run folder until the end or an interrupt, then print the result and the next command."""
-    from esp_cli.training.loading import parse_config
-    from esp_cli.training.trainer import Trainer
-
-    config = parse_config(folder.config, folder.path)
-    resolve_device(config.device)
-    with folder.lock(), stop_requests("stopping after this iteration") as requests:
-        trainer = Trainer(config, folder, tensorboard)
-        if trainer.is_complete and folder.policy_path.is_file():
-            console.note(f"{folder.path} is complete at {console.format_count(trainer.step)} steps")
+def _train(run: Run, tensorboard: bool) -> None:
+    """Train until the end or an interrupt, then print the result and the next command."""
+    with run.trainer(tensorboard) as trainer, stop_requests("stopping after this iteration") as requests:
+        if trainer.is_complete and run.is_complete:
+            console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
             return
-        _announce(config, folder, trainer.step)
+        config = run.config
+        _announce(config, run.path, trainer.step)
         with console.TrainingProgress(config.steps, len(config.seeds), trainer.step, config.task) as progress:
 
             def listen(news: Progress) -> bool:
@@ -144,13 +129,13 @@ def train_folder(folder: RunFolder, tensorboard: bool) -> None:
     if not complete:
         console.note(
             f"stopped at {console.format_count(trainer.step)} steps; continue with: "
-            f"{shlex.join(['esp', 'train', '--resume', str(folder.path)])}"
+            f"{shlex.join(['esp', 'train', '--resume', str(run.path)])}"
         )
         raise typer.Exit(130)
-    _report(trainer, folder)
+    _report(trainer, run.path)
 
 
-def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
+def _announce(config: RunConfig, path: Path, step: int) -> None:
     prior = config.prior
     symmetry = (
         "no prior" if prior.kind == "none" else f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
@@ -158,7 +143,7 @@ def _announce(config: RunConfig, folder: RunFolder, step: int) -> None:
     verb = f"resuming at {console.format_count(step)}" if step else "training"
     console.note(
         f"{verb}: {config.algorithm} on {config.task}, {symmetry}, {len(config.seeds)} seed(s), "
-        f"{console.format_count(config.steps)} steps each -> {folder.path}"
+        f"{console.format_count(config.steps)} steps each -> {path}"
     )
 
 
@@ -173,7 +158,7 @@ def _shown(news: Progress) -> dict[str, float]:
     return out
 
 
-def _report(trainer: Trainer, folder: RunFolder) -> None:
+def _report(trainer: Trainer, path: Path) -> None:
     import numpy as np
 
     from esp_cli.evaluation.statistics import mean_and_sem
@@ -184,5 +169,5 @@ def _report(trainer: Trainer, folder: RunFolder) -> None:
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
-    path = shlex.quote(str(folder.path))
-    console.note(f"next: esp eval {path}    esp render {path} -o out.gif")
+    quoted = shlex.quote(str(path))
+    console.note(f"next: esp eval {quoted}    esp render {quoted} -o out.gif")

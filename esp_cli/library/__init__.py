@@ -1,0 +1,1 @@
+"""The application as a library: what the commands do, as functions for other programs."""

@@ -1,0 +1,192 @@
+"""Runs for other programs: train, read the metrics, evaluate, draw, and let the policy act.
+
+from esp_cli import train
+
+run = train("navigation", "mappo", steps=100_000, seeds=(0, 1), out="runs/cn")
+print(run.metrics["eval/return_greedy"][-1], run.evaluate(64).greedy.mean)
+run.render("cn.gif")
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from esp_cli.deploy.library import LoadedPolicy
+from esp_cli.drawing.draw import Drawing, draw
+from esp_cli.drawing.rendering import View
+from esp_cli.evaluation.final import FinalEvaluation
+from esp_cli.evaluation.final import evaluate as evaluate_policy
+from esp_cli.library.metrics import Metrics
+from esp_cli.machine import resolve_device
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, transfer
+from esp_cli.training.metrics import read_metrics
+from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.trainer import Listener, Progress, Trainer
+
+
+class Run:
+    """A run in its folder: S seeds of one task, algorithm, network and prior.
+
+    Args:
+        path: of the run folder.
+
+    Attributes:
+        path: of the run folder.
+        config: that decides its numbers.
+
+    Raises:
+        ValueError: there is no run, or its configuration is damaged or of another version.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.folder = RunFolder.open(Path(path))
+        self.path = self.folder.path
+        self.config: RunConfig = parse_config(self.folder.config, self.path)
+
+    @property
+    def metrics(self) -> Metrics:
+        """What was logged so far: arrays [U, S] by name, one row per update and one column per seed."""
+        return Metrics(read_metrics(self.folder.metrics_path), self.config.seeds)
+
+    @property
+    def policy(self) -> LoadedPolicy:
+        """The newest policy of the first seed, numpy in and out; `load_policy(run.path, seed=k)` gives another's."""
+        return LoadedPolicy(load_policy(self.path))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether training reached its last step."""
+        return self.folder.policy_path.is_file()
+
+    @contextmanager
+    def trainer(self, tensorboard: bool = False) -> Iterator[Trainer]:
+        """Hold the folder against other processes, and yield what trains it from its newest checkpoint on.
+
+        Raises:
+            ValueError: another process trains it, or its device is not there.
+        """
+        resolve_device(self.config.device)
+        with self.folder.lock():
+            yield Trainer(self.config, self.folder, tensorboard)
+
+    def train(self, listener: Listener | None = None) -> bool:
+        """Train on from the newest checkpoint, bit for bit as without a break.
+
+        Args:
+            listener: told of progress after every update; False asks for a clean stop.
+
+        Returns:
+            Whether the run is complete.
+
+        Raises:
+            ValueError: another process trains it, or no seed has finite numbers any more.
+        """
+        with self.trainer() as trainer:
+            return (trainer.is_complete and self.is_complete) or trainer.run(listener or _go_on)
+
+    def evaluate(self, episodes: int = 320, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
+        """Play episodes with the newest policies, and with the reference policies of the task.
+
+        Args:
+            episodes: per seed, greedy and stochastic each.
+            settings: of the task, without the prefix "task.", where they differ from those of training.
+
+        Raises:
+            ValueError: there is no checkpoint yet, or a setting does not fit the policy.
+        """
+        return evaluate_policy(self._trained(settings), episodes)
+
+    def render(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        seed: int | None = None,
+        episodes: int | None = None,
+        view: View = "auto",
+        size: int = 480,
+        speed: float = 1.0,
+        greedy: bool = True,
+        settings: Mapping[str, object] | None = None,
+    ) -> Drawing:
+        """Draw episodes of one seed's policy as a film (.gif, .mp4), or the trajectories of one episode (.png).
+
+        Args:
+            out: the file.
+            seed: whose policy acts; by default the first.
+            episodes: of a film.
+            view: "top" from above, "3d" in space, "auto" the latter where the task has it.
+            size: of the longer side, pixels.
+            speed: times real time.
+            greedy: whether it takes its most probable actions, or draws them.
+            settings: as of `evaluate`.
+
+        Raises:
+            ValueError: another ending, no checkpoint yet, no such seed or view.
+        """
+        trained = self._trained(settings)
+        return draw(trained, Path(out), seed=seed, episodes=episodes, view=view, size=size, speed=speed, greedy=greedy)
+
+    def _trained(self, settings: Mapping[str, object] | None) -> TrainedPolicy:
+        return transfer(load_policy(self.path), settings or {})
+
+
+def start(
+    task: str = "navigation",
+    algo: str = "mappo",
+    *,
+    steps: int = 1_000_000,
+    seeds: Sequence[int] = (0,),
+    preset: str = "default",
+    settings: Mapping[str, object] | None = None,
+    device: str = "cpu",
+    out: str | os.PathLike[str] | None = None,
+) -> Run:
+    """Make the folder of a new run, which `Run.train` then trains; arguments and errors as of `train`."""
+    config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings)
+    build_learner(config)  # refuses settings that do not fit together before a run folder exists
+    name = f"{config.task}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    path = Path("runs") / name if out is None else Path(out)
+    return Run(RunFolder.create(path, config.model_dump(mode="json")).path)
+
+
+def train(
+    task: str = "navigation",
+    algo: str = "mappo",
+    *,
+    steps: int = 1_000_000,
+    seeds: Sequence[int] = (0,),
+    preset: str = "default",
+    settings: Mapping[str, object] | None = None,
+    device: str = "cpu",
+    out: str | os.PathLike[str] | None = None,
+    listener: Callable[[Progress], bool] | None = None,
+) -> Run:
+    """Train S seeds at once, as `esp train` does, and return the run.
+
+    Args:
+        task: name of a task.
+        algo: "mappo", "maddpg" or "qmix".
+        steps: environment steps per seed.
+        seeds: the run's seeds.
+        preset: "default" or "paper".
+        settings: dotted names to values, as `--set` takes them: {"prior.kind": "none", "task.num_agents": 4}.
+        device: "cpu", "cuda", or "auto" for the latter where there is one.
+        out: the run folder; by default a new one in runs/.
+        listener: told of progress after every update; False asks for a clean stop, after which `Run.train` goes on.
+
+    Raises:
+        ValueError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
+    """
+    run = start(task, algo, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, out=out)
+    run.train(listener)
+    return run
+
+
+def _go_on(_: Progress) -> bool:
+    return True

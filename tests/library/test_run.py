@@ -1,0 +1,134 @@
+"""The application as functions: the same numbers as the commands, metrics as arrays, stopping and going on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import esp_cli
+from esp_cli import Progress, Run, load_policy, train
+from esp_cli.library.metrics import Metrics
+from esp_cli.training.metrics import column, read_metrics
+from tests.cli.running import esp
+
+SMALL = {"mappo.num_envs": 4, "mappo.num_steps": 25, "evaluation.every_steps": 200, "evaluation.episodes": 2}
+OPTIONS = [word for name, value in SMALL.items() for word in ("--set", f"{name}={value}")]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return a finished run of two seeds."""
+    out = tmp_path_factory.mktemp("runs") / "cn"
+    return train("navigation", steps=400, seeds=(3, 7), settings=SMALL, out=out)
+
+
+def test_a_run_has_the_weights_of_the_command(run: Run, tmp_path: Path) -> None:
+    words = ["train", "--task", "navigation", "--steps", "400", "--seeds", "3,7", "--out", str(tmp_path / "cn")]
+    esp(*words, *OPTIONS)
+    obs = np.random.default_rng(0).standard_normal((20, 14))
+    for seed in (3, 7):
+        mine, theirs = load_policy(run.path, seed=seed), load_policy(tmp_path / "cn", seed=seed)
+        for one, other in zip(
+            mine.trained.policy.state_dict().values(), theirs.trained.policy.state_dict().values(), strict=True
+        ):
+            assert (one == other).all()
+    assert np.array_equal(run.policy.act(obs), load_policy(run.path, seed=3).act(obs))
+    assert run.is_complete
+
+
+def test_metrics_are_arrays_of_updates_and_seeds(run: Run) -> None:
+    metrics, rows = run.metrics, read_metrics(run.folder.metrics_path)
+    assert metrics.steps.tolist() == [row["step"] for row in rows]
+    assert metrics.seeds == (3, 7)
+    returns = metrics["eval/return_greedy"]
+    assert returns.shape == (len(rows), 2)
+    measured = ~np.isnan(returns[:, 0])
+    steps, values = column(rows, "eval/return_greedy")
+    assert metrics.steps[measured].tolist() == steps.tolist()
+    assert np.array_equal(returns[measured], values)
+    assert metrics["time/steps_per_second"].shape == (len(rows), 1)
+    assert set(metrics) == {name for row in rows for name in row} - {"step"}
+    assert len(metrics) == len(set(metrics))
+
+
+def test_a_stopped_seed_and_a_number_that_was_not_measured_are_nan() -> None:
+    metrics = Metrics([{"step": 0, "a": [None, 2.0]}, {"step": 5, "b": None}], (0, 1))
+    assert np.array_equal(metrics["a"], [[np.nan, 2], [np.nan, np.nan]], equal_nan=True)
+    assert metrics["b"].shape == (2, 1)
+    with pytest.raises(KeyError):
+        _ = metrics["c"]
+
+
+def test_metrics_become_a_table(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    table = run.metrics.to_pandas()
+    assert list(table.index) == run.metrics.steps.tolist()
+    assert np.array_equal(table["train/return", 7], run.metrics["train/return"][:, 1], equal_nan=True)
+    assert ("time/elapsed_s", "run") in table.columns
+    assert isinstance(table, pandas.DataFrame)
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(ValueError, match="to_pandas needs pandas, which is not installed"):
+        run.metrics.to_pandas()
+
+
+def test_a_listener_stops_a_run_and_training_goes_on_bit_for_bit(run: Run, tmp_path: Path) -> None:
+    told: list[Progress] = []
+
+    def listen(news: Progress) -> bool:
+        told.append(news)
+        return len(told) < 3
+
+    stopped = train("navigation", steps=400, seeds=(3, 7), settings=SMALL, out=tmp_path / "cn", listener=listen)
+    assert [news.step for news in told] == [0, 100, 200]
+    assert not stopped.is_complete
+    again = Run(stopped.path)
+    assert again.train()
+    assert again.is_complete
+    assert again.train(), "nothing is left to do"
+    assert np.array_equal(again.metrics["train/return"], run.metrics["train/return"], equal_nan=True)
+
+
+def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Path) -> None:
+    result = run.evaluate(4)
+    esp("eval", run.path, "--episodes", 4, "--json", tmp_path / "result.json")
+    written = type(result).model_validate_json((tmp_path / "result.json").read_text())
+    assert written.greedy == result.greedy
+    assert run.evaluate(4, {"convention": "pettingzoo"}).convention != result.convention
+    drawing = run.render(tmp_path / "cn.gif", episodes=1, size=64, view="top")
+    assert drawing.path.read_bytes().startswith(b"GIF")
+    assert drawing.steps == 25
+    assert drawing.frames > 5
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ({"task": "chess"}, "unknown task 'chess'"),
+        ({"algo": "dqn"}, "unknown algorithm 'dqn'"),
+        ({"settings": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
+        ({"steps": 0}, "steps"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_no_folder(
+    choice: dict[str, object], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match=sentence) as caught:
+        train(**{"out": tmp_path / "run", **choice})  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="nothing"):
+        Run(tmp_path / "nothing")
+    with pytest.raises(ValueError, match="exists: resume with"):
+        train(out=run.path)
+    with pytest.raises(ValueError, match="cannot write"):
+        run.render(tmp_path / "film.txt")
+
+
+def test_public_names_are_found() -> None:
+    for name in esp_cli.__all__:
+        assert getattr(esp_cli, name) is not None
