@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import esp_cli
 from esp_cli import Progress, Run, load_policy, train
 from esp_cli.library.metrics import Metrics
 from esp_cli.training.metrics import column, read_metrics
@@ -127,8 +126,3 @@ def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
         train(out=run.path)
     with pytest.raises(ValueError, match="cannot write"):
         run.render(tmp_path / "film.txt")
-
-
-def test_public_names_are_found() -> None:
-    for name in esp_cli.__all__:
-        assert getattr(esp_cli, name) is not None
