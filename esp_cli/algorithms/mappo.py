@@ -15,7 +15,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from esp_cli.algorithms.batch import Batch
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
 from esp_cli.algorithms.losses import (
     clip_gradients_per_seed,
@@ -26,9 +25,10 @@ from esp_cli.algorithms.losses import (
     value_loss,
 )
 from esp_cli.algorithms.normalisation import ValueNormaliser
-from esp_cli.algorithms.rollout import Collector, Rollout, values_along
+from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.networks.critic import Critic, CriticInput
+from esp_cli.networks.critic import Critic
+from esp_cli.networks.io_spec import Reads
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
@@ -56,7 +56,7 @@ class MappoConfig(LearnerConfig):
     anneal_entropy: bool = Field(True, description="linearly to 0 over the run")
     bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
     value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
-    critic_input: CriticInput = Field(
+    critic_input: Reads = Field(
         "observations",
         description="the task's global state, all agents' observations in a row, or each agent's own observation",
     )
@@ -131,11 +131,7 @@ class Mappo(Learner):
         return self.config.num_envs * self.config.num_steps
 
     def iterate(self, progress: float) -> Iteration:
-        """Collect one rollout, learn from it, and return what came out.
-
-        Args:
-            progress: share of the run that is done, 0 to 1, for annealing.
-        """
+        """Collect one rollout, learn from it, and return what came out; see `Learner.iterate`."""
         rollout = self.collector.collect(self.config.num_steps)
         metrics = {"train/return": self.collector.pop_mean_return(), **self.update(rollout, progress)}
         return self.iteration(metrics, *(metrics[f"train/{name}"] for name in WATCHED))

@@ -215,11 +215,7 @@ class OffPolicyLearner(Learner):
         )
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            ValueError: tensors of another shape or name, so of another configuration.
-        """
+        """Restore what `state_dict` returned; see `Learner.load_state_dict`."""
         super().load_state_dict(tensors)
         replay = below(tensors, "replay")
         if "counters" not in tensors or tensors["counters"].shape != (2,):

@@ -9,11 +9,16 @@ from __future__ import annotations
 Sections = dict[str, dict[str, object]]
 """Settings by section: the algorithm's name, "network", "prior" or "evaluation"."""
 
-_MAPPO_PAPER_NETWORK: dict[str, object] = {
-    "name": "gru",
-    "hidden": (64, 64),
-    "activation": "relu",
-    "layer_norm": True,
+_PAPER_NETWORK: dict[str, object] = {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True}
+_PAPER_PRIOR: dict[str, object] = {"transforms": "rot90", "consistency_coef": 0.5}
+_PAPER_OFF_POLICY: dict[str, object] = {
+    "num_envs": 1,
+    "rounds": 20,
+    "replay_episodes": 5000,
+    "td_lambda": 0.0,
+    "learning_rate": 7e-4,
+    "anneal_learning_rate": False,
+    "critic_sees_time": False,
 }
 
 # "paper" is supplement table 2 (MAPPO) or 3 (MADDPG, QMIX), and the MAPPO paper's defaults where these are silent.
@@ -30,44 +35,29 @@ PRESETS: dict[str, dict[str, Sections]] = {
                 "clip_value": True,
                 "value_decay": 0.99999,
             },
-            "network": _MAPPO_PAPER_NETWORK,
-            "prior": {"transforms": "rot90", "consistency_coef": 0.5},
+            "network": _PAPER_NETWORK,
+            "prior": _PAPER_PRIOR,
         },
     },
     "maddpg": {
         "default": {"network": {"activation": "relu"}},
         "paper": {
             "maddpg": {
-                "num_envs": 1,
-                "rounds": 20,
-                "replay_episodes": 5000,
-                "td_lambda": 0.0,
-                "learning_rate": 7e-4,
+                **_PAPER_OFF_POLICY,
                 "actor_learning_rate": 7e-4,
-                "anneal_learning_rate": False,
-                "critic_sees_time": False,
                 "actor_actions": "own",
                 "output_penalty": 0.0,
             },
-            "network": _MAPPO_PAPER_NETWORK,
-            "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+            "network": _PAPER_NETWORK,
+            "prior": {**_PAPER_PRIOR, "replay": "stored"},
         },
     },
     "qmix": {
         "default": {"network": {"activation": "relu"}},
         "paper": {
-            "qmix": {
-                "num_envs": 1,
-                "rounds": 20,
-                "replay_episodes": 5000,
-                "critic_input": "state",
-                "learning_rate": 7e-4,
-                "anneal_learning_rate": False,
-                "td_lambda": 0.0,
-                "critic_sees_time": False,
-            },
-            "network": _MAPPO_PAPER_NETWORK,
-            "prior": {"transforms": "rot90", "consistency_coef": 0.5, "replay": "stored"},
+            "qmix": {**_PAPER_OFF_POLICY, "critic_input": "state"},
+            "network": _PAPER_NETWORK,
+            "prior": {**_PAPER_PRIOR, "replay": "stored"},
         },
     },
 }

@@ -1,4 +1,4 @@
-"""On-policy experience: what one round of acting in all worlds leaves behind."""
+"""On-policy experience: what one round of acting in all worlds leaves behind, and its shape for gradient steps."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from esp_cli.networks.critic import Critic
 from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.prior import SeedBatch
 from esp_envs.base import Environment, Observation
 
 
@@ -33,6 +34,23 @@ class Rollout:
     ended: Tensor
     last: Observation
     finals: dict[int, Observation] = field(default_factory=dict)
+
+
+@dataclass
+class Batch(SeedBatch):
+    """Experience ready for gradient steps: B sequences of tau steps (tau = 1 unless the network is recurrent).
+
+    Shape:
+        obs [S, B, tau, N, D], state [S, B, tau, state width], action [S, B, tau, N(, width)],
+        log_prob and advantage [S, B, tau, N], target and value [S, B, tau, C] in normalised units.
+    """
+
+    per_agent = ("log_prob", "advantage", "target", "value")
+
+    log_prob: Tensor
+    advantage: Tensor
+    target: Tensor
+    value: Tensor
 
 
 class Collector:

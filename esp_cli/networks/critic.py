@@ -12,8 +12,6 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.io_spec import IoSpec, Reads
 from esp_envs.spec import TaskSpec
 
-CriticInput = Reads
-
 
 class Critic(nn.Module):
     """S critics of one shape.
@@ -30,7 +28,7 @@ class Critic(nn.Module):
     """
 
     def __init__(
-        self, spec: TaskSpec, reads: CriticInput, network: NetworkConfig, generators: Sequence[torch.Generator]
+        self, spec: TaskSpec, reads: Reads, network: NetworkConfig, generators: Sequence[torch.Generator]
     ) -> None:
         super().__init__()
         self.reads = reads

@@ -5,8 +5,7 @@ import copy
 import pytest
 import torch
 
-from esp_cli.algorithms.batch import Batch
-from esp_cli.algorithms.rollout import values_along
+from esp_cli.algorithms.rollout import Batch, values_along
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
