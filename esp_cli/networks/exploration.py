@@ -45,12 +45,20 @@ class ExploringHead(Head):
         return self.epsilon.view(-1, *[1] * (like.dim() - 1))
 
 
-class EpsilonGreedy(ExploringHead):
-    """Outputs are action values; the best action, or with probability epsilon a uniformly random one."""
+class ExploringChoice(ExploringHead):
+    """A head that chooses one of A actions."""
 
     def __init__(self, space: Discrete, num_seeds: int) -> None:
         super().__init__(num_seeds)
         self.num_outputs = self.action_width = space.count
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Return one-hot rows."""
+        return one_hot(action, self.num_outputs).float()
+
+
+class EpsilonGreedy(ExploringChoice):
+    """Outputs are action values; the best action, or with probability epsilon a uniformly random one."""
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw, per seed, whether to explore and where to: uniform [S, *shape, 2]."""
@@ -70,26 +78,14 @@ class EpsilonGreedy(ExploringHead):
         """Return the mean squared difference of the values: [S, B, N]."""
         return (p - q).square().mean(-1)
 
-    def encode(self, action: Tensor) -> Tensor:
-        """Return one-hot rows."""
-        return one_hot(action, self.num_outputs).float()
 
-
-class ExploringCategorical(ExploringHead, Categorical):
+class ExploringCategorical(ExploringChoice, Categorical):
     """One of A actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""
-
-    def __init__(self, space: Discrete, num_seeds: int) -> None:
-        super().__init__(num_seeds)
-        self.num_outputs = self.action_width = space.count
 
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
         """Draw an action from the mixture by inverting its cumulative distribution at `noise`."""
         share = self._epsilon(log_probs)
         return Categorical.sample(self, ((1 - share) * log_probs.exp() + share / self.num_outputs).log(), noise)
-
-    def encode(self, action: Tensor) -> Tensor:
-        """Return one-hot rows."""
-        return one_hot(action, self.num_outputs).float()
 
     @property
     def choices(self) -> Tensor:

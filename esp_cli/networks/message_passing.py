@@ -195,12 +195,7 @@ class MessagePassing(Memoryless):
     """
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        io: IoSpec,
-        config: NetworkConfig,
-        group: str,
-        output_gain: float,
+        self, generators: Sequence[torch.Generator], io: IoSpec, config: NetworkConfig, group: str, output_gain: float
     ) -> None:
         super().__init__()
         if io.reads != "own":

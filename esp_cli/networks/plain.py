@@ -71,12 +71,7 @@ class MLP(SeedMLP, Memoryless):
     """A perceptron."""
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        inputs: int,
-        outputs: int,
-        config: PlainConfig,
-        output_gain: float,
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
@@ -86,12 +81,7 @@ class GRU(Network):
     """Hidden layers, a gated recurrent unit, a linear head: the recurrent network of the MAPPO paper."""
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        inputs: int,
-        outputs: int,
-        config: PlainConfig,
-        output_gain: float,
+        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         super().__init__()
         width = config.hidden[-1]
