@@ -138,7 +138,8 @@ class AgentPermutations(Group):
 
     def witnesses(self) -> tuple[Element, ...]:
         """Return the swap of the first two agents and the round of all of them, which generate every order."""
-        return tuple(PlaneElement(permutation=p) for p in _swap_and_round(self.num_agents))
+        swap, cycle = (1, 0, *range(2, self.num_agents)), (*range(1, self.num_agents), 0)
+        return PlaneElement(permutation=swap), PlaneElement(permutation=cycle)
 
 
 class ProductGroup(Group):
@@ -160,10 +161,6 @@ class ProductGroup(Group):
     def witnesses(self) -> tuple[Element, ...]:
         """Return those of both factors."""
         return self.plane.witnesses() + self.agents.witnesses()
-
-
-def _swap_and_round(num_agents: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    return (1, 0, *range(2, num_agents)), (*range(1, num_agents), 0)
 
 
 def cyclic(n: int) -> FiniteGroup:

@@ -124,7 +124,15 @@ def _read_plane(word: str, _: int) -> Element | Group | None:
 def _read_agents(word: str, num_agents: int) -> Element | Group | None:
     if word == "agents":
         return agent_permutations(num_agents)
-    return _permutation(word, num_agents) if re.fullmatch(r"agents(-\d{1,4})+", word) else None
+    if not re.fullmatch(r"agents(-\d{1,4})+", word):
+        return None
+    sigma = tuple(int(x) for x in word.split("-")[1:])
+    if sorted(sigma) != list(range(num_agents)):
+        order = "-".join(map(str, (*range(1, num_agents), 0)))
+        raise ValueError(
+            f"'{word}' is not an order of {num_agents} agents; write each place once, as in agents-{order}"
+        )
+    return PlaneElement(permutation=sigma)
 
 
 READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents]
@@ -135,13 +143,3 @@ def _polygon(letter: str, n: int) -> FiniteGroup:
     if not 1 <= n <= _MAX_FOLD:
         raise ValueError(f"group '{letter}{n}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
     return cyclic(n) if letter == "c" else dihedral(n)
-
-
-def _permutation(word: str, num_agents: int) -> PlaneElement:
-    sigma = tuple(int(x) for x in word.split("-")[1:])
-    if sorted(sigma) != list(range(num_agents)):
-        order = "-".join(map(str, (*range(1, num_agents), 0)))
-        raise ValueError(
-            f"'{word}' is not an order of {num_agents} agents; write each place once, as in agents-{order}"
-        )
-    return PlaneElement(permutation=sigma)

@@ -51,17 +51,9 @@ def _number(value: Fraction) -> str:
     return f"{float(value):.3f}"
 
 
-def _scalar(_: Floats) -> Floats:
-    return np.ones((1, 1))
-
-
 def _pseudoscalar(planar: Floats) -> Floats:
     # Round: the determinant of an orthogonal matrix is +1 or -1.
     return np.rint(np.linalg.det(planar)).reshape(1, 1)
-
-
-def _vector(planar: Floats) -> Floats:
-    return planar
 
 
 def _wheels(planar: Floats) -> Floats:
@@ -69,9 +61,9 @@ def _wheels(planar: Floats) -> Floats:
 
 
 KIND_MATRICES: dict[Kind, Callable[[Floats], Floats]] = {
-    Kind.SCALAR: _scalar,
+    Kind.SCALAR: lambda _: np.ones((1, 1)),
     Kind.PSEUDOSCALAR: _pseudoscalar,
-    Kind.VECTOR: _vector,
+    Kind.VECTOR: lambda planar: planar,
     Kind.WHEELS: _wheels,
 }
 """One representation per field kind, pictures apart: a planar matrix [2, 2] to [width, width]."""

@@ -154,10 +154,7 @@ class Transform:
 
 
 def build_transform(
-    elements: Sequence[Element],
-    spaces: Spaces,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
+    elements: Sequence[Element], spaces: Spaces, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Transform:
     """Stack the representations of some elements, one per seed, on a task's spaces.
 
