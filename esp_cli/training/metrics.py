@@ -13,8 +13,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,14 +36,6 @@ class MetricsError(ValueError):
     """A metrics file cannot be written or read; the text is one sentence for the user."""
 
 
-class _Board(Protocol):
-    """What is used of TensorBoard's ``SummaryWriter``, whose package has no types."""
-
-    def add_scalar(self, tag: str, scalar_value: float, global_step: int) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class MetricsWriter:
     """Append rows to a JSONL file, each on its way to the file before :meth:`write` returns.
 
@@ -64,7 +55,7 @@ class MetricsWriter:
         self._path = Path(path)
         self._folder = tensorboard
         self._first_step = first_step
-        self._boards: dict[str, _Board] = {}
+        self._boards: dict[str, Any] = {}  # TensorBoard's writers, whose package has no types
         if tensorboard is not None:
             self._board("mean")
         with attempting("write", self._path, MetricsError):
@@ -75,9 +66,7 @@ class MetricsWriter:
     def __enter__(self) -> MetricsWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def write(self, step: int, values: Mapping[str, Value]) -> None:
@@ -122,7 +111,7 @@ class MetricsWriter:
                 for seed, number in enumerate(numbers):
                     self._board(f"seed-{seed}").add_scalar(name, number, step)
 
-    def _board(self, name: str) -> _Board:
+    def _board(self, name: str) -> Any:
         if name not in self._boards:
             try:
                 # only here: the import takes a second, and the package is an extra
