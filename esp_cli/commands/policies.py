@@ -38,18 +38,9 @@ def policies(
             )
             for e in found
         ]
-        headings = (
-            "policy",
-            "version>",
-            "steps>",
-            "seed>",
-            "return>",
-            "95 % interval>",
-            "episodes>",
-            "reward convention",
-        )
+        numbers = ("version>", "steps>", "seed>", "return>", "95 % interval>", "episodes>")
         caption = "greedy, interval over episodes; the seed is the best of its run on other episodes"
-        console.table(headings, rows, caption=caption)
+        console.table(("policy", *numbers, "reward convention"), rows, caption=caption)
         for entry in found if task else ():
             console.say(f"{entry.name}: {entry.command}")
         console.note("esp eval, esp render and esp export take a policy by its name, or by its task")

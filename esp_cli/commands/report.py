@@ -78,7 +78,7 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
-    from esp_cli.reporting import collect, loose
+    from esp_cli.reporting import collect, curves, loose
     from esp_cli.studies.study import StudyFolder
 
     if fill is not None:
@@ -103,8 +103,10 @@ def report(
         document = material.results.document()
     else:
         command = _command(runs, at or [], limits, mode, out)
-        steps = [parse_count(text) for text in at or []]
-        material = loose.read_runs([_labelled(text) for text in runs], command, mode or "greedy", steps, limits)
+        steps, asked = [parse_count(text) for text in at or []], mode or "greedy"
+        places = [_labelled(text) for text in runs]
+        found = [curves.read_curve(path, label, asked) for label, path in places]
+        material = loose.put_together(found, [path for _, path in places], command, asked, steps, limits)
         document = loose.comparison(material, limits)
     if json != "-":
         print_tables(material.results)

@@ -11,36 +11,13 @@ from esp_cli.evaluation.final import Mode
 from esp_cli.evaluation.statistics import Interval, SeedSummary, summarise
 from esp_cli.formatting import format_count
 from esp_cli.reporting.collect import Material, RunState, results_of
-from esp_cli.reporting.curves import RunCurve, read_curve
+from esp_cli.reporting.curves import RunCurve
 from esp_cli.reporting.plots import Curve, learning_curves
 from esp_cli.reporting.results import CellResult
 from esp_cli.reporting.summary import floats, summarise_cell
 from esp_cli.studies.study import Cell, Study
 
 KIND = "runs"
-
-
-def read_runs(
-    places: Sequence[tuple[str | None, Path]],
-    command: str,
-    mode: Mode,
-    at: Sequence[int] = (),
-    thresholds: Sequence[float] = (),
-) -> Material:
-    """Read runs of one task as a study; see `put_together`.
-
-    Args:
-        places: label and folder of each run.
-        command: that reports them again.
-        mode: which evaluations.
-        at: steps at which the runs are compared.
-        thresholds: returns whose first passing is stated.
-
-    Raises:
-        ValueError: no run folder, no evaluation in it yet, or runs that do not compare.
-    """
-    curves = [read_curve(path, label, mode) for label, path in places]
-    return put_together(curves, [path for _, path in places], command, mode, at, thresholds)
 
 
 def put_together(
@@ -95,7 +72,7 @@ def comparison(material: Material, thresholds: Sequence[float]) -> dict[str, Jso
     """Return runs side by side, as `esp report RUN... --json` writes them.
 
     Args:
-        material: of `read_runs`.
+        material: of `put_together`.
         thresholds: that the user asked for.
 
     Returns:
@@ -160,7 +137,7 @@ def plot(
     """Draw the learning curves of runs put together by hand; returns the PNG and the SVG file.
 
     Args:
-        material: of `read_runs`.
+        material: of `put_together`.
         path: where to.
         references: lines at numbers of others: name -> return.
         view: the lowest and the highest return shown, by default all.
