@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Annotated, Literal
 
 import typer
@@ -77,14 +78,7 @@ def render(
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
-    with ExitStack() as showing:
-        progress: list[console.TrainingProgress] = []
-
-        def watch(done: int, total: int) -> None:
-            if not progress:
-                progress.append(showing.enter_context(console.TrainingProgress(total, description="draw")))
-            progress[0].update(done)
-
+    with _progress() as watch:
         drawing = draw(
             trained,
             out,
@@ -103,3 +97,17 @@ def render(
         console.note(f"episode of {drawing.steps} steps -> {out}")
     else:
         console.note(f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows how many frames of how many are drawn, from the first one on."""
+    with ExitStack() as showing:
+        shown: list[console.TrainingProgress] = []
+
+        def watch(done: int, total: int) -> None:
+            if not shown:
+                shown.append(showing.enter_context(console.TrainingProgress(total, description="draw")))
+            shown[0].update(done)
+
+        yield watch

@@ -14,10 +14,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from esp_cli.deploy.library import LoadedPolicy
-from esp_cli.drawing.draw import Drawing, draw
-from esp_cli.drawing.rendering import View
 from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.final import evaluate as evaluate_policy
 from esp_cli.library.metrics import Metrics
@@ -28,6 +27,10 @@ from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, t
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Listener, Progress, Trainer
+
+if TYPE_CHECKING:
+    from esp_cli.drawing.draw import Drawing
+    from esp_cli.drawing.rendering import View
 
 
 class Run:
@@ -129,6 +132,8 @@ class Run:
         Raises:
             ValueError: another ending, no checkpoint yet, no such seed or view.
         """
+        from esp_cli.drawing.draw import draw  # noqa: PLC0415 - training needs no plotting
+
         trained = self._trained(settings)
         return draw(trained, Path(out), seed=seed, episodes=episodes, view=view, size=size, speed=speed, greedy=greedy)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from itertools import product
 from pathlib import Path
@@ -32,7 +33,9 @@ PUSHES = tuple(product((0.0, -1.0, 1.0), repeat=2))
 MOVES = Discrete(Kind.VECTOR, PUSHES, tuple(map(str, PUSHES)))
 
 
-def experiment(folder: Path, algorithm: Any, callback: SymmetryCallback | None, discrete: bool = False) -> Experiment:
+def experiment(
+    folder: Path, algorithm: Any, callback: SymmetryCallback | None, discrete: bool = False, collisions: bool = False
+) -> Experiment:
     config = ExperimentConfig.get_from_yaml()
     config.prefer_continuous_actions = not discrete
     config.loggers, config.create_json, config.evaluation, config.render = [], False, False, False
@@ -42,7 +45,7 @@ def experiment(folder: Path, algorithm: Any, callback: SymmetryCallback | None, 
     config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 100, 2
     config.off_policy_n_optimizer_steps, config.off_policy_train_batch_size = 4, 32
     task = VmasTask.NAVIGATION.get_from_yaml()
-    task.config |= {"collisions": False, "max_steps": 20}
+    task.config |= {"collisions": collisions, "max_steps": 20}
     model = MlpConfig(num_cells=[16], layer_class=torch.nn.Linear, activation_class=torch.nn.Tanh)
     return Experiment(task, algorithm.get_from_yaml(), model, 0, config, None, [callback] if callback else [])
 
@@ -87,6 +90,19 @@ def test_without_the_prior_the_callback_changes_nothing(tmp_path: Path) -> None:
     on = experiment(tmp_path, MappoConfig, SymmetryCallback(symmetry(), coefficient=1.0))
     on.run()
     assert (weights(on) - weights(plain)).abs().max() > 1e-5
+
+
+def test_the_example_of_the_documentation_trains(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "library.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```text\n(from esp_cli import Continuous.*?)```", page, re.DOTALL)
+    *lines, last = example.strip().splitlines()
+    assert len(lines) + 1 <= 10
+    told: dict[str, Any] = {}
+    exec("\n".join(lines), told)  # noqa: S102 - the documentation's own lines
+    callback = eval(re.search(r"callbacks=\[(.*)\]\)", last)[1], told)  # type: ignore[index]  # noqa: S307 - likewise
+    run = experiment(tmp_path, MappoConfig, callback, collisions=True)
+    run.run()
+    assert weights(run).isfinite().all()
 
 
 def test_a_group_that_is_not_there_and_an_algorithm_without_a_policy_loss_are_refused(tmp_path: Path) -> None:

@@ -62,6 +62,15 @@ def test_any_leading_axes_give_what_rows_give(lead: tuple[int, ...], agents: int
     assert torch.equal(got[1].narrow(len(lead) - 1, count, count).reshape(-1), want[1][action.numel() :])
 
 
+@pytest.mark.gpu
+def test_data_on_a_gpu_stay_there_and_give_the_same_numbers() -> None:
+    obs, action = random(4, 2, 3), zeros(4, 2)
+    here = quarter(2).augment(obs, action, per_agent=(obs[..., 0],))
+    there = quarter(2).augment(obs.cuda(), action.cuda(), per_agent=(obs[..., 0].cuda(),))
+    assert all(x.is_cuda for x in (*there[:2], *there[2]))
+    assert all(torch.equal(x.cpu(), y) for x, y in zip((*there[:2], *there[2]), (*here[:2], *here[2]), strict=True))
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
 def test_every_floating_type_is_turned_to_its_own_precision(dtype: torch.dtype) -> None:
     symmetry = Symmetry(observation=SEEN, action=FORCE, group="rot30")
