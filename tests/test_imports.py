@@ -29,6 +29,7 @@ RANKS = {
     "loop": 3,
     "training": 4,
     "evaluation": 5,
+    "checking": 5,
     "drawing": 6,
     "studies": 6,
     "deploy": 7,

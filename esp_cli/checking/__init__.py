@@ -1,0 +1,20 @@
+"""Whether a task is as symmetric as it claims: from paired states where it can be set to one, else from transitions."""
+
+from esp_cli.checking.candidates import candidates, found_group
+from esp_cli.checking.paired import check_paired
+from esp_cli.checking.task import SymmetryReport, check_symmetry
+from esp_cli.checking.transitions import Transitions, check_transitions, collect
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
+
+__all__ = [
+    "ElementVerdict",
+    "FieldVerdict",
+    "SymmetryReport",
+    "Transitions",
+    "candidates",
+    "check_paired",
+    "check_symmetry",
+    "check_transitions",
+    "collect",
+    "found_group",
+]

@@ -1,0 +1,88 @@
+"""Which elements a check tries, beyond the declared ones, and which group those that hold make up."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from esp_cli.symmetry import Element, Group, build_transform, parse_elements
+from esp_envs.spec import Spaces
+
+_TRIED = "d8,rot57,flip23"
+"""Turns and mirrors that are tried; the last two stand for all angles."""
+_NAMED = ("c2", "flip-x", "flip-y", "d2", "c4", "d4", "c8", "d8")
+"""Groups that are named as found, smaller ones first, if all their elements hold."""
+_MOST = 64
+
+
+def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
+    """Return the elements to try: those asked for, else of d8, any angle, and exchanges of agents.
+
+    Elements that the actions or layouts cannot carry are left out.
+
+    Args:
+        spaces: of the task.
+        transforms: text as `--transforms` takes it.
+
+    Raises:
+        ValueError: the text means nothing, or nothing that is asked for can be carried.
+    """
+    texts = [transforms] if transforms is not None else [_TRIED, _plane(spaces)]
+    if transforms is None and spaces.num_agents > 1:
+        order = list(range(spaces.num_agents))
+        swap, cycle = [order[1], order[0], *order[2:]], [*order[1:], order[0]]
+        texts += ["agents-" + "-".join(map(str, new)) for new in (swap, cycle)]
+    asked = dict.fromkeys(element for text in texts for element in _elements(text, spaces.num_agents))
+    refusals = {element: _refusal(element, spaces) for element in asked}
+    found = [element for element, refusal in refusals.items() if refusal is None]
+    if not found:
+        said = next(iter(refusals.values()), None)
+        raise ValueError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
+    return found[:_MOST]
+
+
+def _refusal(element: Element, spaces: Spaces) -> str | None:
+    """Say why the actions or layouts cannot carry an element, if they cannot."""
+    try:
+        build_transform([element], spaces)
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def is_declared(element: Element, spaces: Spaces) -> bool:
+    """Return whether a task's declared symmetry holds an element."""
+    plane = _plane(spaces)
+    if element.permutation is not None and "agents" not in spaces.symmetry.split("*"):
+        return False
+    if element.in_place.is_identity:
+        return True
+    if plane in ("", "c1"):
+        return False
+    group = parse_elements(plane, spaces.num_agents)
+    return element.in_place in group
+
+
+def found_group(holding: Collection[str], spaces: Spaces) -> str:
+    """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
+    plane = "c1"
+    for name in (*_NAMED, _plane(spaces)):
+        if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
+            plane = name
+    if "rot57" in holding:
+        plane = "o2" if "flip23" in holding else "so2"
+    agents = any(name.startswith("agents-") for name in holding)
+    return f"{plane}*agents" if agents else plane
+
+
+def _plane(spaces: Spaces) -> str:
+    """Return the planar part of the declared symmetry."""
+    return "*".join(name for name in spaces.symmetry.split("*") if name != "agents")
+
+
+def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
+    if text in ("", "c1"):
+        return ()
+    found = parse_elements(text, num_agents)
+    if isinstance(found, Group):
+        return tuple(element for element in found.witnesses() if not element.is_identity)
+    return found[:_MOST]

@@ -1,0 +1,158 @@
+"""Compare a step from a state with the step from the transformed state, as distributions.
+
+From each state s and joint action a, two runs with chance of their own give outcomes X and X', transformed by g; two
+runs from L_g s with K_g a give Y and Y'. The energy distance
+
+    E |X - Y| - (E |X - X'| + E |Y - Y'|) / 2
+
+is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. Without chance it is |X - Y|.
+A random prey or a noisy sensor is thus no false alarm, and no task has to turn its own noise along.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from esp_cli.checking.candidates import is_declared
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, judged
+from esp_cli.symmetry import Element, Transform, build_transform
+from esp_envs.base import Environment, Observation, Step
+from esp_envs.spec import Layout, TaskSpec, joint_layout
+
+MakeWorlds = Callable[[int, Sequence[int]], Environment]
+_NUMBERS = 1 << 18
+"""Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
+MOMENTS = 8
+"""Points of an episode at which states are taken."""
+
+Outcomes = dict[str, Tensor]
+"""What a step gives, by field: [M, numbers]."""
+
+
+def check_paired(make: MakeWorlds, elements: Sequence[Element], worlds: int | None = None) -> list[ElementVerdict]:
+    """Judge elements on a task that can be set to a state.
+
+    Args:
+        make: makes E worlds for some seeds.
+        elements: to try.
+        worlds: E; by default 256, and fewer where agents see pictures.
+    """
+    if worlds is None:
+        spec = make(1, [0]).spec
+        worlds = max(64, min(256, _NUMBERS // (spec.num_agents * spec.observation.width)))
+    twins = [make(worlds, [seed]) for seed in (101, 102)]
+    spec = twins[0].spec
+    visited = _visit(make(worlds, [0]))
+    here = [_outcomes(env, visited, None) for env in twins]
+    return [_judge(element, spec, visited, twins, here) for element in elements]
+
+
+def _visit(env: Environment) -> list[tuple[Tensor, Tensor]]:
+    """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any."""
+    observation = env.reset()
+    taken = {round(k * (env.spec.horizon - 1) / MOMENTS) for k in range(MOMENTS)}
+    visited = []
+    for t in range(max(taken) + 1):
+        action = env.random_action()
+        if t in taken:
+            visited.append((observation.state.clone(), action.clone()))
+        if env.heuristics:
+            half = env.num_envs // 2
+            action[:, :half] = env.heuristic()[:, :half]
+        observation = env.step(action).next
+    return visited
+
+
+def _outcomes(env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | None) -> list[Step]:
+    """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end."""
+    steps = []
+    for state, action in visited:
+        env.reset()  # draws chance of its own
+        start = env.set_state(state if turned is None else turned.state(state))
+        step = env.step(action if turned is None else turned.action(action))
+        reached = step.final or step.next
+        steps.append(
+            Step(
+                next=start,
+                reward=step.reward,
+                terminated=step.terminated,
+                truncated=step.truncated,
+                final=reached,
+                metrics={},
+            )
+        )
+    return steps
+
+
+def _judge(
+    element: Element,
+    spec: TaskSpec,
+    visited: Sequence[tuple[Tensor, Tensor]],
+    twins: Sequence[Environment],
+    here: Sequence[list[Step]],
+) -> ElementVerdict:
+    declared = is_declared(element, spec)
+    transform = build_transform([element], spec)
+    try:
+        there = [_outcomes(env, visited, transform) for env in twins]
+    except Exception as error:
+        reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
+        return ElementVerdict(element.name, declared, (), reason)
+    same = _fields(here[0], spec, None)
+    first, second = (_fields(steps, spec, transform) for steps in here)
+    third, fourth = (_fields(steps, spec, None) for steps in there)
+    verdicts = [_verdict(name, first[name], second[name], third[name], fourth[name], same[name]) for name in first]
+    return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
+
+
+def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, plain: Tensor) -> FieldVerdict:
+    """Judge one field from its outcomes [M, numbers]; `plain` is x before it was transformed."""
+    spread = torch.cat([x, y]).std(0)
+    scale = max(float(spread.max()), 1e-6)
+    known = torch.isfinite(torch.stack([x, x2, y, y2])).all(-1).all(0)
+    x, x2, y, y2 = (part[known] for part in (x, x2, y, y2))
+    if not bool(known.any()):
+        return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    across = ((x - y).abs() + (x2 - y2).abs() + (x - y2).abs() + (x2 - y).abs()) / 4
+    energy = (across - ((x - x2).abs() + (y - y2).abs()) / 2).mean(1, keepdim=True)
+    shift = (x + x2 - y - y2) / 2
+    # An invariant number is covered by any state; one that turns, only where it is not zero throughout.
+    moved = float(plain.abs().max()) > 1e-6 or torch.equal(plain, x)
+    return judged(name, torch.cat([energy, shift], 1), scale, moved)
+
+
+def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
+    """Keep one verdict for each field: the start's and the reached observation are of one field."""
+    rank = {"broken": 2, "holds": 1, "not covered": 0}
+    best: dict[str, FieldVerdict] = {}
+    for verdict in verdicts:
+        name = verdict.field.removeprefix("start ")
+        renamed = FieldVerdict(name, verdict.outcome, verdict.gap, verdict.error)
+        known = best.get(name)
+        if known is None or (rank[renamed.outcome], renamed.gap) > (rank[known.outcome], known.gap):
+            best[name] = renamed
+    return list(best.values())
+
+
+def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) -> Outcomes:
+    """Return everything that the steps gave by field, transformed."""
+    joint = spec.state == joint_layout(spec.observation, spec.num_agents)
+    parts: dict[str, list[Tensor]] = {}
+
+    def add(prefix: str, layout: Layout, rows: Tensor) -> None:
+        for name, where in layout.slices().items():
+            parts.setdefault(prefix + name, []).append(rows[..., where].flatten(0, 1).flatten(1))
+
+    for step in steps:
+        for prefix, seen in (("start ", step.next), ("", step.final)):
+            assert isinstance(seen, Observation)
+            add(f"{prefix}obs.", spec.observation, seen.obs if transform is None else transform.obs(seen.obs))
+            if not joint:
+                add(f"{prefix}state.", spec.state, seen.state if transform is None else transform.state(seen.state))
+        reward = step.reward if transform is None else transform.per_agent(step.reward)
+        parts.setdefault("reward", []).append(reward.flatten(0, 1))
+        parts.setdefault("end", []).append(step.terminated.float().flatten(0, 1).unsqueeze(-1))
+    return {name: torch.cat(rows) for name, rows in parts.items()}

@@ -1,0 +1,172 @@
+"""Judge symmetry from transitions alone, whoever made them: no state can be set, and nothing is known of the noise.
+
+If the starts, the policy, the dynamics and the reward are symmetric, a transition and its transformed copy have one
+distribution. So every expectation of (input, residual) agrees, where the residual is what a regression of change and
+reward on the input leaves. The regression only takes the large common part away; the test holds without it.
+
+Starts that are not symmetric themselves say nothing about the dynamics: there the element is "not covered".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from esp_cli.checking.candidates import is_declared
+from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
+from esp_cli.symmetry import Element, Transform, build_transform
+from esp_envs.base import Environment
+from esp_envs.spec import Discrete, Spaces
+
+EPISODES = 2048
+STEPS = 8
+"""Steps of each episode that are looked at."""
+_WIDEST = 48
+"""Up to so many numbers of one agent, products of two of them are looked at too."""
+_ASYMMETRIC = 0.05
+"""Shift of the starts, in standard deviations, from which an element is not covered."""
+_RIDGE = 1e-3
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Steps of a policy that prefers no direction, such as the uniformly random one.
+
+    Shape:
+        obs, next_obs: [M, T, N, D], M episodes from their starts, T steps of each.
+        action: [M, T, N] int64, or [M, T, N, width] float32.
+        reward: [M, T, N].
+    """
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor
+    next_obs: Tensor
+
+
+def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> Transitions:
+    """Return the first steps of episodes of the random policy.
+
+    An episode that ends earlier repeats its last transition.
+    """
+    found: list[list[tuple[Tensor, ...]]] = []
+    for _ in range(-(-episodes // (env.num_envs * env.num_seeds))):
+        observation = env.reset()
+        over = torch.zeros(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
+        rows: list[tuple[Tensor, ...]] = []
+        for _ in range(min(steps, env.spec.horizon)):
+            action = env.random_action()
+            step = env.step(action)
+            row: tuple[Tensor, ...] = (observation.obs, action, step.reward, (step.final or step.next).obs)
+            if rows:
+                row = tuple(
+                    torch.where(over.view(*over.shape, *(1,) * (new.dim() - 2)), old, new)
+                    for old, new in zip(rows[-1], row, strict=True)
+                )
+            rows.append(row)
+            over = over | step.terminated | step.truncated
+            observation = step.next
+        found.append(rows)
+    parts = [
+        torch.cat([torch.stack([row[k] for row in rows], 2).flatten(0, 1) for rows in found]).cpu() for k in range(4)
+    ]
+    return Transitions(*parts)
+
+
+def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
+    """Judge elements from transitions.
+
+    Args:
+        spaces: what the numbers are, and the declared symmetry.
+        data: anybody's transitions, of a policy that prefers no direction.
+        elements: to try.
+    """
+    half = len(data.obs) // 2
+    inputs, outputs = _rows(spaces, data)
+    model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
+    held = Transitions(data.obs[half:], data.action[half:], data.reward[half:], data.next_obs[half:])
+    return [_judge(element, spaces, held, model) for element in elements]
+
+
+def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -> ElementVerdict:
+    transform = build_transform([element], spaces)
+    declared = is_declared(element, spaces)
+    turned = _turned(data, transform)
+    if shift := _asymmetry(data.obs[:, 0], turned.obs[:, 0]):
+        return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
+    here, there = (_statistics(spaces, part, model) for part in (data, turned))
+    layout = spaces.observation
+    verdicts: list[FieldVerdict] = []
+    for name, where in layout.slices().items():
+        moved = bool((data.obs[..., where].abs() > 1e-6).any())
+        verdicts.append(_field_verdict(f"obs.{name}", here, there, where, moved))
+    reward = slice(layout.width, layout.width + 1)
+    verdicts.append(_field_verdict("reward", here, there, reward, True))
+    return ElementVerdict(element.name, declared, tuple(verdicts))
+
+
+def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: bool) -> FieldVerdict:
+    """Judge the statistics [M, N, features, outputs] of one field."""
+    gap = (here[..., where] - there[..., where]).flatten(1)
+    live = gap.std(0) > 1e-9
+    if not bool(live.any()):
+        return judged(name, gap[:, :1], 1.0, moved)
+    return judged(name, gap[:, live] / here[..., where].flatten(1).std(0)[live].clamp_min(1e-6), 1.0, moved)
+
+
+def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
+    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1] of each agent: change and reward."""
+    action = data.action
+    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
+    row = torch.cat([data.obs, acted], -1)
+    one = torch.ones_like(row[..., :1])
+    features = [one, row]
+    if row.shape[-1] <= _WIDEST:
+        first, second = torch.triu_indices(row.shape[-1], row.shape[-1])
+        features.append(row[..., first] * row[..., second])
+    return torch.cat(features, -1), torch.cat([data.next_obs - data.obs, data.reward.unsqueeze(-1)], -1)
+
+
+def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
+    """Return the ridge regression [N, features, outputs] of each agent's outputs [M, N, ...]."""
+    x, y = inputs.double().transpose(0, 1), outputs.double().transpose(0, 1)
+    gram = x.mT @ x / x.shape[1]
+    gram += _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6))
+    return torch.linalg.solve(gram, x.mT @ y / x.shape[1]).float()
+
+
+def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
+    """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1]."""
+    inputs, outputs = _rows(spaces, data)
+    residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
+    linear = inputs[..., : 1 + data.obs.shape[-1]]
+    return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
+
+
+def _turned(data: Transitions, transform: Transform) -> Transitions:
+    def one(part: Tensor) -> Tensor:
+        return part.unsqueeze(0)
+
+    return Transitions(
+        transform.obs(one(data.obs))[0],
+        transform.action(one(data.action))[0],
+        transform.per_agent(one(data.reward))[0],
+        transform.obs(one(data.next_obs))[0],
+    )
+
+
+def _asymmetry(start: Tensor, turned: Tensor) -> float:
+    """Return the largest shift of mean or spread of the starts [M, N, D] in s.d. that is no chance, else 0."""
+    start, turned = start.flatten(1).double(), turned.flatten(1).double()
+    spread = torch.cat([start, turned]).std(0).clamp_min(1e-3)
+    worst = 0.0
+    for power in (1, 2):
+        gap = (start / spread) ** power - (turned / spread) ** power
+        size, error = gap.mean(0).abs(), gap.std(0) / len(gap) ** 0.5
+        real = (size > SIGNIFICANT * error) & (size > _ASYMMETRIC)
+        worst = max(worst, float(torch.where(real, size, 0.0).max()))
+    return worst
