@@ -25,6 +25,12 @@ def format_interval(interval: Sequence[float] | None, digits: int = 2) -> str:
     return f"[{low:.{digits}f}, {high:.{digits}f}]"
 
 
+def file_name(text: str) -> str:
+    """Return a name for a folder: "rot90, rot180" -> "rot90-rot180", "mine:Task" -> "mine-task"."""
+    words = "".join(c if c.isalnum() or c == "." else " " for c in text.lower()).split()
+    return "-".join(words)
+
+
 def format_span(counts: Collection[int]) -> str:
     """Return the smallest to the largest of some counts, or the one that they all are: {32, 160} -> "32 to 160"."""
     low, high = min(counts), max(counts)

@@ -2,6 +2,7 @@
 
 from esp_cli.checking.candidates import candidates, found_group
 from esp_cli.checking.paired import check_paired
+from esp_cli.checking.policy import PolicyVerdict, check_policy
 from esp_cli.checking.task import SymmetryReport, check_symmetry
 from esp_cli.checking.transitions import Transitions, check_transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
@@ -9,10 +10,12 @@ from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 __all__ = [
     "ElementVerdict",
     "FieldVerdict",
+    "PolicyVerdict",
     "SymmetryReport",
     "Transitions",
     "candidates",
     "check_paired",
+    "check_policy",
     "check_symmetry",
     "check_transitions",
     "collect",

@@ -28,6 +28,8 @@ _NUMBERS = 1 << 18
 MOMENTS = 8
 """Points of an episode at which states are taken."""
 
+_BOUND = 0.05
+"""Where the bounded distance levels off, in standard deviations of the field."""
 Outcomes = dict[str, Tensor]
 """What a step gives, by field: [M, numbers]."""
 
@@ -116,12 +118,22 @@ def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, plain: Ten
     x, x2, y, y2 = (part[known] for part in (x, x2, y, y2))
     if not bool(known.any()):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    across = ((x - y).abs() + (x2 - y2).abs() + (x - y2).abs() + (x2 - y).abs()) / 4
-    energy = (across - ((x - x2).abs() + (y - y2).abs()) / 2).mean(1, keepdim=True)
-    shift = (x + x2 - y - y2) / 2
+    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
+    # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
+    bound = _BOUND * scale
+    distances = (Tensor.abs, lambda gap: bound * -torch.expm1(-gap.abs() / bound))
+    tests = [_excess(distance, within, across) for distance in distances]
+    tests.append((x + x2 - y - y2) / 2)
     # An invariant number is covered by any state; one that turns, only where it is not zero throughout.
     moved = float(plain.abs().max()) > 1e-6 or torch.equal(plain, x)
-    return judged(name, torch.cat([energy, shift], 1), scale, moved)
+    return judged(name, torch.cat(tests, 1), scale, moved)
+
+
+def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], across: Sequence[Tensor]) -> Tensor:
+    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]."""
+    apart = torch.stack([distance(gap) for gap in across]).mean(0)
+    own = torch.stack([distance(gap) for gap in within]).mean(0)
+    return (apart - own).mean(1, keepdim=True)
 
 
 def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:

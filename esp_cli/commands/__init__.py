@@ -17,6 +17,7 @@ COMMANDS: dict[str, str] = {
     "policies": "esp_cli.commands.policies:policies",
     "report": "esp_cli.commands.report:report",
     "compare-homomorphic": "esp_cli.commands.compare_homomorphic:compare_homomorphic",
+    "check": "esp_cli.commands.check:check",
     "tasks": "esp_cli.commands.tasks:tasks",
 }
 """Command name -> "module:function", in the order in which `esp --help` lists them."""

@@ -10,10 +10,12 @@ from esp_cli.commands.options import (
     BundledPriorOption,
     EpisodesOption,
     JsonOption,
+    OwnTaskOption,
     PhysicsOption,
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
+    register_tasks,
 )
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ EPILOG = """Examples:\n
 
 def evaluate(
     policy: PolicyArgument,
+    task: OwnTaskOption = None,
     episodes: EpisodesOption = 320,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
@@ -43,6 +46,7 @@ def evaluate(
     from esp_cli.evaluation.final import evaluate as evaluate_policy
     from esp_cli.training.loading import transfer
 
+    register_tasks(task)
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)

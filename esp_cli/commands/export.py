@@ -14,7 +14,9 @@ from esp_cli.commands.options import (
     ForceOption,
     JsonOption,
     OutOption,
+    OwnTaskOption,
     PolicyArgument,
+    register_tasks,
 )
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ def export(
         ),
     ],
     out: OutOption,
+    task: OwnTaskOption = None,
     seed: Annotated[
         int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
     ] = None,
@@ -73,6 +76,7 @@ def export(
         raise ValueError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
     if name is not None and "policy" not in formats:
         raise ValueError("--name is for -f policy alone; leave it out")
+    register_tasks(task)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)

@@ -123,6 +123,18 @@ def check_finite(option: str, *values: float) -> None:
             raise ValueError(f"{option} {value} is not a finite number; write for example {option} -125")
 
 
+def register_tasks(names: Iterable[str] | None) -> None:
+    """Admit the tasks that this command line names as module:Class; a name of any other form needs nothing.
+
+    Raises:
+        ValueError: a module cannot be imported, or holds no such task.
+    """
+    from esp_envs.registry import register
+
+    for name in names or ():
+        register(name)
+
+
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     """Wrap a parser so that its message names the option."""
 
@@ -136,7 +148,13 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     return parser
 
 
-TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task to play; `esp tasks` lists them.", metavar="TASK")]
+TaskOption = Annotated[
+    str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")
+]
+OwnTaskOption = Annotated[
+    list[str] | None,
+    typer.Option("--task", help="Import this task of yours, which the run or policy is of.", metavar="MODULE:CLASS"),
+]
 AlgoOption = Annotated[str, typer.Option("--algo", "-a", help="Learning algorithm, such as mappo.", metavar="ALGO")]
 StepsOption = Annotated[
     int,

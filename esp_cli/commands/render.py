@@ -14,10 +14,12 @@ from esp_cli.commands.options import (
     BundledAlgoOption,
     BundledPriorOption,
     OutOption,
+    OwnTaskOption,
     PhysicsOption,
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
+    register_tasks,
 )
 
 EPILOG = """Examples:\n
@@ -46,6 +48,7 @@ def parse_speed(value: str | float) -> float:
 def render(
     policy: PolicyArgument,
     out: OutOption,
+    task: OwnTaskOption = None,
     view: Annotated[
         Literal["auto", "top", "3d"],
         typer.Option("--view", help="From above, or in space; auto takes the latter where the task has it."),
@@ -75,6 +78,7 @@ def render(
     from esp_cli.training.loading import transfer
 
     kind = check_target(out, episodes)
+    register_tasks(task)
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)

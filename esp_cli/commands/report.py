@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, check_finite, parse_count
+from esp_cli.commands.options import JsonOption, OwnTaskOption, check_finite, parse_count, register_tasks
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material
@@ -75,12 +75,14 @@ def report(
     mode: ModeOption = None,
     view: ViewOption = None,
     plot: PlotOption = None,
+    task: OwnTaskOption = None,
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
     from esp_cli.reporting import collect, curves, loose
     from esp_cli.studies.study import StudyFolder
 
+    register_tasks(task)
     if fill is not None:
         _fill(fill)
     if not runs:

@@ -20,6 +20,7 @@ from esp_cli.commands.options import (
     SetOption,
     parse_assignments,
     parse_count,
+    register_tasks,
 )
 
 if TYPE_CHECKING:
@@ -127,6 +128,7 @@ class StudyChoices:
         from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
+        register_tasks(parse_names(self.tasks))
         return Request(
             tasks=parse_names(self.tasks),
             algorithms=parse_names(self.algos),

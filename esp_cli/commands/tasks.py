@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption
+from esp_cli.commands.options import JsonOption, register_tasks
 
 EPILOG = """Examples:\n
     esp tasks\n
@@ -24,6 +24,7 @@ def tasks(
     from esp_envs.registry import make, task_class, task_names
     from esp_envs.spec import describe_action
 
+    register_tasks([task] if task else None)
     found = []
     for name in (task,) if task else task_names():
         spec = make(name, 1, [0]).spec

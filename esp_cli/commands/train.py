@@ -20,6 +20,7 @@ from esp_cli.commands.options import (
     TaskOption,
     TransformsOption,
     parse_assignments,
+    register_tasks,
 )
 from esp_cli.commands.stopping import stop_requests
 
@@ -79,8 +80,9 @@ def train(
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     from esp_cli.library.run import Run, start
 
+    register_tasks([task])
     if resume is not None:
-        _refuse_beside_resume(context)
+        _refuse_beside_resume(context, allowed=("task",) if ":" in task else ())
         _train(Run(resume), tensorboard)
         return
     chosen = {
@@ -95,12 +97,12 @@ def train(
     _train(run, tensorboard)
 
 
-def _refuse_beside_resume(context: typer.Context) -> None:
+def _refuse_beside_resume(context: typer.Context, allowed: tuple[str, ...]) -> None:
     """Refuse options that a resumed run would ignore: it keeps its own configuration."""
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "tensorboard")
+        if parameter.name not in ("resume", "tensorboard", *allowed)
         and getattr(context.get_parameter_source(str(parameter.name)), "name", "") == "COMMANDLINE"
     ]
     if given:

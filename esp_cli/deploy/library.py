@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.deploy.bundled import open_policy
 from esp_cli.training.loading import TrainedPolicy, single_seed
+from esp_envs.base import Environment
+from esp_envs.registry import register
 from esp_envs.spec import Continuous, TaskSpec
 
 Floats = NDArray[np.float32]
@@ -133,17 +135,24 @@ class LoadedPolicy:
 
 
 def load_policy(
-    where: str | os.PathLike[str], algo: str | None = None, prior: str | None = None, seed: int | None = None
+    where: str | os.PathLike[str],
+    algo: str | None = None,
+    prior: str | None = None,
+    seed: int | None = None,
+    task: str | type[Environment] | None = None,
 ) -> LoadedPolicy:
-    """Load a trained policy; loading never runs code.
+    """Load a trained policy; loading runs no code but that of a `task` which you name.
 
     Args:
         where: a task ("formation") or the name of a bundled policy, a policy file, or a run folder.
         algo: of a task's policies, the one that this algorithm trained.
         prior: likewise this kind of prior; "none" is the plain learner.
         seed: which seed of a run acts; by default its first.
+        task: the task that the policy is of, as "module:Class" or as the class, where it is not installed.
 
     Raises:
-        ValueError: nothing there, damaged, of another version, or no such seed.
+        ValueError: nothing there, damaged, of another version, no such seed, or no such task.
     """
+    if task is not None:
+        register(task)
     return LoadedPolicy(open_policy(Path(where), algo, prior), seed)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 from esp_cli.deploy.library import LoadedPolicy
 from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.final import evaluate as evaluate_policy
+from esp_cli.formatting import file_name
 from esp_cli.library.metrics import Metrics
 from esp_cli.machine import resolve_device
 from esp_cli.training.build import build_learner
@@ -27,6 +28,8 @@ from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, t
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Listener, Progress, Trainer
+from esp_envs.base import Environment
+from esp_envs.registry import register
 
 if TYPE_CHECKING:
     from esp_cli.drawing.draw import Drawing
@@ -38,6 +41,7 @@ class Run:
 
     Args:
         path: of the run folder.
+        task: the task that the run is of, as "module:Class" or as the class, where it is not installed.
 
     Attributes:
         path: of the run folder.
@@ -47,7 +51,9 @@ class Run:
         ValueError: there is no run, or its configuration is damaged or of another version.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: str | os.PathLike[str], task: str | type[Environment] | None = None) -> None:
+        if task is not None:
+            register(task)
         self.folder = RunFolder.open(Path(path))
         self.path = self.folder.path
         self.config: RunConfig = parse_config(self.folder.config, self.path)
@@ -142,7 +148,7 @@ class Run:
 
 
 def start(
-    task: str = "navigation",
+    task: str | type[Environment] = "navigation",
     algo: str = "mappo",
     *,
     steps: int = 1_000_000,
@@ -153,15 +159,15 @@ def start(
     out: str | os.PathLike[str] | None = None,
 ) -> Run:
     """Make the folder of a new run, which `Run.train` then trains; arguments and errors as of `train`."""
-    config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings)
+    config = resolve_config(register(task), algo, preset, steps, seeds, resolve_device(device), settings)
     build_learner(config)  # refuses settings that do not fit together before a run folder exists
-    name = f"{config.task}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = f"{file_name(config.task)}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
     path = Path("runs") / name if out is None else Path(out)
     return Run(RunFolder.create(path, config.model_dump(mode="json")).path)
 
 
 def train(
-    task: str = "navigation",
+    task: str | type[Environment] = "navigation",
     algo: str = "mappo",
     *,
     steps: int = 1_000_000,
@@ -175,7 +181,7 @@ def train(
     """Train S seeds at once, as `esp train` does, and return the run.
 
     Args:
-        task: name of a task.
+        task: name of a task, "module:Class", or the class of one.
         algo: "mappo", "maddpg" or "qmix".
         steps: environment steps per seed.
         seeds: the run's seeds.

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.formatting import format_count
+from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, Settings, StudyKind, Team
 from esp_cli.studies.study import Cell, Study
@@ -79,7 +79,7 @@ def _pairs(
     for team, steps, algorithm in (
         (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
     ):
-        stem = f"{_slug(team.label)}-{_count(steps)}-{algorithm}"
+        stem = f"{file_name(team.label)}-{_count(steps)}-{algorithm}"
         for prior in variants:
             settings = {**team.settings, **kind.variants[prior]}
             config = _config(task, algorithm, steps, request, settings, kind.common)
@@ -98,18 +98,18 @@ def _variants(
 ) -> Iterator[Cell]:
     """Yield the variants of each algorithm, which are compared with the first of them."""
     for algorithm, steps in ((a, s) for a in algorithms for s in _steps(kind, task, request)):
-        stem = f"{task}-{algorithm}-{_count(steps)}"
+        stem = f"{file_name(task)}-{algorithm}-{_count(steps)}"
         for variant in variants:
             choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
             config = _config(task, algorithm, steps, request, choice, kind.common)
             fields = {"task": task, "steps": steps, "algorithm": algorithm, "value": variant.removeprefix("c = ")}
             place = tuple(part.format(**fields) for part in kind.place)
             yield Cell(
-                name=f"{stem}-{_slug(variant)}",
+                name=f"{stem}-{file_name(variant)}",
                 panel=f"{task}, {algorithm.upper()}, {_count(steps)}",
                 variant=variant,
                 config=config,
-                reference=None if variant == variants[0] else f"{stem}-{_slug(variants[0])}",
+                reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
                 paper=place if paper.reported(place or None) and _comparable(config, {}) else None,
             )
 
@@ -176,12 +176,6 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
 def _paired_name(algorithm: str, prior: str) -> str:
     """Return how the paper calls an algorithm without the prior and with it: "MADDPG", "MADDPG-ESP"."""
     return algorithm.upper() + ("" if prior == "none" else "-ESP")
-
-
-def _slug(text: str) -> str:
-    """Return a name for a folder: "rot90, rot180" -> "rot90-rot180", "N = 2" -> "n-2"."""
-    words = "".join(c if c.isalnum() or c == "." else " " for c in text.lower()).split()
-    return "-".join(words)
 
 
 def _count(steps: int) -> str:

@@ -1,0 +1,107 @@
+"""`esp check`: does a task keep what every task promises, and is it as symmetric as it declares?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_tasks
+
+if TYPE_CHECKING:
+    from esp_cli.checking import PolicyVerdict, SymmetryReport
+    from esp_cli.checking.paired import MakeWorlds
+    from esp_envs import Environment
+    from esp_envs.conformance import Finding
+
+EPILOG = """Examples:\n
+    esp check task rendezvous:Rendezvous\n
+    esp check symmetry navigation --set task.actions=continuous\n
+    esp check symmetry rendezvous:Rendezvous --transforms d8*agents --json symmetry.json"""
+
+_ROUNDING = 1e-4
+"""How far a step from a restored state may differ: physics may be finer than the float32 of states."""
+
+
+def check(
+    what: Annotated[Literal["task", "symmetry"], typer.Argument(help="What to check.", metavar="task|symmetry")],
+    task: Annotated[str, typer.Argument(help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")],
+    transforms: Annotated[
+        str | None,
+        typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.", metavar="LIST"),
+    ] = None,
+    settings: TaskSetOption = None,
+    policy: Annotated[
+        Path | None, typer.Option("--policy", help="Also measure how symmetric this policy is.", metavar="RUN|POLICY")
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Check what every task promises, or a task's declared symmetry; exit code 1 where something is broken.
+
+    Symmetry is judged per element and field: it holds, it is broken, or the data does not cover it.
+    """
+    from esp_envs.registry import make
+
+    register_tasks([task])
+    chosen = parse_task_settings(settings or [])
+
+    def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
+        return make(task, num_envs, seeds, chosen)
+
+    make_worlds(1, [0])  # a mistake in task or settings is the user's, not a broken promise
+    if what == "task":
+        if transforms is not None or policy is not None:
+            raise ValueError("--transforms and --policy belong to 'esp check symmetry'; leave them out")
+        holds = _check_task(task, make_worlds, json)
+    else:
+        holds = _check_symmetry(make_worlds, transforms, policy, json)
+    if not holds:
+        raise typer.Exit(1)
+
+
+def _check_task(task: str, make_worlds: MakeWorlds, json: str | None) -> bool:
+    from esp_envs.conformance import Subject, check
+
+    findings: list[Finding] = list(check(Subject(make_worlds, rounding=_ROUNDING)))
+    if json != "-":
+        rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
+                for f in findings]  # fmt: skip
+        console.table(("promise", "result", "what happens"), rows, title=f"What {task} promises as a task")
+    if json is not None:
+        console.write_json(json, findings)
+    return not any(finding.broken for finding in findings)
+
+
+def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> bool:
+    from esp_cli.checking import check_policy, check_symmetry
+
+    report = check_symmetry(make_worlds, transforms)
+    measured: list[PolicyVerdict] = []
+    if policy is not None:
+        from esp_cli.deploy.bundled import open_policy
+
+        measured = check_policy(open_policy(policy), make_worlds, transforms)
+    if json != "-":
+        _print(report, measured)
+    if json is not None:
+        console.write_json(json, {"report": report, "holds": report.holds, "policy": measured})
+    return report.holds
+
+
+def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
+    rows = []
+    for element in report.elements:
+        worst = [f for f in element.fields if f.outcome == "broken"]
+        gaps = ", ".join(f"{f.field} {f.gap:.3f} ± {f.error:.3f}" for f in worst)
+        unseen = ", ".join(f.field for f in element.fields if f.outcome == "not covered")
+        told = gaps or element.reason or (f"not covered: {unseen}" if unseen else "")
+        rows.append((element.element, "yes" if element.declared else "no", element.outcome, told))
+    title = f"{report.task} by {report.method}: declared {report.declared}, found {report.found}"
+    caption = "gap and standard error in standard deviations of the field; found: as far as the visited states show"
+    console.table(("element", "declared", "result", "where"), rows, title=title, caption=caption)
+    if measured:
+        agreeing = [(m.element, f"{m.agreement:.3f}") for m in measured]
+        console.table(("element", "same greedy action>"), agreeing, title="Symmetry of the policy")

@@ -1,0 +1,81 @@
+"""Symmetry from transitions alone, for tasks that cannot be set to a state and for data of others."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from esp_cli.checking import Transitions, candidates, check_transitions, collect
+from esp_cli.checking.candidates import found_group
+from esp_cli.symmetry import parse_elements
+from esp_envs import make
+from esp_envs.mpe.task import FORCE
+from esp_envs.spec import Field, Items, Kind, Spaces, layout
+from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
+
+CONTINUOUS = {"actions": "continuous"}
+
+
+def outcomes(make_worlds, text: str = "rot90,flip-x,flip-y") -> dict[str, str]:
+    env = make_worlds(128, [0])
+    elements = parse_elements(text, env.spec.num_agents)
+    return {v.element: v.outcome for v in check_transitions(env.spec, collect(env, episodes=1536), elements)}
+
+
+@pytest.mark.parametrize(
+    ("task", "settings"), [("navigation", {}), ("predator-prey", CONTINUOUS), ("predator-prey", {})]
+)
+def test_a_clean_task_is_not_accused(task, settings) -> None:
+    found = outcomes(lambda n, seeds: make(task, n, seeds, settings), "rot90,flip-x,agents-1-0-2")
+    assert set(found.values()) == {"holds"}
+
+
+def test_wind_breaks_what_turns_it() -> None:
+    found = outcomes(with_fault("navigation", CONTINUOUS, wind(0.1)))
+    assert found == {"rot90": "broken", "flip-x": "holds", "flip-y": "broken"}
+
+
+def test_a_vector_declared_as_scalars_is_found() -> None:
+    fault = declared(as_scalars, "landmarks")
+    assert outcomes(with_fault("navigation", {}, fault), "rot90")["rot90"] == "broken"
+
+
+def test_an_agent_that_is_paid_otherwise_is_found() -> None:
+    found = outcomes(with_fault("navigation", {}, Fault(paid=first_counts_more)), "rot90,agents-1-0-2")
+    assert found == {"rot90": "holds", "agents-1-0-2": "broken"}
+
+
+def test_starts_that_are_not_symmetric_are_not_covered() -> None:
+    env = make("formation", 64, [0], {"horizon": 20, "num_agents": 4})
+    (verdict,) = check_transitions(env.spec, collect(env, episodes=256), parse_elements("rot90", 4))
+    assert verdict.outcome == "not covered"
+    assert "the starts differ from their image by" in verdict.reason
+
+
+def anybodys(drift: float) -> tuple[Spaces, Transitions]:
+    """Two points that somebody simulated elsewhere."""
+    g = torch.Generator().manual_seed(0)
+    row = layout(Field("position", Kind.VECTOR), Field("other", Kind.VECTOR, items=Items.OTHERS))
+    state = layout(Field("position", Kind.VECTOR, 2, items=Items.AGENTS))
+    spaces = Spaces(num_agents=2, observation=row, state=state, action=FORCE, symmetry="o2*agents")
+    position, action = torch.randn(2, 1500, 4, 2, 2, generator=g).unbind()
+    after = position + 0.1 * action + 0.05 * torch.randn(position.shape, generator=g) + torch.tensor([drift, 0.0])
+
+    def seen(x: torch.Tensor) -> torch.Tensor:
+        return torch.cat([x, x.flip(2) - x], -1)
+
+    return spaces, Transitions(seen(position), action, -after.norm(dim=-1), seen(after))
+
+
+@pytest.mark.parametrize(("drift", "found"), [(0.0, "o2*agents"), (0.02, "flip-x*agents")])
+def test_anybodys_transitions_are_judged(drift: float, found: str) -> None:
+    spaces, data = anybodys(drift)
+    verdicts = check_transitions(spaces, data, candidates(spaces))
+    assert found_group({v.element for v in verdicts if v.outcome == "holds"}, spaces) == found
+
+
+def test_what_no_action_carries_is_not_tried() -> None:
+    spec = make("navigation", 1, [0]).spec
+    assert "rot45" not in {element.name for element in candidates(spec)}
+    with pytest.raises(ValueError, match="no transform can be tried on navigation: action 'left' turned by 45"):
+        candidates(spec, "rot45")

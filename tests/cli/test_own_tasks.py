@@ -1,0 +1,158 @@
+"""A task of one's own through the application, from training to a study, in a fresh process where paths matter."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from esp_cli import load_policy
+from tests.own_tasks import save_page_files
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+TASK = "rendezvous:Rendezvous"
+SHORT = ["--steps", "200", "--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2"]
+
+
+def esp(folder: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the application as a user does, in a folder."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
+    boot = "from esp_cli.app import main; main()"
+    result = subprocess.run(
+        [sys.executable, "-c", boot, *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert result.returncode == code, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A working directory with the task and a finished run of it."""
+    folder = tmp_path_factory.mktemp("own")
+    save_page_files(folder)
+    esp(folder, "train", "--task", TASK, "--out", "run", *SHORT)
+    return folder
+
+
+def test_a_run_is_resumed_evaluated_drawn_exported_and_reported_with_its_task_named(folder: Path) -> None:
+    own = ["--task", TASK]
+    esp(folder, "train", "--resume", "run", *own)
+    esp(folder, "eval", "run", "--episodes", "2", "--json", "result.json", *own)
+    result = json.loads((folder / "result.json").read_text())
+    assert result["heuristics"] == ["middle"]
+    esp(folder, "render", "run", "-o", "film.gif", *own)
+    esp(folder, "export", "run", "-f", "numpy", "-o", "exported", *own)
+    esp(folder, "report", "run", *own)
+    assert (folder / "film.gif").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "--resume", "run"],
+        ["eval", "run"],
+        ["render", "run", "-o", "f.gif"],
+        ["export", "run", "-f", "numpy", "-o", "e"],
+        ["report", "run"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_run_alone_imports_nothing_and_says_what_to_add(folder: Path, words: list[str]) -> None:
+    result = esp(folder, *words, code=2)
+    assert f"the task '{TASK}' is not installed; add --task {TASK} to let esp import and run it" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_a_program_loads_such_a_policy_by_naming_its_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from esp_envs import registry
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    with pytest.raises(ValueError, match="add --task rendezvous:Rendezvous"):
+        load_policy(folder / "run")
+    policy = load_policy(folder / "run", task=TASK)
+    assert policy.spec.name == "rendezvous"
+
+
+def test_a_task_without_heuristics_is_evaluated_beside_the_random_policy_alone(folder: Path) -> None:
+    source = (folder / "rendezvous.py").read_text()
+    (folder / "bare.py").write_text(
+        source.replace('    heuristics = ("middle",)\n', "").replace("def heuristic(", "def h(")
+    )
+    esp(folder, "train", "--task", "bare:Rendezvous", "--out", "bare-run", *SHORT)
+    shown = esp(folder, "eval", "bare-run", "--episodes", "2", "--task", "bare:Rendezvous").stdout
+    assert "random" in shown
+    assert "heuristic" not in shown
+
+
+def test_a_study_hands_the_task_to_its_workers(folder: Path) -> None:
+    words = [
+        "ablate",
+        "modules",
+        "--task",
+        TASK,
+        "--algo",
+        "mappo",
+        "--seeds",
+        "1",
+        "--out",
+        "study",
+        "--episodes",
+        "2",
+    ]
+    esp(folder, *words, *SHORT)
+    assert "found nothing" not in esp(folder, "report", "study", "--task", TASK).stdout
+    assert esp(folder, "report", "study", code=2).stderr.count("add --task") == 1
+
+
+@pytest.mark.parametrize(
+    ("task", "sentence"),
+    [
+        ("rendezvous:Nothing", "the module 'rendezvous' has no class 'Nothing'"),
+        ("nowhere:Task", "cannot import the module 'nowhere' of the task: ModuleNotFoundError"),
+        ("rendezvous:torch", "'rendezvous:torch' is not a task"),
+    ],
+)
+def test_a_task_that_cannot_be_had_is_one_sentence(folder: Path, task: str, sentence: str) -> None:
+    result = esp(folder, "train", "--task", task, code=2)
+    assert sentence in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_check_says_whether_a_task_is_what_it_claims(folder: Path) -> None:
+    assert "broken" not in esp(folder, "check", "task", TASK).stdout
+    source = (folder / "rendezvous.py").read_text()
+    windy = source.replace("+ 0.1 * action", "+ 0.1 * action + torch.tensor([0.05, 0.0])")
+    (folder / "windy.py").write_text(windy)
+    shown = esp(folder, "check", "symmetry", "windy:Rendezvous", "--json", "windy.json", code=1).stdout
+    assert "declared o2*agents, found flip-x*agents" in shown
+    report = json.loads((folder / "windy.json").read_text())
+    assert report["holds"] is False
+    held = {e["element"]: e for e in report["report"]["elements"]}
+    broken = {f["field"] for f in held["rot90"]["fields"] if f["outcome"] == "broken"}
+    assert broken == {"state.position"}, "the others drift along, and so does the reward"
+    assert esp(folder, "check", "symmetry", "windy:Rendezvous", "--transforms", "flip-x").returncode == 0
+
+
+def test_check_measures_a_policy_too(folder: Path) -> None:
+    words = ["check", "symmetry", TASK, "--transforms", "rot90,flip-x", "--policy", "run", "--json", "-"]
+    result = json.loads(esp(folder, *words).stdout)
+    assert [m["element"] for m in result["policy"]] == ["rot90", "flip-x"]
+    assert all(0 <= m["agreement"] <= 1 for m in result["policy"])
+
+
+def test_check_refuses_what_it_does_not_take(folder: Path) -> None:
+    words = ["check", "task", TASK, "--transforms", "d4"]
+    assert "belong to 'esp check symmetry'" in esp(folder, *words, code=2).stderr
