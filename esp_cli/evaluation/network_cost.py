@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -11,27 +9,11 @@ from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 
 
-@dataclass(frozen=True)
-class NetworkCost:
-    """Sizes of the networks of one seed.
-
-    Attributes:
-        parameters: weights by name of the network, "policy" among them.
-        flops_per_action: floating-point operations of matrix products by which the policy chooses one agent's action.
-    """
-
-    parameters: dict[str, int]
-    flops_per_action: float
-
-
-def network_cost(config: RunConfig) -> NetworkCost:
-    """Build the networks of a run and count."""
-    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
-    modules = build_learner(config).modules
-    counts: dict[str, int] = {
-        name: sum(p.numel() for p in modules[name].parameters()) for name in ("policy", "critic") if name in modules
-    }
-    return NetworkCost(counts, flops_per_action(config))
+def network_parameters(config: RunConfig) -> dict[str, int]:
+    """Build the networks of one seed of a run, and return their weights by name, "policy" among them."""
+    modules = build_learner(config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})).modules
+    names = [name for name in ("policy", "critic") if name in modules]
+    return {name: sum(p.numel() for p in modules[name].parameters()) for name in names}
 
 
 @torch.no_grad()

@@ -141,7 +141,7 @@ def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
     value = float(first.mean() - second.mean())
     if paired:
         return Estimate(value, _interval((first - second,), np.mean))
-    return Estimate(value, _interval((first, second), _mean_difference))
+    return Estimate(value, _interval((first, second), lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis)))
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
@@ -246,10 +246,6 @@ def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamp
 
 def _iqm(values: Floats, axis: int = -1) -> Any:
     return stats.trim_mean(values, 0.25, axis=axis)
-
-
-def _mean_difference(x: Floats, y: Floats, axis: int = -1) -> Any:
-    return x.mean(axis=axis) - y.mean(axis=axis)
 
 
 def _wins(x: Floats, y: Floats) -> Floats:

@@ -11,7 +11,7 @@ from pydantic import JsonValue
 
 from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
 from esp_cli.evaluation.final import FinalEvaluation, Mode
-from esp_cli.evaluation.network_cost import network_cost
+from esp_cli.evaluation.network_cost import flops_per_action, network_parameters
 from esp_cli.evaluation.statistics import summarise
 from esp_cli.reporting.curves import RunCurve, read_curve
 from esp_cli.reporting.results import CellResult, Passing, Results, flat
@@ -79,11 +79,10 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
         states[cell.name] = RunState(step, _read_curve(run, cell, mode), final)
     results = results_of(study, states, mode, thresholds)
     if kind is not None and kind.network_cost:
-        costs = [network_cost(cell.config) for cell in study.cells]
-        cells = [
-            cell.model_copy(update={"parameters": cost.parameters, "flops_per_action": cost.flops_per_action})
-            for cell, cost in zip(results.cells, costs, strict=True)
-        ]
+        cells = []
+        for found, config in zip(results.cells, (cell.config for cell in study.cells), strict=True):
+            cost = {"parameters": network_parameters(config), "flops_per_action": flops_per_action(config)}
+            cells.append(found.model_copy(update=cost))
         results = results.model_copy(update={"cells": tuple(cells)})
     curves = {name: state.curve for name, state in states.items() if state.curve is not None}
     return Material(study, results, curves, {cell.name: folder.run_path(cell) for cell in study.cells})

@@ -49,15 +49,6 @@ class Gap:
 
 
 @dataclass(frozen=True)
-class PaperGap:
-    """The paper's number of a cell, and whose mean is higher; None where that cannot be tested."""
-
-    mean: float
-    sem: float | None
-    ahead: Literal["first", "second", "neither"] | None
-
-
-@dataclass(frozen=True)
 class CellSummary:
     """Everything that tables say about one cell; what cannot be said is None.
 
@@ -67,7 +58,7 @@ class CellSummary:
         normalised: 0 is the random policy, 1 the heuristic.
         area: mean height of the learning curve.
         gap: to the cell's reference.
-        paper: the paper's side.
+        leader: "first" where our mean is higher than the paper's, "second" where the paper's is.
     """
 
     returns: SeedSummary
@@ -75,7 +66,7 @@ class CellSummary:
     normalised: SeedSummary | None = None
     area: SeedSummary | None = None
     gap: Gap | None = None
-    paper: PaperGap | None = None
+    leader: Literal["first", "second", "neither"] | None = None
 
 
 @dataclass(frozen=True)
@@ -102,17 +93,14 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
     good = values[np.isfinite(values)]
     if not good.size or returns.mean is None:
         return CellSummary(returns)
-    scores, paper = _normalised(cell, good), None
-    if cell.paper is not None:
-        ahead = leader((returns.mean, returns.sem, good.size), (*cell.paper, NUM_SEEDS))
-        paper = PaperGap(*cell.paper, ahead)
+    scores, ours = _normalised(cell, good), (returns.mean, returns.sem, good.size)
     return CellSummary(
         returns,
         iqm=interquartile_mean(good),
         normalised=None if scores is None else summarise(scores),
         area=None if cell.area_under_curve is None else summarise(floats(cell.area_under_curve)),
         gap=_gap(results, cell, values),
-        paper=paper,
+        leader=None if cell.paper is None else leader(ours, (*cell.paper, NUM_SEEDS)),
     )
 
 

@@ -183,9 +183,8 @@ def _compared(cell: CellResult, found: CellSummary) -> dict[str, str]:
         texts["minus reference>"] = f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)}"
         texts["P(improvement)>"] = _estimate(gap.probability)
         texts["ahead of reference"] = _AHEAD[gap.ahead]
-    if found.paper:
-        texts["paper>"] = format_mean(found.paper.mean, found.paper.sem)
-        texts["ours or paper ahead"] = _LEADER[found.paper.ahead]
+    if cell.paper:
+        texts |= {"paper>": format_mean(*cell.paper), "ours or paper ahead": _LEADER[found.leader]}
     return texts
 
 
