@@ -43,32 +43,24 @@ def c_source(program: Program, comment: str) -> CSource:
         raise ValueError(
             "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
         )
-    scratch = _Scratch(program)
+    scratch = 2 * program.team * _row_width(program) + 6 * program.hidden
     return CSource(
         header=_header(program, comment),
-        source=_source(program, scratch),
+        source=_source(program),
         flash_bytes=len(program.weights),
-        ram_bytes=4 * (scratch.total + program.memory_width),
+        ram_bytes=4 * (scratch + program.memory_width),
     )
 
 
-@dataclass(frozen=True)
-class _Scratch:
-    """Static arrays: two rows an agent that layers read and write in turn, both projections of a recurrent unit."""
-
-    program: Program
-
-    @property
-    def row(self) -> int:
-        widths = [self.program.num_inputs + self.program.previous, self.program.num_outputs, self.program.hidden]
-        widths += [layer.weight.shape[1] for layer in self.program.layers if isinstance(layer, layers.Affine)]
-        widths += [layer.weight.shape[0] for layer in self.program.layers if isinstance(layer, layers.Affine)]
-        widths += [layer.width for layer in self.program.layers if isinstance(layer, layers.Convolution)]
-        return max(widths)
-
-    @property
-    def total(self) -> int:
-        return 2 * self.program.team * self.row + 6 * self.program.hidden
+def _row_width(program: Program) -> int:
+    """Return the width of the two rows, an agent each, that layers read and write in turn."""
+    widths = [program.num_inputs + program.previous, program.num_outputs, program.hidden]
+    for layer in program.layers:
+        if isinstance(layer, layers.Affine):
+            widths += layer.weight.shape
+        elif isinstance(layer, layers.Convolution):
+            widths.append(layer.width)
+    return max(widths)
 
 
 def example_source(program: Program, observation: Iterable[float], action: Iterable[float]) -> str:
@@ -174,12 +166,12 @@ def _outputs(program: Program) -> str:
     return f"const float *esp_policy_outputs({'int agent' if program.team > 1 else 'void'})"
 
 
-def _source(program: Program, scratch: _Scratch) -> str:
+def _source(program: Program) -> str:
     kinds = {type(layer) for layer in program.layers}
     names = {layer.name for layer in program.layers if isinstance(layer, layers.Activation)}
     parts = ['#include "policy.h"\n\n#include <math.h>\n#include <string.h>\n']
     parts += [array(f"w{k}_{i}", a) for k, layer in enumerate(program.layers) for i, a in enumerate(layer.arrays)]
-    row = str(scratch.row)
+    row = str(_row_width(program))
     if program.team > 1:
         parts.append(f"#define ROW {row}")
         row = "ESP_POLICY_AGENTS * ROW"

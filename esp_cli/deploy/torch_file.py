@@ -69,7 +69,6 @@ def torch_archive(program: Program, description: str) -> bytes:
 
 
 def _apply(x: Tensor, layer: layers.Layer, arrays: list[Tensor], observation: Tensor) -> Tensor:
-    """Apply a layer without memory."""
     if isinstance(layer, layers.Affine):
         return torch.addmm(arrays[1], x, arrays[0])
     if isinstance(layer, layers.Activation):
@@ -87,7 +86,6 @@ def _apply(x: Tensor, layer: layers.Layer, arrays: list[Tensor], observation: Te
 
 
 def _convolve(x: Tensor, layer: layers.Convolution, arrays: list[Tensor]) -> Tensor:
-    """Apply filters to rows that hold pictures."""
     weight = arrays[0].T.reshape(layer.outputs, layer.channels, layer.side, layer.side)
     pictures = x.unflatten(1, (layer.channels, layer.rows, layer.columns))
     return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
@@ -103,7 +101,6 @@ def _hear(x: Tensor, observation: Tensor, layer: layers.MessageAggregation) -> T
 
 
 def _recur(x: Tensor, hidden: Tensor, arrays: list[Tensor]) -> Tensor:
-    """Advance the gated recurrent unit by one step."""
     pr, pz, pn = torch.addmm(arrays[1], x, arrays[0]).chunk(3, -1)
     qr, qz, qn = torch.addmm(arrays[3], hidden, arrays[2]).chunk(3, -1)
     reset, update = torch.sigmoid(pr + qr), torch.sigmoid(pz + qz)

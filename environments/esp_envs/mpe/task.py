@@ -48,13 +48,7 @@ class ParticleTask(LockstepTask):
     settings: ParticleSettings
 
     def _build(self, spec: TaskSpec, bodies: Bodies, first_learner: int = 0) -> None:
-        """Make the worlds.
-
-        Args:
-            spec: the finished spec.
-            bodies: what the worlds hold.
-            first_learner: index of the first agent that learns; the others are driven by the task.
-        """
+        """Make the worlds; `spec.num_agents` agents from `first_learner` on learn, the task drives the others."""
         self.spec = spec
         velocity_first = self.settings.convention == "esp"
         self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
