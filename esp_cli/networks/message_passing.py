@@ -50,31 +50,24 @@ class PictureEncoder(nn.Module):
         super().__init__()
         assert field.pixels is not None
         self.shape = (field.count, *field.pixels)
-        side = min(field.pixels)
+        lengths = list(field.pixels)
         block = trivial(group, field.count)
         self.sides, self.strides, layers = [], [], []
         for channels, filter_side, stride in zip(CHANNELS, FILTERS, STRIDES, strict=True):
-            used = min(filter_side, side)
+            used = min(filter_side, *lengths)
             # a stride that skips the last pixels would break the symmetry between the edges
-            step = stride if all((length - used) % stride == 0 for length in self._after(field.pixels)) else 1
+            step = stride if all((length - used) % stride == 0 for length in lengths) else 1
             following = regular(group, copies_for(channels, group))
             layers.append(ConstrainedLinear(generators, [with_pixels(block, used, group)], [following], GAINS["relu"]))
             self.sides.append(used)
             self.strides.append(step)
-            side = (side - used) // step + 1
+            lengths = [(length - used) // step + 1 for length in lengths]
             block = following
         self.layers = nn.ModuleList(layers)
         self.output = block
         keys = torch.randn(2, field.width, generator=torch.Generator().manual_seed(0))
         self.keys: Tensor
         self.register_buffer("keys", keys, False)
-
-    def _after(self, pixels: tuple[int, int]) -> list[int]:
-        """Return height and width after the layers so far."""
-        sizes = list(pixels)
-        for side, stride in zip(self.sides, self.strides, strict=True):
-            sizes = [(size - side) // stride + 1 for size in sizes]
-        return sizes
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Encode pictures; equal pictures are encoded once. No gradient reaches a picture."""

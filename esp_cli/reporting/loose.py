@@ -17,8 +17,6 @@ from esp_cli.reporting.results import CellResult
 from esp_cli.reporting.summary import floats, summarise_cell
 from esp_cli.studies.study import Cell, Study
 
-KIND = "runs"
-
 
 def put_together(
     curves: Sequence[RunCurve],
@@ -58,7 +56,7 @@ def put_together(
             states[name] = RunState(curve.last_step, curve, at=step)
             by_name[name], runs[name] = curve, path
     study = Study(
-        kind=KIND,
+        kind="runs",
         title=f"{' and '.join(labels)} on {curves[0].config.task}",
         command=command,
         episodes=curves[0].config.evaluation.episodes,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from esp_cli.evaluation.statistics import Estimate, SeedSummary
 from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.reporting.results import CellResult, Passing, Results
+from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell
 from esp_cli.studies import paper
 from esp_cli.studies.catalogue import paper_cells
@@ -108,7 +108,8 @@ def statistics_table(results: Results) -> Table:
             continue
         seeds = sum(x is not None for x in found.returns.per_seed)
         duration = NOTHING if cell.seconds is None else format_duration(cell.seconds)
-        passings = "; ".join(map(_passing, cell.steps_to)) or NOTHING
+        reached = [(p.threshold, NOTHING if p.of_mean is None else format_count(p.of_mean)) for p in cell.steps_to]
+        passings = "; ".join(f"{threshold:.2f}: {steps}" for threshold, steps in reached) or NOTHING
         texts = (_estimate(found.iqm), _mean_of(found.normalised), passings, _mean_of(found.area))
         rows.append((cell.panel, cell.variant, str(seeds), *texts, duration))
     caption = (
@@ -208,10 +209,6 @@ def _caption(results: Results) -> str:
     episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     said = f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
     return f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed.{said}"
-
-
-def _passing(passed: Passing) -> str:
-    return f"{passed.threshold:.2f}: {NOTHING if passed.of_mean is None else format_count(passed.of_mean)}"
 
 
 def _mean_of(summary: SeedSummary | None) -> str:

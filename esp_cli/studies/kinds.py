@@ -143,9 +143,7 @@ KINDS: Mapping[str, StudyKind] = {
     "homomorphic": StudyKind(
         "Symmetry in the network and symmetry in the prior (figure 6b)",
         rows="variants",
-        varies=frozenset(
-            {"network.name", "network.group", "network.symmetrise", "prior.kind", "prior.transforms"},
-        ),
+        varies=frozenset({"network.name", "network.group", "network.symmetrise", "prior.kind", "prior.transforms"}),
         variants={
             "mpn": {"network.name": "mpn", "prior.kind": "none"},
             "mpn-esp": {"network.name": "mpn", "prior.kind": "esp", "prior.transforms": GROUP},
