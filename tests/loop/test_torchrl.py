@@ -107,6 +107,13 @@ def test_a_tensordict_is_copied_key_by_key() -> None:
     assert data["agents", "logits"].shape == (ROWS, AGENTS, 4), "the original stays as it is"
 
 
+def test_a_mask_of_actions_turns_with_the_actions() -> None:
+    data = rows()
+    data["agents", "action_mask"] = torch.tensor([True, False, False, True]).expand(ROWS, AGENTS, 4)
+    both = augmented(symmetry(), data)
+    assert both["agents", "action_mask"][ROWS, 0].tolist() == [True, True, False, False], "right becomes up, down right"
+
+
 def test_a_group_of_one_agent_may_have_an_agent_axis() -> None:
     alone = Symmetry(observation=layout(Field("velocity", Kind.VECTOR)), action=FORCE, group="rot90")
     obs, ended = torch.tensor([[[1.0, 0.0]]] * 4), torch.zeros(4, 1, dtype=torch.bool)
