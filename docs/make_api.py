@@ -43,7 +43,7 @@ def signature(thing: Any) -> str:
     if inspect.isclass(thing) and issubclass(thing, Enum):
         return f"({', '.join(member.name for member in thing)})"
     thing = thing.fget if isinstance(thing, property) else getattr(thing, "__func__", thing)
-    return re.sub(r"(: |-> )'([^']*)'", r"\1\2", str(inspect.signature(thing)))
+    return re.sub(r"(: |-> )(?:'([^']*)'|\"([^\"]*)\")", r"\1\2\3", str(inspect.signature(thing)))
 
 
 def signatures() -> dict[str, str]:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Literal, overload
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, overload
 
 import torch
 from torch import Tensor
 
 from esp_cli.loop.divergence import Policy, policy_divergence
+from esp_cli.loop.shapes import act, carry, check_state, lead_of
+from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
 from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
-
-HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
-"""What messages advise where numbers look like memory."""
 
 
 class Symmetry:
@@ -113,7 +112,7 @@ class Symmetry:
         Raises:
             ValueError: a shape that does not fit the layouts, or an action outside.
         """
-        lead = self.lead_of(obs)
+        lead = lead_of(self.spaces, obs)
         if not 0 <= dim < len(lead):
             raise ValueError(
                 f"obs of shape {list(obs.shape)} has {len(lead)} leading axes; copies cannot go along {dim}"
@@ -124,15 +123,30 @@ class Symmetry:
             return torch.cat([x, *images], dim)
 
         moved_obs = joined(obs, [g.obs(obs) for g in transforms])
-        moved_action = joined(action, [self.act(g, action, lead) for g in transforms])
+        moved_action = joined(action, [act(self.spaces, g, action, lead) for g in transforms])
         numbers = tuple(
-            joined(x, [self.carry(g.per_agent, x, lead, f"per_agent[{i}]") for g in transforms])
+            joined(x, [carry(self.spaces, g.per_agent, x, lead, f"per_agent[{i}]") for g in transforms])
             for i, x in enumerate(per_agent)
         )
         if state is None:
             return moved_obs, moved_action, numbers
-        self.check_state(state, lead)
+        check_state(self.spaces, state, lead)
         return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
+
+    def augment_tensordict(self, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
+        """Return a TensorDict with its copies behind it, along the first axis of its batch.
+
+        Keys are known by their last part: observation, state, action. Others hold numbers that go with their agents, or
+        one for each row. What networks said (logits, loc, scale) and "info" are left out.
+
+        Args:
+            data: TensorDict [B, ...], agents in nested groups or not, also below "next".
+            roles: of keys by their last part, where `esp_cli.loop.tensordicts.ROLES` says it otherwise.
+
+        Raises:
+            ValueError: the numbers under a key do not fit, or have no role.
+        """
+        return torch.cat(with_copies(self.spaces, data, self.transforms, roles)[0], 0)
 
     def policy_loss(
         self, policy: Callable[[Tensor], Policy], obs: Tensor, here: Policy = None, mask: Tensor | None = None
@@ -151,7 +165,7 @@ class Symmetry:
         Raises:
             ValueError: a shape that does not fit, or a distribution that is not known.
         """
-        self.lead_of(obs)
+        lead_of(self.spaces, obs)
         here = policy(obs) if here is None else here
         return _mean([policy_divergence(g, policy(g.obs(obs)), here) for g in self.transforms(obs)], mask)
 
@@ -177,16 +191,18 @@ class Symmetry:
             ValueError: a shape that does not fit.
         """
         if state is not None and obs is None:
-            lead = self.check_state(state)
+            lead = check_state(self.spaces, state)
             here = value(state) if here is None else here
             moved = [(g, value(g.state(state))) for g in self.transforms(state)]
         elif obs is not None and state is None:
-            lead = self.lead_of(obs)
+            lead = lead_of(self.spaces, obs)
             here = value(obs) if here is None else here
             moved = [(g, value(g.obs(obs))) for g in self.transforms(obs)]
         else:
             raise ValueError("value_loss takes either state or obs; give the one that the critic sees")
-        return _mean([value_consistency_loss(self.carry(g.values, x, lead, "value"), here) for g, x in moved], mask)
+        return _mean(
+            [value_consistency_loss(carry(self.spaces, g.values, x, lead, "value"), here) for g, x in moved], mask
+        )
 
     def action_value_loss(
         self, value: Callable[[Tensor], Tensor], obs: Tensor, here: Tensor | None = None, mask: Tensor | None = None
@@ -204,91 +220,16 @@ class Symmetry:
         """
         if not isinstance(self.spaces.action, Discrete):
             raise ValueError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
-        self.lead_of(obs)
+        lead_of(self.spaces, obs)
         here = value(obs) if here is None else here
         gaps = [value_consistency_loss(g.pull_back(value(g.obs(obs))), here) for g in self.transforms(obs)]
         return _mean(gaps, mask)
-
-    def lead_of(self, obs: Tensor) -> torch.Size:
-        """Return the leading axes of observations.
-
-        Raises:
-            ValueError: their shape or type does not fit.
-        """
-        return self._check_rows("obs", obs, self.spaces.observation, agents=self._agents)
-
-    def check_state(self, state: Tensor, lead: torch.Size | None = None) -> torch.Size:
-        """Return the leading axes of states.
-
-        Raises:
-            ValueError: their shape or type does not fit, or the leading axes are not those of the observations.
-        """
-        return self._check_rows("state", state, self.spaces.state, lead)
-
-    def act(self, transform: Transform, action: Tensor, lead: torch.Size) -> Tensor:
-        """Return K_g a; shapes as of `augment`.
-
-        Raises:
-            ValueError: another shape or type, or an action outside.
-        """
-        space, axes, shape = self.spaces.action, (*lead, *self._agents), list(action.shape)
-        if not isinstance(space, Discrete):
-            if action.shape != (*axes, space.width):
-                raise ValueError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
-            return transform.action(action)
-        if action.shape == (*axes, space.count) and space.count > 1:
-            return transform.push_outputs(action)
-        if action.shape not in (axes, (*axes, 1)):
-            raise ValueError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
-        if action.is_floating_point() or action.dtype == torch.bool:
-            raise ValueError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
-        low, high = torch.aminmax(action) if action.numel() else (0, 0)
-        if low < 0 or high >= space.count:
-            outside = int(low if low < 0 else high)
-            raise ValueError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
-        return transform.action(action.reshape(axes).long()).reshape(action.shape).to(action.dtype)
-
-    def carry(self, move: Callable[[Tensor], Tensor], x: Tensor, lead: torch.Size, name: str) -> Tensor:
-        """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`.
-
-        Raises:
-            ValueError: another shape.
-        """
-        agents, tail = (*lead, *self._agents), x.shape[len(lead) :]
-        if x.shape[: len(lead)] == lead and tail.numel() == 1:
-            return x
-        if x.shape in (agents, (*agents, 1)):
-            return move(x.reshape(agents)).reshape(x.shape)
-        reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
-        raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
-
-    @property
-    def _agents(self) -> tuple[int, ...]:
-        """The agent axis, where there is one."""
-        return (self.spaces.num_agents,) if self.spaces.num_agents > 1 else ()
 
     def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
         key = (device, dtype)
         if key not in self._sets:
             self._sets[key] = transform_set(self.group, self.spaces, device, dtype)
         return self._sets[key]
-
-    def _check_rows(
-        self, name: str, x: Tensor, layout: Layout, lead: torch.Size | None = None, agents: tuple[int, ...] = ()
-    ) -> torch.Size:
-        """Return the leading axes of rows [..., *agents, width] after checking that they are that."""
-        cut = x.dim() - 1 - len(agents)
-        found = x.shape[: max(cut, 0)]
-        if x.shape[-1:] != (layout.width,):
-            width = x.shape[-1] if x.dim() else 0
-            raise ValueError(f"{name} has rows of {width} numbers, but its layout has {layout.width}: {layout.summary}")
-        if cut < 0 or x.shape[cut:-1] != agents:
-            raise ValueError(f"{name} has shape {list(x.shape)}, but axis -2 must hold {self.spaces.num_agents} agents")
-        if lead is not None and found != lead:
-            raise ValueError(f"{name} has leading axes {list(found)}, but those of obs are {list(lead)}")
-        if not x.is_floating_point():
-            raise ValueError(f"{name} is {x.dtype}; give floating-point numbers")
-        return found
 
 
 def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from esp_cli.loop.symmetry import Symmetry
+from esp_cli.loop.shapes import act, carry, check_state, lead_of
 from esp_cli.symmetry import Transform
+from esp_envs.spec import Spaces
 
 Role = Literal["observation", "state", "action", "same", "drop"]
 """What the numbers under a key are: rows of a layout, actions (or one number per action), unchanged, left out."""
@@ -34,26 +35,22 @@ Other keys hold numbers that go with their agents, or one for each row (rewards,
 """
 
 
-def augmented(symmetry: Symmetry, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
-    """Return a TensorDict with its transformed copies behind it, along the first axis of its batch.
+def with_copies(
+    spaces: Spaces,
+    data: Any,
+    choose: Callable[[Tensor], list[Transform]],
+    roles: Mapping[str, Role] | None = None,
+) -> tuple[list[Any], list[Transform]]:
+    """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
 
     Args:
-        symmetry: says what the numbers are.
+        spaces: what the numbers are.
         data: TensorDict [B, ...], agents in nested groups or not, also below "next".
+        choose: returns the elements of the copies, on the device of a tensor.
         roles: of keys by their last part, where they differ from `ROLES`.
 
     Raises:
         ValueError: the numbers under a key do not fit, or have no role.
-    """
-    return torch.cat(with_copies(symmetry, data, roles)[0], 0)
-
-
-def with_copies(
-    symmetry: Symmetry, data: Any, roles: Mapping[str, Role] | None = None
-) -> tuple[list[Any], list[Transform]]:
-    """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
-
-    Arguments and errors as of `augmented`.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
     leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
@@ -63,31 +60,29 @@ def with_copies(
     if not seen:
         names = ", ".join(".".join(path) for path in leaves)
         raise ValueError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
-    transforms, copies = symmetry.transforms(seen[0]), []
+    transforms, copies = choose(seen[0]), []
     for transform in transforms:
         copy = data.clone(False)
         for path, value in kept.items():
-            copy.set(path, _moved(symmetry, transform, value, named.get(path[-1]), data.batch_size, ".".join(path)))
+            copy.set(path, _moved(spaces, transform, value, named.get(path[-1]), data.batch_size, ".".join(path)))
         copies.append(copy)
     return [data, *copies], transforms
 
 
-def _moved(
-    symmetry: Symmetry, transform: Transform, x: Tensor, role: Role | None, lead: torch.Size, name: str
-) -> Tensor:
+def _moved(spaces: Spaces, transform: Transform, x: Tensor, role: Role | None, lead: torch.Size, name: str) -> Tensor:
     """Return the numbers of one key in a copy."""
     try:
         if role == "observation":
-            symmetry.lead_of(x)
+            lead_of(spaces, x)
             return transform.obs(x)
         if role == "state":
-            symmetry.check_state(x)
+            check_state(spaces, x)
             return transform.state(x)
         if role == "action":
             # a group of one agent has an agent axis all the same
-            alone = symmetry.spaces.num_agents == 1 and x.shape[len(lead) : -1] == (1,)
-            return symmetry.act(transform, x, torch.Size((*lead, 1)) if alone else lead)
-        return x if role == "same" else symmetry.carry(transform.per_agent, x, lead, "it")
+            alone = spaces.num_agents == 1 and x.shape[len(lead) : -1] == (1,)
+            return act(spaces, transform, x, torch.Size((*lead, 1)) if alone else lead)
+        return x if role == "same" else carry(spaces, transform.per_agent, x, lead, "it")
     except ValueError as error:
         advice = "" if role else "; name its role, 'same' or 'drop' for example"
         raise ValueError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None

@@ -16,15 +16,16 @@ from torchrl.envs.transforms import Transform as TorchRLTransform
 from torchrl.objectives import LossModule
 
 from esp_cli.loop.divergence import Policy, policy_divergence, split_policy
+from esp_cli.loop.shapes import carry
 from esp_cli.loop.symmetry import Symmetry
-from esp_cli.loop.tensordicts import Role, augmented, with_copies
+from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 
 
 class SymmetricCopies(TorchRLTransform):
     """Adds transformed copies to what a replay buffer samples, or a collector delivers (as its `postproc`).
 
-    `TensorDictReplayBuffer` refuses samples that grow; take `ReplayBuffer`, or extend it by `augmented` data.
+    `TensorDictReplayBuffer` refuses samples that grow; take `ReplayBuffer`, or extend with `augment_tensordict`.
 
     Args:
         symmetry: says what the numbers are.
@@ -37,7 +38,7 @@ class SymmetricCopies(TorchRLTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the data with its copies behind it, along the first axis."""
-        return augmented(self.symmetry, tensordict, self.roles)
+        return self.symmetry.augment_tensordict(tensordict, self.roles)
 
 
 class _Answers(NamedTuple):
@@ -97,7 +98,9 @@ class SymmetricLoss(nn.Module):
         """
         if not self.augment and not self.coefficient:
             return self.loss(tensordict)
-        parts, transforms = with_copies(self.symmetry, self._needed(tensordict), self.roles)
+        parts, transforms = with_copies(
+            self.symmetry.spaces, self._needed(tensordict), self.symmetry.transforms, self.roles
+        )
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
         said = [self._ask(batch) for batch in batches]
         losses, size = said[0].losses, len(tensordict)
@@ -109,7 +112,7 @@ class SymmetricLoss(nn.Module):
             gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
         own, *moved = (part for answer in said for part in answer.value.split(size))
         gaps["value"] = [
-            value_consistency_loss(self.symmetry.carry(g.values, v, tensordict.batch_size, "the value"), own)
+            value_consistency_loss(carry(self.symmetry.spaces, g.values, v, tensordict.batch_size, "the value"), own)
             for g, v in zip(transforms, moved, strict=True)
         ]
         for name, gap in gaps.items():

@@ -20,7 +20,6 @@ from torchrl.modules import ProbabilisticActor, QMixer, QValueModule, TanhNormal
 from torchrl.objectives import ClipPPOLoss, DQNLoss, ValueEstimators
 from torchrl.objectives.multiagent import QMixerLoss
 
-from esp_cli.loop.tensordicts import augmented
 from esp_cli.loop.torchrl import SymmetricCopies, SymmetricLoss
 
 try:
@@ -89,7 +88,7 @@ def skip_missing(kind: Any) -> None:
 
 def test_a_tensordict_is_copied_key_by_key() -> None:
     data = rows()
-    both = augmented(symmetry("rot90*agents-1-2-0"), data)
+    both = symmetry("rot90*agents-1-2-0").augment_tensordict(data)
     obs, action, (log_prob, advantage) = symmetry("rot90*agents-1-2-0").augment(
         data["agents", "observation"],
         data["agents", "action"],
@@ -110,7 +109,7 @@ def test_a_tensordict_is_copied_key_by_key() -> None:
 def test_a_mask_of_actions_turns_with_the_actions() -> None:
     data = rows()
     data["agents", "action_mask"] = torch.tensor([True, False, False, True]).expand(ROWS, AGENTS, 4)
-    both = augmented(symmetry(), data)
+    both = symmetry().augment_tensordict(data)
     assert both["agents", "action_mask"][ROWS, 0].tolist() == [True, True, False, False], "right becomes up, down right"
 
 
@@ -118,9 +117,9 @@ def test_a_group_of_one_agent_may_have_an_agent_axis() -> None:
     alone = Symmetry(observation=layout(Field("velocity", Kind.VECTOR)), action=FORCE, group="rot90")
     obs, ended = torch.tensor([[[1.0, 0.0]]] * 4), torch.zeros(4, 1, dtype=torch.bool)
     data = TensorDict({"agents": {"observation": obs, "action": obs, "reward": obs[..., :1]}, "done": ended}, [4])
-    both = augmented(alone, data)
+    both = alone.augment_tensordict(data)
     assert both["agents", "observation"][4:].tolist() == both["agents", "action"][4:].tolist() == [[[0.0, 1.0]]] * 4
-    flat = augmented(alone, TensorDict({"observation": obs[:, 0], "action": obs[:, 0]}, [4]))
+    flat = alone.augment_tensordict(TensorDict({"observation": obs[:, 0], "action": obs[:, 0]}, [4]))
     assert flat["action"][4:].tolist() == [[0.0, 1.0]] * 4
 
 
@@ -139,13 +138,13 @@ def test_a_key_that_does_not_fit_is_named(change: dict[str, torch.Tensor], sente
     data = rows()
     data["agents"].update(change)
     with pytest.raises(ValueError, match=sentence):
-        augmented(symmetry(), data)
-    assert "hidden" not in change or augmented(symmetry(), data, {"hidden": "drop"}) is not None
+        symmetry().augment_tensordict(data)
+    assert "hidden" not in change or symmetry().augment_tensordict(data, {"hidden": "drop"}) is not None
 
 
 def test_a_tensordict_without_observations_is_refused() -> None:
     with pytest.raises(ValueError, match=r"no key of the TensorDict is an observation .* it has pixels"):
-        augmented(symmetry(), TensorDict({"pixels": torch.zeros(ROWS, 3)}, [ROWS]))
+        symmetry().augment_tensordict(TensorDict({"pixels": torch.zeros(ROWS, 3)}, [ROWS]))
 
 
 def test_a_replay_buffer_samples_rows_with_their_copies() -> None:
@@ -166,7 +165,7 @@ def test_the_loss_is_that_of_the_copied_rows_plus_the_consistency_terms(kind: An
     action = MOVES if discrete else FORCE
     got = SymmetricLoss(loss, symmetry("d4", action, copies="all"), 0.5)(data.clone())
     again = symmetry("d4", action, copies="all")
-    plain = loss(augmented(again, data))
+    plain = loss(again.augment_tensordict(data))
     obs, bare = data["agents", "observation"], loss.actor_network
     with loss.actor_network_params.to_module(bare):
         policy_gap = again.policy_loss(
@@ -234,7 +233,7 @@ def mixer_loss() -> QMixerLoss:
 
 def test_qmix_compares_the_mixed_value_of_actions_taken() -> None:
     data, loss = rows(), mixer_loss()
-    both = augmented(symmetry(), data)
+    both = symmetry().augment_tensordict(data)
     plain = loss(both)["loss"].item()
     with torch.no_grad(), loss.local_value_network_params.to_module(loss.local_value_network):
         said = loss.local_value_network(both.clone())
