@@ -39,13 +39,8 @@ from esp_cli.training.policy_file import write_policy
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
 
-_CONFIG, _METRICS, _CHECKPOINTS, _POLICY, _LOCK = (
-    "config.json",
-    "metrics.jsonl",
-    "checkpoints",
-    "policy.safetensors",
-    "run.lock",
-)
+_CONFIG, _METRICS, _CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
+_POLICY, _LOCK = "policy.safetensors", "run.lock"
 _CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 
 
@@ -86,11 +81,6 @@ class RunFolder:
     def lock_path(self) -> Path:
         """The file that the process which trains holds."""
         return self.path / _LOCK
-
-    @property
-    def tensorboard_path(self) -> Path:
-        """The folder for TensorBoard, made by its writer."""
-        return self.path / "tensorboard"
 
     @classmethod
     def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any], force: bool = False) -> RunFolder:

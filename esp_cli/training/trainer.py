@@ -94,7 +94,7 @@ class Trainer:
 
     def __init__(self, config: RunConfig, folder: RunFolder, tensorboard: bool = False) -> None:
         self.config, self.folder = config, folder
-        self.tensorboard = folder.tensorboard_path if tensorboard else None
+        self.tensorboard = folder.path / "tensorboard" if tensorboard else None
         self.learner = build_learner(config)
         self.iteration = 0
         self.stopped_seeds: dict[int, int] = {}
