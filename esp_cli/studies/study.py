@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from esp_cli import __version__
 from esp_cli.evaluation.final import FinalEvaluation
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, validate
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.config import RunConfig
@@ -107,7 +107,7 @@ class StudyFolder:
         for name in names:
             # A name is that of a folder inside the study: nothing is written outside it.
             if not _FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
-                raise StudyError(f"{path / _STUDY} is damaged: {name!r} is not the name of one run")
+                raise StudyError(f"{path / _STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
         self.path, self.study = path, study
 
     @staticmethod

@@ -46,12 +46,11 @@ def spoil_bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def spoil_value(value: Any, rng: random.Random) -> Any:
-    """Return a JSON value with one to three places changed."""
-    value = copy.deepcopy(value)
+    """Return a JSON value with one to three places changed; it may be changed itself."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         inner, key = _place(value, rng)
         if inner is None:
-            value = copy.deepcopy(rng.choice(JUNK))
+            value = _junk(rng)
         elif rng.random() < 0.2:
             del inner[key]
         elif isinstance(inner, dict) and rng.random() < 0.1:
@@ -59,7 +58,7 @@ def spoil_value(value: Any, rng: random.Random) -> Any:
         elif rng.random() < 0.1:
             inner[key] = [inner[key]] * rng.choice((1, 2, 100))
         else:
-            inner[key] = copy.deepcopy(rng.choice(JUNK))
+            inner[key] = _junk(rng)
     return value
 
 
@@ -85,6 +84,11 @@ def spoil_header(content: bytes, rng: random.Random) -> bytes:
         header = spoil_value(header, rng)
     text = _dump(header)
     return struct.pack("<Q", len(text)) + text + content[8 + length :]
+
+
+def _junk(rng: random.Random) -> Any:
+    value = rng.choice(JUNK)
+    return copy.deepcopy(value) if isinstance(value, dict | list) else value
 
 
 def _dump(value: Any) -> bytes:

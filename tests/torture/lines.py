@@ -7,7 +7,6 @@ import os
 import random
 import shlex
 import shutil
-import signal
 import typing
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,8 +23,8 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 from esp_envs.registry import task_class, task_names
+from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
 
-LIMIT_S = 10.0
 BATCH = 10
 WORDS = ("x", "-", "--", "é", "a b", "../../x", "$(x)", "`x`", "x" * 3000, "\udcff", "[bold]", "0x10", "1,", ",", "=a")
 INTEGERS = ("x", "1.5", "nan", "inf", "-1", "1e30", "9" * 400, "0x1", "1_", "true", "[1]", "--", "é")
@@ -82,10 +81,10 @@ class Lines:
 
     def _try(self, words: list[str]) -> str | None:
         try:
-            with _time_limit():
+            with time_limit():
                 result = self._runner.invoke(app, words)
-        except TimeoutError:
-            return f"takes longer than {LIMIT_S} s"
+        except TooLongError:
+            return f"takes longer than {PROCESSOR_S} s"
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             return f"{type(result.exception).__name__}: {str(result.exception)[:300]}"
         lines = result.stderr.splitlines()
@@ -199,17 +198,3 @@ def _inside(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.chdir(old)
-
-
-@contextlib.contextmanager
-def _time_limit() -> Iterator[None]:
-    def stop(number: int, frame: object) -> None:
-        raise TimeoutError
-
-    old = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, old)
