@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from esp_cli.checking import Transitions
     from esp_cli.deploy.library import LoadedPolicy, load_policy
     from esp_cli.library.metrics import Metrics
     from esp_cli.library.run import Run, train
@@ -26,6 +27,7 @@ __all__ = [
     "Progress",
     "Run",
     "Symmetry",
+    "Transitions",
     "__version__",
     "discrete_moves",
     "layout",
@@ -40,6 +42,7 @@ _HOMES = {
     "Progress": "esp_cli.training.trainer",
     "Run": "esp_cli.library.run",
     "Symmetry": "esp_cli.loop.symmetry",
+    "Transitions": "esp_cli.checking",
     "discrete_moves": "esp_envs.moves",
     "load_policy": "esp_cli.deploy.library",
     "train": "esp_cli.library.run",

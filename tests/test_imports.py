@@ -26,7 +26,7 @@ RANKS = {
     "prior": 2,
     "networks": 2,
     "algorithms": 3,
-    "loop": 3,
+    "loop": 5.5,
     "training": 4,
     "evaluation": 5,
     "checking": 5,

@@ -143,7 +143,9 @@ def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
     """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1]."""
     inputs, outputs = _rows(spaces, data)
     residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
-    linear = inputs[..., : 1 + data.obs.shape[-1]]
+    action = spaces.action
+    acted = action.count - 1 if isinstance(action, Discrete) else action.width
+    linear = inputs[..., : 1 + data.obs.shape[-1] + acted]  # a wrong order of actions shows beside actions alone
     return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, overload
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import torch
 from torch import Tensor
@@ -14,6 +15,10 @@ from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
 from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
+
+if TYPE_CHECKING:
+    from esp_cli.checking import ElementVerdict, Transitions
+    from esp_envs.base import Environment
 
 
 class Symmetry:
@@ -224,6 +229,28 @@ class Symmetry:
         here = value(obs) if here is None else here
         gaps = [value_consistency_loss(g.pull_back(value(g.obs(obs))), here) for g in self.transforms(obs)]
         return _mean(gaps, mask)
+
+    def check(self, source: Environment | Transitions, transforms: str | None = None) -> list[ElementVerdict]:
+        """Judge for each element and field whether a task is as symmetric as you say: holds, broken, or not covered.
+
+        A wrong layout, action order or group shows as "broken". Without an agent axis where `num_agents` is 1.
+
+        Args:
+            source: a task of this application, or transitions [M, T, N, ...] of episodes from their starts, made by a
+                policy that prefers no direction, such as the uniformly random one.
+            transforms: which elements; by default those of the group.
+
+        Raises:
+            ValueError: the transforms mean nothing, or nothing of them can be carried.
+        """
+        from esp_cli.checking import Transitions, candidates, check_transitions, collect  # noqa: PLC0415 - it trains too
+
+        data = source if isinstance(source, Transitions) else collect(source)
+        if not self.spaces.num_agents > 1 and data.reward.dim() == 2:
+            data = Transitions(*(getattr(data, field.name).unsqueeze(2) for field in fields(data)))
+        lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))
+        spaces = replace(self.spaces, symmetry=self.group)
+        return check_transitions(spaces, data, candidates(spaces, transforms or self.group))
 
     def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
         key = (device, dtype)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from esp_cli import Continuous, Field, Items, Kind, Symmetry, discrete_moves, layout
+from esp_cli import Continuous, Field, Items, Kind, Symmetry, Transitions, discrete_moves, layout
+from esp_envs import make
 
 SEEN = layout(Field("velocity", Kind.VECTOR), Field("load", Kind.SCALAR))
 MOVES = discrete_moves(4)  # right, up, left, down
@@ -268,3 +270,41 @@ def test_importing_it_imports_torch_and_numpy_alone() -> None:
     everything = IMPORTED.replace("import Symmetry", "import load_policy, Symmetry")
     done = subprocess.run([sys.executable, "-c", everything], capture_output=True, text=True, check=True)
     assert "pydantic" in done.stdout, "the check sees what is imported"
+
+
+def transitions(wind: float, names: tuple[str, ...] = ("right", "up", "left", "down")) -> Transitions:
+    """Return 600 episodes of a point that is pushed in one of four directions, and by a wind to the right."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.tensor(discrete_moves(names).points)
+    velocity, rows = torch.randn(600, 2, generator=generator), []
+    for _ in range(4):
+        action = torch.randint(4, (600,), generator=generator)
+        after = 0.8 * velocity + 0.3 * points[action] + torch.tensor([wind, 0.0])
+        rows.append((velocity, action, -after.square().sum(-1), after))
+        velocity = after
+    return Transitions(*(torch.stack(part, 1) for part in zip(*rows, strict=True)))
+
+
+def outcomes(symmetry: Symmetry, source: Any) -> set[str]:
+    return {verdict.outcome for verdict in symmetry.check(source)}
+
+
+def test_transitions_say_whether_layout_actions_and_group_are_right() -> None:
+    point = layout(Field("velocity", Kind.VECTOR))
+    symmetry = Symmetry(observation=point, action=MOVES)
+    assert outcomes(symmetry, transitions(0.0)) == {"holds"}
+    assert "broken" in outcomes(symmetry, transitions(0.2))
+    assert "broken" in outcomes(symmetry, transitions(0.0, ("right", "left", "up", "down"))), "the order is another"
+    scalars = Symmetry(observation=layout(Field("velocity", Kind.SCALAR, 2)), action=MOVES)
+    assert "broken" in outcomes(scalars, transitions(0.0)), "the kind is another"
+    with pytest.raises(ValueError, match="obs has rows of 2 numbers, but its layout has 3"):
+        quarter().check(transitions(0.0))
+
+
+def test_a_task_is_checked_with_the_layout_that_is_given() -> None:
+    env = make("navigation", 64, [0])
+    spec = env.spec
+    right = Symmetry(observation=spec.observation, action=spec.action, num_agents=3, group="rot90")
+    assert outcomes(right, env) == {"holds"}
+    other = discrete_moves(["stay", "left", "down", "right", "up"])
+    assert "broken" in outcomes(Symmetry(observation=spec.observation, action=other, num_agents=3), env)
