@@ -106,9 +106,9 @@ def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: 
     pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(alone)
     for _ in range(5):
         seen = pilot.observations(team.poses, team.goals, team.pillars[0])
-        assert np.allclose(seen, team.env._observe().obs[0, 0].numpy(), atol=1e-6)
+        assert np.allclose(seen, team.env._seen().obs[0, 0].numpy(), atol=1e-6)
         wheels = pilot.wheels(team.poses, team.goals, team.pillars[0])
-        action = alone.policy.act(team.env._observe().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
+        action = alone.policy.act(team.env._seen().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
         expected = team.env._wheel_speeds(action)[0].numpy()
         assert np.allclose(wheels, expected, atol=1e-4)
         assert np.abs(wheels).max() <= MAX_WHEEL_SPEED + 1e-6

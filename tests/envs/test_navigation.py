@@ -71,7 +71,7 @@ def test_default_landmarks_are_the_papers(agents: int, landmarks: int) -> None:
 
 def test_spec_names_the_symmetry_that_the_actions_carry() -> None:
     discrete, continuous = make("navigation", 1, [0]).spec, make("navigation", 1, [0], {"actions": "continuous"}).spec
-    assert (discrete.symmetry, continuous.symmetry) == ("d4", "o2")
+    assert (discrete.symmetry, continuous.symmetry) == ("d4*agents", "o2*agents")
     assert isinstance(discrete.action, Discrete)
     assert discrete.action.names == ("no-op", "left", "right", "down", "up")
 

@@ -48,7 +48,7 @@ def test_a_learning_prey_pays_for_touches_and_bounds() -> None:
     step = env.step(torch.zeros(1, 1, 1, dtype=torch.int64))
     torch.testing.assert_close(step.reward, torch.full((1, 1, 1), -10.5))
     assert env.spec.num_agents == 1
-    assert env.spec.symmetry == "d4"
+    assert env.spec.symmetry == "d4*agents"
     assert [f.name for f in env.spec.state.fields if f.items is Items.AGENTS] == ["prey_velocity", "prey_position"]
 
 
