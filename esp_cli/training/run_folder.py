@@ -17,7 +17,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -32,16 +31,13 @@ from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from esp_cli.training.checkpoint_names import FILE_NAME, file_name, is_final, step_of, superseded
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 
-KEPT_CHECKPOINTS = 2
-"""Two, so that a damaged newest one leaves another to go on from."""
-
 _CONFIG, _METRICS, _CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
 _POLICY, _LOCK = "policy.safetensors", "run.lock"
-_CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 
 
 class RunFolderError(ValueError):
@@ -160,14 +156,14 @@ class RunFolder:
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""
-        return self.path / _CHECKPOINTS / f"step-{step:012d}{'-final' if final else ''}.safetensors"
+        return self.path / _CHECKPOINTS / file_name(step, final)
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint files, oldest first."""
         folder = self.path / _CHECKPOINTS
         if not folder.is_dir():
             return []
-        return sorted(file for file in folder.iterdir() if _CHECKPOINT_NAME.fullmatch(file.name))
+        return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))
 
     def write_checkpoint(
         self, step: int, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], final: bool = False
@@ -198,11 +194,7 @@ class RunFolder:
                     os.fsync(metrics.fileno())
         save_checkpoint(path, tensors, {**meta, "step": step})
         with attempting("remove old checkpoints beside", path, RunFolderError):
-            files = self.checkpoints()
-            past = [file for file in files if _step(file) > step]
-            regular = [file for file in files if file not in past and not _is_final(file)]
-            finals = [file for file in files if file not in past and _is_final(file)]
-            for file in (*past, *regular[:-KEPT_CHECKPOINTS], *finals[:-1]):
+            for file in superseded(self.checkpoints(), step):
                 remove_file(file)
         return path
 
@@ -238,13 +230,13 @@ class RunFolder:
         for file in reversed(self.checkpoints()):
             try:
                 tensors, meta = load_checkpoint(file)
-                if meta.get("step") != _step(file):
+                if meta.get("step") != step_of(file):
                     raise CheckpointError(f"{file} does not hold the step that its name says")
             except CheckpointError as error:
                 problem = problem or str(error)
                 continue
             if problem:
-                warnings.warn(f"{problem}; going back to step {_step(file)}", CheckpointWarning, stacklevel=2)
+                warnings.warn(f"{problem}; going back to step {step_of(file)}", CheckpointWarning, stacklevel=2)
             return tensors, meta
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
@@ -266,10 +258,10 @@ class RunFolder:
     def _remove_superseded(self) -> None:
         """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
-        if any(map(_is_final, files)):
+        if any(map(is_final, files)):
             with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):
                 for file in files:
-                    if not _is_final(file):
+                    if not is_final(file):
                         remove_file(file)
 
     def _remove_half_written(self) -> None:
@@ -300,11 +292,3 @@ def _is_leftover(entry: Path) -> bool:
     if entry.name == _METRICS:
         return entry.is_file() and entry.stat().st_size == 0
     return entry.name == _LOCK or entry.name.startswith(TEMPORARY_PREFIX)
-
-
-def _step(path: Path) -> int:
-    return int(path.name[len("step-") : len("step-") + 12])
-
-
-def _is_final(path: Path) -> bool:
-    return path.name.endswith("-final.safetensors")
