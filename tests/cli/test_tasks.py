@@ -13,6 +13,12 @@ from esp_envs.registry import make, task_names
 from tests.cli.running import esp, refused
 
 
+@pytest.fixture(autouse=True)
+def no_task_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Show the built-in tasks alone: other tests register tasks with long names."""
+    monkeypatch.setattr("esp_envs.registry._REGISTERED", {})
+
+
 def test_the_list_names_every_task_with_the_symmetries_that_it_carries() -> None:
     told = esp("tasks")
     for name in task_names():

@@ -32,7 +32,7 @@ def test_a_loader_that_lets_damage_through_is_found(files, monkeypatch, tmp_path
 
 
 def test_wrong_command_lines_end_in_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setattr("esp_cli.commands.train.train_folder", None)  # put back after the test
+    monkeypatch.setattr("esp_cli.commands.train._train", None)  # put back after the test
     lines = Lines(tmp_path, 1)
     assert [lines.run(number) for number in range(10)] == [None] * 10
 
