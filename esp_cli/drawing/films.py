@@ -1,7 +1,7 @@
 """Films and pictures as files: GIF, MP4 and PNG, each written whole or not at all.
 
 imageio writes MP4 and PNG. The GIFs are made here: with one palette for a whole film, and without pixels that do not
-change, they have a fourth to two thirds of the size of imageio's, at the same fidelity.
+change, they are smaller than imageio's at the same fidelity.
 """
 
 from __future__ import annotations

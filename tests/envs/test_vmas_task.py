@@ -1,4 +1,4 @@
-"""VMAS scenarios as tasks, held against VMAS itself."""
+"""VMAS scenarios as tasks, compared with VMAS itself."""
 
 from __future__ import annotations
 
