@@ -84,5 +84,5 @@ def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
         return ()
     found = parse_elements(text, num_agents)
     if isinstance(found, Group):
-        return tuple(element for element in found.witnesses() if not element.is_identity)
+        return tuple(element for element in found.generators() if not element.is_identity)
     return found[:_MOST]

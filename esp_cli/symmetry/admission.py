@@ -28,7 +28,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
         ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
             are to change places and a layout does not say which numbers follow them.
     """
-    moved = elements.witnesses() if isinstance(elements, Group) else tuple(elements)
+    moved = elements.generators() if isinstance(elements, Group) else tuple(elements)
     reason = _reason(moved, spaces)
     if reason is None:
         return
@@ -56,7 +56,7 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
 
 def _carries(name: str, spaces: Spaces) -> bool:
     found = parse_elements(name, spaces.num_agents)
-    return _reason(found.witnesses() if isinstance(found, Group) else found, spaces) is None
+    return _reason(found.generators() if isinstance(found, Group) else found, spaces) is None
 
 
 def _declared_plane(spaces: Spaces) -> str:

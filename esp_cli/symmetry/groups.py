@@ -34,8 +34,8 @@ class Group(ABC):
         """Whether the element belongs to the group."""
 
     @abstractmethod
-    def witnesses(self) -> tuple[Element, ...]:
-        """Return elements such that whatever carries all of these carries the whole group."""
+    def generators(self) -> tuple[Element, ...]:
+        """Return elements whose products are the group, or come near each of its elements if it is continuous."""
 
 
 class FiniteGroup(Group):
@@ -91,7 +91,7 @@ class FiniteGroup(Group):
     def __contains__(self, element: object) -> bool:
         return element in self._index
 
-    def witnesses(self) -> tuple[Element, ...]:
+    def generators(self) -> tuple[Element, ...]:
         """Return all elements."""
         return self.elements
 
@@ -114,7 +114,7 @@ class PlaneGroup(Group):
             return False
         return self.mirrors or not element.mirrored
 
-    def witnesses(self) -> tuple[Element, ...]:
+    def generators(self) -> tuple[Element, ...]:
         """Return one radian (its multiples come near every turn) and, for O(2), `flip-x`."""
         radian = PlaneElement(Fraction(1 / math.tau))
         return (radian, mirror()) if self.mirrors else (radian,)
@@ -136,7 +136,7 @@ class AgentPermutations(Group):
             return False
         return element.permutation is None or len(element.permutation) == self.num_agents
 
-    def witnesses(self) -> tuple[Element, ...]:
+    def generators(self) -> tuple[Element, ...]:
         """Return the swap of the first two agents and the round of all of them, which generate every order."""
         swap, cycle = (1, 0, *range(2, self.num_agents)), (*range(1, self.num_agents), 0)
         return PlaneElement(permutation=swap), PlaneElement(permutation=cycle)
@@ -158,9 +158,9 @@ class ProductGroup(Group):
             return False
         return element.in_place in self.plane and PlaneElement(permutation=element.permutation) in self.agents
 
-    def witnesses(self) -> tuple[Element, ...]:
+    def generators(self) -> tuple[Element, ...]:
         """Return those of both factors."""
-        return self.plane.witnesses() + self.agents.witnesses()
+        return self.plane.generators() + self.agents.generators()
 
 
 def cyclic(n: int) -> FiniteGroup:

@@ -127,5 +127,5 @@ def test_membership_of_continuous_groups() -> None:
     both = direct_product(orthogonal(), agent_permutations(2))
     assert both.name == "o2*agents"
     assert mirror(10) @ PlaneElement(permutation=(1, 0)) in both
-    assert all(w in both for w in both.witnesses())
+    assert all(w in both for w in both.generators())
     assert "rot90" not in both
