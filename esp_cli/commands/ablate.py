@@ -13,16 +13,17 @@ EPILOG = """Examples:\n
     esp ablate transforms --algo maddpg --task navigation\n
     esp ablate coefficient --steps 500k --dry-run\n
     esp ablate modules --algo maddpg,mappo --seeds 10 --steps 500k --out runs/modules\n
+    esp ablate prior --task rendezvous:Rendezvous --seeds 5 --steps 200k\n
     esp ablate modules --reuse runs/table1 --reuse runs/transforms"""
 
 
 @study_command
 def ablate(
     part: Annotated[
-        Literal["transforms", "coefficient", "modules"],
+        Literal["transforms", "coefficient", "modules", "prior"],
         typer.Argument(
-            help="Number and type of transforms (figures 5a, 5b), weight of the consistency loss (5c), or loss and "
-            "augmentation apart (6a).",
+            help="Number and type of transforms (figures 5a, 5b), weight of the consistency loss (5c), loss and "
+            "augmentation apart (6a), or the learner with the whole prior and without it.",
             metavar="PART",
         ),
     ],

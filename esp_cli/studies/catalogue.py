@@ -134,7 +134,7 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
     """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
     settings = dict(common)
     for name, value in request.overrides.items():
-        section, _, rest = name.partition(".")
+        section, _, rest = name.rpartition(".")
         if section == task:
             settings[f"task.{rest}"] = value
         elif section == algorithm or section not in (*ALGORITHMS, *task_names()):
@@ -158,7 +158,7 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
     if other is not None:
         raise ValueError(f"this study is on {kind.only} alone, not on {other}; leave out --tasks")
     for name in request.overrides:
-        section = name.partition(".")[0]
+        section = name.rpartition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):
             raise ValueError(f"--set {name} concerns no run of this study; it has {', '.join((*tasks, *algorithms))}")
     for task, steps in request.steps or ():

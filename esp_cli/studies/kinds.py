@@ -139,6 +139,13 @@ KINDS: Mapping[str, StudyKind] = {
             "both": {"prior.kind": "esp"},
         },
     ),
+    "ablate-prior": StudyKind(
+        "Each learner with the prior and without it",
+        rows="panels",
+        varies=frozenset({"prior.kind"}),
+        variants=PLAIN_AND_ESP,
+        algorithms=("mappo",),
+    ),
     # the standard network, the same with the prior, the equivariant one, and the standard one averaged over the group
     "homomorphic": StudyKind(
         "Symmetry in the network and symmetry in the prior (figure 6b)",

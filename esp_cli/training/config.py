@@ -104,7 +104,7 @@ def resolve_config(
     """
     sections = _preset_sections(task, algorithm, preset)
     for dotted, value in (overrides or {}).items():
-        section, dot, key = dotted.partition(".")
+        section, dot, key = dotted.rpartition(".")
         if not dot or section not in sections:
             known = ", ".join(sections)
             raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {known}")

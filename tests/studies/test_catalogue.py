@@ -9,6 +9,7 @@ from esp_cli.studies.catalogue import Request, paper_cells, plan
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import Reported, horizons, reported, tasks
 from esp_cli.symmetry import parse
+from esp_envs import registry, task_class
 from tests.studies.small_studies import request, small_study
 
 
@@ -108,6 +109,22 @@ def test_modules_are_none_loss_augmentation_and_both():
     assert kinds == ["none", "consistency", "augment", "esp"] * 2
     assert {c.config.prior.transforms for c in study.cells if c.config.prior.kind != "none"} == {"rot90"}
     assert {c.config.prior.coefficient for c in study.cells} == {0.0, 0.5}
+
+
+def test_prior_is_each_learner_without_the_prior_and_with_it():
+    study = plan("ablate-prior", Request(steps=((None, 20_000),), overrides={"prior.transforms": "c4"}))
+    assert [cell.variant for cell in study.cells] == ["MAPPO", "MAPPO-ESP"]
+    assert [cell.config.prior.kind for cell in study.cells] == ["none", "esp"]
+    assert study.cells[1].reference == study.cells[0].name
+
+
+def test_a_setting_names_a_task_of_the_caller_whose_module_is_in_a_package(monkeypatch):
+    monkeypatch.setattr(registry, "_REGISTERED", {})
+    own = registry.register(task_class("navigation"))
+    assert own == "esp_envs.mpe.navigation:Navigation"
+    request = Request(tasks=("navigation", own), steps=((None, 20_000),), overrides={f"{own}.num_agents": 2})
+    agents = [cell.config.task_settings["num_agents"] for cell in plan("ablate-prior", request).cells]
+    assert agents == [3, 3, 2, 2]
 
 
 def test_a_setting_reaches_the_runs_that_it_concerns():
