@@ -10,7 +10,7 @@ DEMO := runs/demo
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench docs torture clean
+.PHONY: help demo test check bench docs site torture clean
 
 help: ## list what make can do
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -44,11 +44,15 @@ bench: $(VENV)/.installed-test ## measure the speed of environments and training
 docs: $(VENV)/.installed-test ## check the documentation: links lead somewhere, commands parse
 	$(BIN)/python -m pytest tests/test_docs.py
 
+site: $(VENV)/.installed-dev ## build the site of the documentation into site/, for reading without a network
+	$(BIN)/python -m mkdocs build --quiet
+	@echo "Open site/index.html"
+
 torture: $(VENV)/.installed-test ## kill, spoil and mistype for MINUTES (10); SEED chooses the cases, RECORD goes on
 	$(BIN)/python -m tests.torture --minutes $(or $(MINUTES),10) --seed $(or $(SEED),$(shell date +%j)) $(if $(RECORD),--record "$(RECORD)")
 
 clean: ## remove the demo run, builds and caches (runs and .venv stay)
-	rm -rf $(DEMO) build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(DEMO) build dist site .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find esp_cli environments tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # --- the environment ---------------------------------------------------------------------------------------------

@@ -45,10 +45,11 @@ def make(checkout: Path, *targets: str, user: int | None = None) -> str:
 
 def test_every_target_works_in_a_path_with_spaces_and_umlauts(checkout: Path) -> None:
     (checkout / "runs" / "demo").mkdir(parents=True)
-    said = make(checkout, "demo", "test", "check", "docs", "torture", "clean", "help")
+    said = make(checkout, "demo", "test", "check", "docs", "site", "torture", "clean", "help")
     assert "esp train --algo mappo --task formation" in said
     assert "python -m pytest" in said
     assert "ruff check ." in said
+    assert "python -m mkdocs build" in said
     assert "python -m tests.torture --minutes 10 --seed" in said
     assert not (checkout / "runs" / "demo").exists()
 

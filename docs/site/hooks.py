@@ -1,0 +1,94 @@
+"""What `make site` adds to the pages of docs/: pages from the application, and the files outside docs/ that pages link to."""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import site_reference
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files, InclusionLevel
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+AT_THE_ROOT = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+_CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?\)")
+_UNSEARCHED = "---\nsearch:\n  exclude: true\nhide: [navigation]\n---\n"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are not files of docs/."""
+    pages = site_reference.pages()
+    for name, page in AT_THE_ROOT.items():
+        if page != "index.md":
+            pages[page] = inside((ROOT / name).read_text(encoding="utf-8"), "", ROOT)
+    for page in [*DOCS.rglob("*.md"), *(ROOT / name for name in AT_THE_ROOT)]:
+        for target in _targets(page.read_text(encoding="utf-8"), page.parent):
+            pages[source_page(target)] = _source(target)
+    for path, content in pages.items():
+        shown = InclusionLevel.NOT_IN_NAV if path.startswith("source/") else InclusionLevel.INCLUDED
+        files.append(File.generated(config, path, content=content, inclusion=shown))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Lead links that leave docs/ to the pages that stand for their files."""
+    folder = posixpath.dirname(page.file.src_uri)
+    return inside(markdown, folder, DOCS / folder) if page.file.abs_src_path else markdown
+
+
+def inside(markdown: str, folder: str, on_disk: Path) -> str:
+    """Return a page whose links to files outside docs/ lead to pages of the site.
+
+    Args:
+        markdown: The text.
+        folder: Where the page stands in the site.
+        on_disk: The folder from which its links are written.
+    """
+
+    def lead(match: re.Match[str]) -> str:
+        target = (on_disk / match[2]).resolve()
+        if target.is_relative_to(DOCS):
+            path = target.relative_to(DOCS).as_posix()
+        elif target.parent == ROOT and target.name in AT_THE_ROOT:
+            path = AT_THE_ROOT[target.name]
+        else:
+            path = source_page(target)
+        return f"{match[1]}{posixpath.relpath(path, folder or '.')}{match[3] or ''})"
+
+    return _outside_code(markdown, lambda text: _LINK.sub(lead, text))
+
+
+def source_page(target: Path) -> str:
+    """Return the page that shows a file outside docs/."""
+    return f"source/{target.relative_to(ROOT).as_posix()}.md"
+
+
+def _targets(markdown: str, on_disk: Path) -> set[Path]:
+    found = set()
+    for match in _LINK.finditer(_CODE.sub("", markdown)):
+        target = (on_disk / match[2]).resolve()
+        if target.exists() and not target.is_relative_to(DOCS) and target.name not in AT_THE_ROOT:
+            found.add(target)
+    return found
+
+
+def _source(target: Path) -> str:
+    title = f"{_UNSEARCHED}# `{target.relative_to(ROOT)}`\n\n"
+    if target.is_dir():
+        return title + "\n".join(f"- `{name}`" for name in sorted(os.listdir(target)) if not name.startswith("__"))
+    language = {".py": "python", ".json": "json"}.get(target.suffix, "text")
+    return f"{title}~~~~~~ {{.{language} linenums=1}}\n{target.read_text(encoding='utf-8')}\n~~~~~~\n"
+
+
+def _outside_code(markdown: str, change: Callable[[str], str]) -> str:
+    parts, end = [], 0
+    for code in _CODE.finditer(markdown):
+        parts += [change(markdown[end : code.start()]), code.group()]
+        end = code.end()
+    return "".join([*parts, change(markdown[end:])])
