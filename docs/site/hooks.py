@@ -1,8 +1,7 @@
-"""What `make site` adds to the pages of docs/: pages from the application, and the files outside docs/ that pages link to."""
+"""What `make site` adds to docs/: pages from the application, and the files outside docs/ that pages link to."""
 
 from __future__ import annotations
 
-import os
 import posixpath
 import re
 from collections.abc import Callable
@@ -36,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Lead links that leave docs/ to the pages that stand for their files."""
     folder = posixpath.dirname(page.file.src_uri)
     return inside(markdown, folder, DOCS / folder) if page.file.abs_src_path else markdown
@@ -80,8 +79,6 @@ def _targets(markdown: str, on_disk: Path) -> set[Path]:
 
 def _source(target: Path) -> str:
     title = f"{_UNSEARCHED}# `{target.relative_to(ROOT)}`\n\n"
-    if target.is_dir():
-        return title + "\n".join(f"- `{name}`" for name in sorted(os.listdir(target)) if not name.startswith("__"))
     language = {".py": "python", ".json": "json"}.get(target.suffix, "text")
     return f"{title}~~~~~~ {{.{language} linenums=1}}\n{target.read_text(encoding='utf-8')}\n~~~~~~\n"
 
