@@ -11,7 +11,6 @@ import os
 import re
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +20,7 @@ from typer.core import TyperGroup
 from esp_cli import __version__, console, machine
 from esp_cli.commands import COMMANDS
 from esp_cli.files import failures
+from esp_cli.files.suggesting import did_you_mean
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -43,9 +43,8 @@ class LazyGroup(TyperGroup):
         """Find the command that the first argument names, or say which one is like it."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-"):
-            close = get_close_matches(name, COMMANDS, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else "'esp --help' lists the commands"
-            raise UserError(f"there is no command '{name}'; {hint}")
+            hint = did_you_mean(name, COMMANDS) or "; 'esp --help' lists the commands"
+            raise UserError(f"there is no command '{name}'{hint}")
         return super().resolve_command(ctx, args)
 
     def main(self, args: Sequence[str] | None = None, prog_name: str | None = None, **extra: Any) -> Any:  # type: ignore[override]

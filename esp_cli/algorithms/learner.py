@@ -175,6 +175,12 @@ class Learner(ABC):
             reason = str(error).split("\n")[0]
             raise ValueError(f"the checkpoint does not fit this configuration ({reason})") from None
 
+    def start_from(self, policy: Mapping[str, Tensor]) -> None:
+        """Give the policy, and the target policy where there is one, these weights."""
+        for name in ("policy", "target_policy"):
+            if name in self.modules:
+                self.modules[name].load_state_dict(policy)
+
     def bytes_to_come(self, steps: int) -> int:
         """Return by how many bytes the state of a run will grow over its steps per seed: by what a replay collects."""
         return 0

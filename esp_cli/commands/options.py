@@ -180,8 +180,9 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
         ),
     ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
+Device = Literal["auto", "cpu", "cuda"]
 DeviceOption = Annotated[
-    Literal["auto", "cpu", "cuda"],
+    Device,
     typer.Option("--device", help="Device to compute on; auto takes a GPU if there is one."),
 ]
 JsonOption = Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -23,6 +23,7 @@ from esp_cli.commands.options import (
     register_tasks,
 )
 from esp_cli.commands.stopping import stop_requests
+from esp_cli.commands.train_choices import with_file
 
 if TYPE_CHECKING:
     from esp_cli.library.run import Run
@@ -75,26 +76,60 @@ def train(
     ] = None,
     device: DeviceOption = "cpu",
     settings: SetOption = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            help="Take what no option says from a run, its config.json, or a JSON or TOML file with what differs.",
+            metavar="FILE",
+        ),
+    ] = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the resolved configuration as JSON; train nothing.")
+    ] = False,
+    init_from: Annotated[
+        Path | None,
+        typer.Option(
+            "--init-from",
+            help="Start from this policy where the shapes fit: a run, a file, or bundled.",
+            metavar="RUN|POLICY",
+        ),
+    ] = None,
     tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard files too.")] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
-    from esp_cli.library.run import Run, start
+    from esp_cli.library.run import Run, begin, plan
+    from esp_cli.training.run_folder import RUN_FORMAT
 
     register_tasks([task])
     if resume is not None:
         _refuse_beside_resume(context, allowed=("task",) if ":" in task else ())
         _train(Run(resume), tensorboard)
         return
-    chosen = {
+    short = {
         "prior.kind": prior,
         "prior.transforms": transforms,
         "prior.consistency_coef": consistency_coef,
         "network.name": network,
         "task.physics": physics,
     }
-    overrides = {name: value for name, value in chosen.items() if value is not None} | parse_assignments(settings or [])
-    run = start(task, algo, steps=steps, seeds=seeds, preset=preset, settings=overrides, device=device, out=out)
-    _train(run, tensorboard)
+    overrides = {name: value for name, value in short.items() if value is not None} | parse_assignments(settings or [])
+    choices: dict[str, Any] = {
+        "task": task,
+        "algorithm": algo,
+        "preset": preset,
+        "steps": steps,
+        "seeds": seeds,
+        "device": device,
+        "init_from": init_from,
+    }
+    if config is not None:
+        choices, overrides = with_file(context, config, choices, overrides)
+    resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, **choices)
+    if print_config:
+        console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
+        return
+    _train(begin(resolved, weights, out), tensorboard)
 
 
 def _refuse_beside_resume(context: typer.Context, allowed: tuple[str, ...]) -> None:

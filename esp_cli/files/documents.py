@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import read_regular
+from esp_cli.files.suggesting import nearest
 from esp_cli.files.writing import replace_file
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -90,7 +91,11 @@ class DocumentFormat:
         """
         if "format" in content or "version" in content:
             raise self.error(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
-        replace_file(path, encode({"format": self.name, "version": self.version, **content}, path, self.error))
+        replace_file(path, encode(self.document(content), path, self.error))
+
+    def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Return content with the keys that say what it is."""
+        return {"format": self.name, "version": self.version, **content}
 
 
 def validate(model: type[Model], content: object) -> Model:
@@ -165,6 +170,9 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
     if first["type"] == "extra_forbidden":
+        near = nearest(str(first["loc"][-1]), model.model_fields) if len(first["loc"]) == 1 else None
+        if near is not None:
+            return f"unknown setting '{name}'; did you mean '{f'{section}.{near}' if section else near}'?"
         return f"unknown setting '{name}'; {owner or section or 'it'} has {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"the setting '{name}' is missing"

@@ -16,6 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torch import Tensor
+
+from esp_cli.deploy.bundled import open_policy
 from esp_cli.deploy.library import LoadedPolicy
 from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.final import evaluate as evaluate_policy
@@ -24,6 +27,7 @@ from esp_cli.library.metrics import Metrics
 from esp_cli.machine import resolve_device
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.initial import describe, fitted
 from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, transfer
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -147,23 +151,35 @@ class Run:
         return transfer(load_policy(self.path), settings or {})
 
 
-def start(
-    task: str | type[Environment] = "navigation",
-    algo: str = "mappo",
+def plan(
+    task: str,
+    algo: str,
     *,
-    steps: int = 1_000_000,
-    seeds: Sequence[int] = (0,),
-    preset: str = "default",
-    settings: Mapping[str, object] | None = None,
-    device: str = "cpu",
-    out: str | os.PathLike[str] | None = None,
-) -> Run:
-    """Make the folder of a new run, which `Run.train` then trains; arguments and errors as of `train`."""
-    config = resolve_config(register(task), algo, preset, steps, seeds, resolve_device(device), settings)
-    build_learner(config)  # refuses settings that do not fit together before a run folder exists
+    steps: int,
+    seeds: Sequence[int],
+    preset: str,
+    settings: Mapping[str, object] | None,
+    device: str,
+    init_from: str | os.PathLike[str] | None,
+) -> tuple[RunConfig, dict[str, Tensor] | None]:
+    """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
+
+    Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: a task of
+    the caller is registered already.
+    """
+    config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings)
+    learner = build_learner(config)
+    if init_from is None:
+        return config, None
+    weights = fitted(learner.policy, open_policy(Path(init_from)))
+    return config.model_copy(update={"init_from": describe(os.fspath(init_from), weights)}), weights
+
+
+def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:
+    """Make the folder of a new run, by default a new one in runs/."""
     name = f"{file_name(config.task)}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
     path = Path("runs") / name if out is None else Path(out)
-    return Run(RunFolder.create(path, config.model_dump(mode="json")).path)
+    return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
 
 
 def train(
@@ -176,6 +192,7 @@ def train(
     settings: Mapping[str, object] | None = None,
     device: str = "cpu",
     out: str | os.PathLike[str] | None = None,
+    init_from: str | os.PathLike[str] | None = None,
     listener: Callable[[Progress], bool] | None = None,
 ) -> Run:
     """Train S seeds at once, as `esp train` does, and return the run.
@@ -189,12 +206,17 @@ def train(
         settings: dotted names to values, as `--set` takes them: {"prior.kind": "none", "task.num_agents": 4}.
         device: "cpu", "cuda", or "auto" for the latter where there is one.
         out: the run folder; by default a new one in runs/.
+        init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
         listener: told of progress after every update; False asks for a clean stop, after which `Run.train` goes on.
 
     Raises:
         ValueError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
     """
-    run = start(task, algo, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, out=out)
+    name = register(task)
+    config, weights = plan(
+        name, algo, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
+    )
+    run = begin(config, weights, out)
     run.train(listener)
     return run
 

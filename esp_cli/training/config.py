@@ -13,12 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from esp_cli.algorithms.presets import PRESETS, TUNED
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence, parse_value, shortened
+from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_envs.registry import task_class
 
-_SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
+SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
+"""The sections that settings of every run have, and where its configuration holds them."""
 _OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
 
 
@@ -29,6 +31,15 @@ class EvaluationConfig(BaseModel):
 
     every_steps: int = Field(10_000, ge=1, description="environment steps per seed between evaluations")
     episodes: int = Field(32, ge=1, description="per seed, greedy and stochastic each")
+
+
+class InitialPolicy(BaseModel):
+    """The policy that a run started from; the run's folder holds a copy of it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: str = Field(max_length=4096, description="where it was found: a run folder, a file, a bundled policy")
+    sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of its weights")
 
 
 class RunConfig(BaseModel):
@@ -47,6 +58,7 @@ class RunConfig(BaseModel):
     prior: PriorConfig = PriorConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
     device: Literal["cpu", "cuda"] = "cpu"
+    init_from: InitialPolicy | None = Field(None, description="the policy that it started from")
 
     def command(self) -> str:
         """Return the `esp train` command line that resolves to this configuration, quoted for a shell.
@@ -59,7 +71,8 @@ class RunConfig(BaseModel):
         words += ["--preset", self.preset] if self.preset != "default" else []
         words += ["--seeds", seeds_text(self.seeds), "--steps", str(self.steps)]
         words += ["--device", self.device] if self.device != "cpu" else []
-        for section, key in ({self.algorithm: "algorithm_settings"} | _SECTIONS).items():
+        words += ["--init-from", self.init_from.source] if self.init_from else []
+        for section, key in ({self.algorithm: "algorithm_settings"} | SECTIONS).items():
             for name, value in own[key].items():
                 if known[key].get(name, ...) != value:
                     words += _assignment(f"{section}.{name}", value)
@@ -106,8 +119,7 @@ def resolve_config(
     for dotted, value in (overrides or {}).items():
         section, dot, key = dotted.rpartition(".")
         if not dot or section not in sections:
-            known = ", ".join(sections)
-            raise ValueError(f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {known}")
+            raise ValueError(_no_section(dotted, task, algorithm))
         sections[section][key] = read = _read(value)
         if isinstance(read, float) and not math.isfinite(read):
             raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
@@ -134,6 +146,21 @@ def resolve_config(
         "device": device,
     }
     return validated(RunConfig, values, "run")
+
+
+def _no_section(dotted: str, task: str, algorithm: str) -> str:
+    """Say that a name is not SECTION.NAME, and which setting is like it."""
+    models: dict[str, type[BaseModel]] = {
+        "task": task_class(task).Settings,
+        algorithm: ALGORITHMS[algorithm].config_class,
+        "network": MlpConfig,
+        "prior": PriorConfig,
+        "evaluation": EvaluationConfig,
+    }
+    homes = {name: section for section, model in reversed(models.items()) for name in model.model_fields}
+    name = nearest(dotted.rpartition(".")[2], homes)
+    hint = f"; did you mean '{homes[name]}.{name}'?" if name else ""
+    return f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {', '.join(models)}{hint}"
 
 
 def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:

@@ -6,6 +6,7 @@ Layout::
     metrics.jsonl                           a row per update, see esp_cli.training.metrics
     checkpoints/step-000000500000.safetensors   the newest two; only step-...-final.safetensors when training is done
     policy.safetensors                      the trained policy
+    initial-policy.safetensors              the policy that the run started from, where it started from one
     run.lock                                held by the process that trains; says which
 
 Every file but the metrics is replaced as a whole. A process may be killed at any moment: the kernel lets go of its
@@ -32,12 +33,10 @@ from esp_cli.files.opening import open_own
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from esp_cli.training.checkpoint_names import FILE_NAME, file_name, is_final, step_of, superseded
+from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
-
-_CONFIG, _METRICS, _CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
-_POLICY, _LOCK = "policy.safetensors", "run.lock"
 
 
 class RunFolderError(ValueError):
@@ -66,26 +65,38 @@ class RunFolder:
     @property
     def metrics_path(self) -> Path:
         """The file that a MetricsWriter appends to."""
-        return self.path / _METRICS
+        return self.path / METRICS
 
     @property
     def policy_path(self) -> Path:
         """The file of the trained policy."""
-        return self.path / _POLICY
+        return self.path / POLICY
+
+    @property
+    def initial_path(self) -> Path:
+        """The file of the policy that the run started from."""
+        return self.path / INITIAL
 
     @property
     def lock_path(self) -> Path:
         """The file that the process which trains holds."""
-        return self.path / _LOCK
+        return self.path / LOCK
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], config: Mapping[str, Any], force: bool = False) -> RunFolder:
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        config: Mapping[str, Any],
+        force: bool = False,
+        initial: Mapping[str, Tensor] | None = None,
+    ) -> RunFolder:
         """Make a run folder; its configuration is written last, so that a folder with one is complete.
 
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
             config: resolved configuration, JSON-able; the keys ``format`` and ``version`` are the folder's own.
             force: restart an existing run: its metrics, checkpoints and policy go, other files stay.
+            initial: weights of the policy that the run starts from.
 
         Raises:
             RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
@@ -106,11 +117,13 @@ class RunFolder:
             with folder.lock():
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path, force)
-                for file in (folder.policy_path, *folder.checkpoints(), folder.metrics_path):
+                for file in (folder.policy_path, folder.initial_path, *folder.checkpoints(), folder.metrics_path):
                     remove_file(file)
-                (path / _CHECKPOINTS).mkdir(exist_ok=True)
+                (path / CHECKPOINTS).mkdir(exist_ok=True)
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
-                RUN_FORMAT.write(path / _CONFIG, resolved)
+                if initial is not None:
+                    write_policy(folder.initial_path, initial, {})
+                RUN_FORMAT.write(path / CONFIG, resolved)
         return folder
 
     @classmethod
@@ -124,10 +137,10 @@ class RunFolder:
         if not path.is_dir():
             what = "is a file, not a run folder" if path.exists() else "does not exist"
             raise RunFolderError(f"{path} {what}; give the folder that esp train --out made")
-        file = path / _CONFIG
+        file = path / CONFIG
         if not file.is_file():
             raise RunFolderError(
-                f"{path} is no run folder: it has no {_CONFIG}; give the folder that esp train --out made"
+                f"{path} is no run folder: it has no {CONFIG}; give the folder that esp train --out made"
             )
         return cls(path, RUN_FORMAT.read(file))
 
@@ -156,11 +169,11 @@ class RunFolder:
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""
-        return self.path / _CHECKPOINTS / file_name(step, final)
+        return self.path / CHECKPOINTS / file_name(step, final)
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint files, oldest first."""
-        folder = self.path / _CHECKPOINTS
+        folder = self.path / CHECKPOINTS
         if not folder.is_dir():
             return []
         return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))
@@ -259,20 +272,20 @@ class RunFolder:
         """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
         if any(map(is_final, files)):
-            with attempting("remove old checkpoints in", self.path / _CHECKPOINTS, RunFolderError):
+            with attempting("remove old checkpoints in", self.path / CHECKPOINTS, RunFolderError):
                 for file in files:
                     if not is_final(file):
                         remove_file(file)
 
     def _remove_half_written(self) -> None:
-        for folder in (self.path, self.path / _CHECKPOINTS):
+        for folder in (self.path, self.path / CHECKPOINTS):
             for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
                 file.unlink(missing_ok=True)
 
 
 def _refuse_taken(path: Path, force: bool) -> None:
     """Refuse a folder that holds a run (unless forced) or files that no run has."""
-    if (path / _CONFIG).exists():
+    if (path / CONFIG).exists():
         if not force:
             raise RunFolderError(
                 f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
@@ -280,15 +293,6 @@ def _refuse_taken(path: Path, force: bool) -> None:
         # forcing restarts a run; it must not overwrite another run's configuration
         RunFolder.open(path)
         return
-    foreign = sorted(entry.name for entry in path.iterdir() if not _is_leftover(entry))
+    foreign = sorted(entry.name for entry in path.iterdir() if not is_leftover(entry))
     if foreign:
         raise RunFolderError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")
-
-
-def _is_leftover(entry: Path) -> bool:
-    """Return whether create(), killed before its end, may have left this; it leaves nothing with content."""
-    if entry.name == _CHECKPOINTS:
-        return entry.is_dir() and not any(entry.iterdir())
-    if entry.name == _METRICS:
-        return entry.is_file() and entry.stat().st_size == 0
-    return entry.name == _LOCK or entry.name.startswith(TEMPORARY_PREFIX)

@@ -19,6 +19,7 @@ from torch import Tensor
 from esp_cli.files.faults import reach
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
+from esp_cli.training.initial import read_initial
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.play import PolicyController, play
 from esp_cli.training.policy_file import describe_policy
@@ -259,6 +260,8 @@ class Trainer:
                     f"{self.folder.path} was trained on {self.config.task} version {stands.task_version}, but this is "
                     f"version {version}; use the esp that it was begun with, or train anew"
                 )
+        elif self.config.init_from is not None:
+            self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
         self.folder.truncate_metrics(self.step if found else -1)
 
     def _load(self, tensors: dict[str, Tensor]) -> None:

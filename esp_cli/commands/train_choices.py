@@ -1,0 +1,64 @@
+"""What `esp train` was asked for: the command line first, then a file, then defaults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, get_args
+
+import typer
+
+from esp_cli.commands.options import Device, parse_count, parse_seeds
+
+_PARAMETERS = {"algorithm": "algo"}
+"""Names of parameters that differ from those in a file."""
+
+
+def with_file(
+    context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
+) -> tuple[dict[str, Any], dict[str, object]]:
+    """Let a file fill in what the command line leaves open.
+
+    Args:
+        context: of the command, which knows what was given.
+        path: of the file.
+        given: choices by their name in a file, defaults included.
+        settings: of the command line.
+
+    Raises:
+        ValueError: the file cannot be read, or does not go with what was given.
+    """
+    from esp_cli.training.config_file import read_config_file
+
+    file = read_config_file(path)
+    said = {name for name in given if _was_given(context, _PARAMETERS.get(name, name))}
+    if file.is_complete:
+        for name in ("task", "algorithm", "preset"):
+            if name in said and given[name] != file.choices[name]:
+                flag = f"--{_PARAMETERS.get(name, name)}"
+                raise ValueError(
+                    f"{path} holds every setting of a run with {flag} {file.choices[name]}; leave {flag} out, "
+                    "or name a file with only what differs"
+                )
+    filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in said}
+    return given | filled, file.settings | settings
+
+
+def _was_given(context: typer.Context, name: str) -> bool:
+    return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
+
+
+def _read(path: Path, name: str, value: Any) -> Any:
+    """Return a choice of a file in the form that its option has."""
+    try:
+        if name == "steps" and type(value) in (int, str):
+            return parse_count(value)
+        if name == "seeds" and type(value) in (int, str):
+            return parse_seeds(value)
+        if name == "seeds" and isinstance(value, list):
+            return parse_seeds(",".join(map(str, value)) + ",")
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    known = get_args(Device) if name == "device" else (value,)
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{path} sets '{name}' to {value!r}; write it as esp train --{name} takes it")
+    return value

@@ -1,0 +1,71 @@
+"""What a file says about a run: the `config.json` of any run, or a small file with only what differs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from esp_cli.files.suggesting import did_you_mean
+from esp_cli.files.tables import flat, read_table
+from esp_cli.training.config import SECTIONS, RunConfig
+from esp_cli.training.loading import parse_config
+from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
+
+CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from")
+"""What a file may choose beside settings."""
+
+
+@dataclass(frozen=True)
+class ConfigFile:
+    """What a file says.
+
+    Attributes:
+        path: of the file.
+        choices: of `CHOICES`, those that it names; numbers of steps and seeds may be text, as 500k.
+        settings: dotted names to values, as `--set` takes them.
+        is_complete: whether it is the configuration of a run, and so says everything.
+    """
+
+    path: Path
+    choices: dict[str, Any]
+    settings: dict[str, Any]
+    is_complete: bool
+
+
+def read_config_file(path: Path) -> ConfigFile:
+    """Read the configuration of a run (its folder or its config.json), or a small file as JSON or TOML.
+
+    A small file names settings flat, {"mappo.learning_rate": 5e-4}, or nested, {"mappo": {"learning_rate": 5e-4}},
+    beside choices such as {"task": "navigation", "steps": "500k"}.
+
+    Raises:
+        ValueError: it is missing or damaged, or names a choice that nobody knows.
+    """
+    if path.is_dir():
+        return _of_run(path, parse_config(RunFolder.open(path).config, path))
+    table = read_table(path)
+    if "format" in table:
+        return _of_run(path, parse_config(RUN_FORMAT.read(path), path))
+    choices, settings = {}, {}
+    for name, value in flat(table):
+        if name in CHOICES:
+            choices[name] = value
+        elif "." in name:
+            # TOML cannot hold the name of the task and a table of its settings under one key
+            settings[name.replace("task_settings.", "task.", 1)] = value
+        else:
+            hint = did_you_mean(name, CHOICES) or f"; write one of {', '.join(CHOICES)}, or a setting as SECTION.NAME"
+            raise ValueError(f"{path} sets '{name}', which is not a choice of a run{hint}")
+    return ConfigFile(path, choices, settings, is_complete=False)
+
+
+def _of_run(path: Path, config: RunConfig) -> ConfigFile:
+    """Return everything that the configuration of a run says."""
+    stored = config.model_dump(mode="json")
+    choices = {name: stored[name] for name in CHOICES if name != "init_from"}
+    if config.init_from is not None:
+        choices["init_from"] = config.init_from.source
+    sections = {config.algorithm: "algorithm_settings"} | SECTIONS
+    settings = {f"{section}.{name}": value for section, key in sections.items() for name, value in stored[key].items()}
+    return ConfigFile(path, choices, settings, is_complete=True)
