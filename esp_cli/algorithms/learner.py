@@ -12,6 +12,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
+from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
@@ -87,7 +88,7 @@ class Learner(ABC):
     config: LearnerConfig
     policy: Policy
     modules: dict[str, nn.Module]
-    optimisers: dict[str, torch.optim.Optimizer]
+    optimisers: dict[str, SeedAdam]
     collector: Worlds
 
     def __init__(
@@ -138,8 +139,7 @@ class Learner(ABC):
     def anneal(self, remaining: float) -> None:
         """Set the learning rate of every optimiser to this share of what it was made with."""
         for optimiser in self.optimisers.values():
-            for group in optimiser.param_groups:
-                group["lr"] = group.setdefault("initial_lr", group["lr"]) * remaining
+            optimiser.anneal(remaining)
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return everything that a resumed run needs to go on bit for bit, as flat tensors.
@@ -151,8 +151,7 @@ class Learner(ABC):
         for name, module in self.modules.items():
             out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
         for name, optimiser in self.optimisers.items():
-            for index, entry in optimiser.state_dict()["state"].items():
-                out |= {f"optimiser.{name}.{index}.{key}": value for key, value in entry.items()}
+            out |= {f"optimiser.{name}.{key}": value for key, value in optimiser.state_dict().items()}
         for name, generators in self.generators.items():
             out[f"generators.{name}"] = generator_states(generators)
         return out | {f"collector.{key}": value for key, value in self.collector.state_dict().items()}
@@ -167,7 +166,7 @@ class Learner(ABC):
             for name, module in self.modules.items():
                 module.load_state_dict(below(tensors, name))
             for name, optimiser in self.optimisers.items():
-                _load_optimiser(optimiser, below(tensors, f"optimiser.{name}"))
+                optimiser.load_state_dict(below(tensors, f"optimiser.{name}"))
             for name, generators in self.generators.items():
                 restore_generators(generators, tensors[f"generators.{name}"])
             self.collector.load_state_dict(below(tensors, "collector"))
@@ -188,26 +187,9 @@ class Learner(ABC):
     def seed_tensors(self) -> list[Tensor]:
         """Return every tensor with a leading seed axis that learning changes: weights, statistics, moments."""
         out = [tensor for module in self.modules.values() for tensor in module.state_dict().values()]
-        for optimiser in self.optimisers.values():
-            for entry in optimiser.state.values():
-                out += [value for key, value in entry.items() if key != "step"]
-        return out
+        return out + [moment for adam in self.optimisers.values() for moment in (adam.mean, adam.square)]
 
 
 def below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Return the entries under `prefix.`, without it."""
     return {k[len(prefix) + 1 :]: v for k, v in tensors.items() if k.startswith(prefix + ".")}
-
-
-def _load_optimiser(optimiser: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
-    """Load flat entries "index.name" into an optimiser over the same parameters."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in tensors.items():
-        index, key = name.split(".")
-        state.setdefault(int(index), {})[key] = tensor
-    parameters: list[Tensor] = [parameter for group in optimiser.param_groups for parameter in group["params"]]
-    for number, entry in state.items():
-        shape = parameters[number].shape
-        if {key: tensor.shape for key, tensor in entry.items()} != {"step": (), "exp_avg": shape, "exp_avg_sq": shape}:
-            raise KeyError(f"the moments of parameter {number}")
-    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})

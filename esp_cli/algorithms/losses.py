@@ -104,21 +104,3 @@ def explained_variance(value: Tensor, target: Tensor) -> Tensor:
     """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S]."""
     residual = (target - value).flatten(1).var(1, correction=0)
     return 1 - residual / target.flatten(1).var(1, correction=0).clamp_min(1e-8)
-
-
-def clip_gradients_per_seed(gradients: list[Tensor], max_norm: float) -> Tensor:
-    """Scale each seed's gradients in place so that their joint norm is at most `max_norm`.
-
-    Args:
-        gradients: tensors with a leading seed axis.
-        max_norm: largest norm allowed.
-
-    Returns:
-        [S] norms before clipping.
-    """
-    flat = [g.view(g.shape[0], -1) for g in gradients]
-    squares = torch.stack([g.square().sum(1) for g in flat])
-    norm = squares.sum(0).sqrt()
-    scale = (max_norm / (norm + 1e-6)).clamp(max=1.0).unsqueeze(1)
-    torch._foreach_mul_(flat, [scale] * len(flat))
-    return norm

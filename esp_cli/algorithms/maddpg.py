@@ -14,7 +14,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
+from esp_cli.algorithms.adam import SeedParameters
+from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
@@ -68,9 +69,15 @@ class Maddpg(OffPolicyLearner):
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.actor_parameters, self.critic_parameters = list(self.policy.parameters()), list(self.critic.parameters())
-        self.actor_optimiser = adam(self.actor_parameters, config.actor_learning_rate, config.adam_epsilon)
-        self.critic_optimiser = adam(self.critic_parameters, config.learning_rate, config.adam_epsilon)
+        self.actor_optimiser = self.adam(self.policy, learning_rate=config.actor_learning_rate)
+        self.critic_optimiser = self.adam(self.critic, learning_rate=config.learning_rate)
+        self._targets_of = [
+            (SeedParameters(list(target.parameters())), optimiser.parameters)
+            for target, optimiser in (
+                (self.target_policy, self.actor_optimiser),
+                (self.target_critic, self.critic_optimiser),
+            )
+        ]
         self.modules |= {
             "critic": self.critic,
             "target_policy": self.target_policy,
@@ -90,9 +97,8 @@ class Maddpg(OffPolicyLearner):
         copies = self.prior.copies(batch, self.generators["prior"])
         seen = self._critic_rows(copies.rows)
         metrics = self._learn_critic(copies, seen) | self._learn_actor(copies, seen)
-        with torch.no_grad():
-            targets: list[Tensor] = [*self.target_policy.parameters(), *self.target_critic.parameters()]
-            torch._foreach_lerp_(targets, [*self.actor_parameters, *self.critic_parameters], self.config.tau)
+        for target, online in self._targets_of:
+            target.buffer.lerp_(online.buffer, self.config.tau)
         return metrics
 
     def answers(self, rows: EpisodeBatch) -> Answers:
@@ -105,7 +111,8 @@ class Maddpg(OffPolicyLearner):
         values = self.joint.value(self.critic, seen[:, :, :-1], self.head.encode(copies.rows.action))
         target = self._targets(copies.originals, copies.original(seen))
         loss, metrics = self._td_loss(values, target, copies)
-        return metrics | {"critic_grad_norm": self._step(self.critic_optimiser, self.critic_parameters, loss)}
+        (norm,) = self.critic_optimiser.step(self.critic_optimiser.gradient(loss))
+        return metrics | {"critic_grad_norm": norm}
 
     def _learn_actor(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `seen` is what the critic sees of every row."""
@@ -122,7 +129,7 @@ class Maddpg(OffPolicyLearner):
         policy_loss = -(self.spec.horizon**0.5) * mean_per_seed(value, batch.valid)
         loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(learned), batch.valid)
         loss = loss + copies.penalty(policy=(self.head, outputs))
-        norm = self._step(self.actor_optimiser, self.actor_parameters, loss)
+        (norm,) = self.actor_optimiser.step(self.actor_optimiser.gradient(loss))
         metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
         return metrics | {name: mean_per_seed(x, batch.valid) for name, x in self.head.statistics(learned).items()}
 

@@ -15,9 +15,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
 from esp_cli.algorithms.losses import (
-    clip_gradients_per_seed,
     clipped_surrogate,
     explained_variance,
     gae,
@@ -108,10 +108,12 @@ class Mappo(Learner):
             raise ValueError(
                 f"mappo.num_minibatches is {config.num_minibatches}, but a rollout has {sequences} rows to share"
             )
-        self.actor_parameters = list(self.policy.parameters())
-        self.critic_parameters = list(self.critic.parameters())
-        self.optimiser = torch.optim.Adam(
-            self.actor_parameters + self.critic_parameters, config.learning_rate, eps=config.adam_epsilon, fused=True
+        self.optimiser = SeedAdam(
+            list(self.policy.parameters()),
+            list(self.critic.parameters()),
+            learning_rate=config.learning_rate,
+            epsilon=config.adam_epsilon,
+            max_grad_norm=config.max_grad_norm,
         )
         self.modules = {"policy": self.policy, "critic": self.critic, "normaliser": self.normaliser}
         self.optimisers = {"adam": self.optimiser}
@@ -222,16 +224,14 @@ class Mappo(Learner):
         copies = self.prior.copies(minibatch, self.generators["prior"], self.reevaluated)
         num_seeds, total, length = minibatch.obs.shape[:3]
         size = max(1, self.config.chunk_steps // (num_seeds * length))
-        self.optimiser.zero_grad(set_to_none=True)
+        gradient = torch.zeros(())
         for chunk in copies.chunks(size):
             weight = chunk.originals.count / total
             loss = self._loss(chunk, entropy_coef, weight, sums)
-            (loss.sum() * weight).backward()
-        actor_norm = clip_gradients_per_seed([_grad(p) for p in self.actor_parameters], self.config.max_grad_norm)
-        critic_norm = clip_gradients_per_seed([_grad(p) for p in self.critic_parameters], self.config.max_grad_norm)
+            gradient = gradient + self.optimiser.gradient(loss * weight)
+        actor_norm, critic_norm = self.optimiser.step(gradient)
         if sums is not None:
             _add(sums, 1.0, actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
-        self.optimiser.step()
 
     def _loss(
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
@@ -270,11 +270,6 @@ class Mappo(Learner):
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""
         outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(rows.obs, rows.state)
         return {"policy": (self.policy.head, outputs), "value": values}
-
-
-def _grad(parameter: torch.nn.Parameter) -> Tensor:
-    assert parameter.grad is not None
-    return parameter.grad
 
 
 def _add(sums: dict[str, Tensor], weight: float, **values: Tensor) -> None:

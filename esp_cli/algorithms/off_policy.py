@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
 from typing import ClassVar, Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.episodes import EpisodeCollector
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
-from esp_cli.algorithms.losses import clip_gradients_per_seed, huber, td_targets
+from esp_cli.algorithms.losses import huber, td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
@@ -189,14 +189,15 @@ class OffPolicyLearner(Learner):
             "value": mean_per_seed(copies.original(values), valid),
         }
 
-    def _step(self, optimiser: torch.optim.Optimizer, parameters: list[nn.Parameter], loss: Tensor) -> Tensor:
-        """Take one step down the losses [S] of all seeds; return their gradient norms [S] before clipping."""
-        optimiser.zero_grad(set_to_none=True)
-        loss.sum().backward(inputs=parameters)
-        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
-        norm = clip_gradients_per_seed(gradients, self.config.max_grad_norm)
-        optimiser.step()
-        return norm
+    def adam(self, module: nn.Module, *others: nn.Module, learning_rate: float) -> SeedAdam:
+        """Return an optimiser of the parameters of some networks, whose gradients are clipped together."""
+        parameters = [parameter for part in (module, *others) for parameter in part.parameters()]
+        return SeedAdam(
+            parameters,
+            learning_rate=learning_rate,
+            epsilon=self.config.adam_epsilon,
+            max_grad_norm=self.config.max_grad_norm,
+        )
 
     def _condition(self, _: EpisodeBatch) -> dict[str, Tensor]:
         """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""
@@ -227,8 +228,3 @@ class OffPolicyLearner(Learner):
 
 PROBE_EPISODES = 4
 """Episodes per seed on which the symmetry errors are measured once an iteration."""
-
-
-def adam(parameters: Iterable[nn.Parameter], learning_rate: float, epsilon: float) -> torch.optim.Adam:
-    """Return an optimiser for networks of all seeds."""
-    return torch.optim.Adam(parameters, learning_rate, eps=epsilon, fused=True)

@@ -15,7 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner, adam
+from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
@@ -62,8 +62,7 @@ class Qmix(OffPolicyLearner):
         self.mixer = MonotonicMixer(generators, *widths).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
-        self.parameters = [*self.policy.parameters(), *self.mixer.parameters()]
-        self.optimiser = adam(self.parameters, config.learning_rate, config.adam_epsilon)
+        self.optimiser = self.adam(self.policy, self.mixer, learning_rate=config.learning_rate)
         self.modules |= {
             "mixer": self.mixer,
             "target_policy": self.target_policy,
@@ -94,7 +93,7 @@ class Qmix(OffPolicyLearner):
         values = self._total(utilities, copies.rows)
         target = self._targets(batch, copies.original(utilities).detach())
         loss, metrics = self._td_loss(values, target, copies)
-        norm = self._step(self.optimiser, self.parameters, loss)
+        (norm,) = self.optimiser.step(self.optimiser.gradient(loss))
         if (self.updates + 1) % self.config.target_every == 0:
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_mixer.load_state_dict(self.mixer.state_dict())

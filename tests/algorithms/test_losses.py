@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from esp_cli.algorithms.losses import (
-    clip_gradients_per_seed,
     clipped_surrogate,
     explained_variance,
     gae,
@@ -129,19 +128,3 @@ def test_a_masked_mean_counts_what_is_valid_alone():
 def test_normalisation_is_per_seed():
     x = torch.tensor([[1.0, 3.0], [10.0, 30.0]])
     torch.testing.assert_close(normalise_per_seed(x, 0.0), torch.tensor([[-1.0, 1.0], [-1.0, 1.0]]))
-
-
-def test_gradients_are_clipped_by_the_norm_of_their_own_seed():
-    # seed 0 has norm 5 over both tensors, seed 1 has 0.5
-    first, second = torch.tensor([[3.0], [0.3]]), torch.tensor([[[4.0]], [[0.4]]])
-    norm = clip_gradients_per_seed([first, second], 1.0)
-    torch.testing.assert_close(norm, torch.tensor([5.0, 0.5]))
-    torch.testing.assert_close(first, torch.tensor([[0.6], [0.3]]), atol=1e-5, rtol=0)
-    torch.testing.assert_close(second, torch.tensor([[[0.8]], [[0.4]]]), atol=1e-5, rtol=0)
-
-
-def test_a_broken_seed_does_not_spoil_the_others_gradients():
-    gradient = torch.tensor([[3.0, 4.0], [math.nan, 1.0]])
-    clip_gradients_per_seed([gradient], 1.0)
-    torch.testing.assert_close(gradient[0], torch.tensor([0.6, 0.8]), atol=1e-5, rtol=0)
-    assert gradient[1].isnan().all()

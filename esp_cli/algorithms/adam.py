@@ -1,0 +1,145 @@
+"""Parameters, gradients and moments of S seeds, each in one buffer: a clip, a step or a copy is one operation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+_ALIGNED = 16
+"""Numbers per seed are filled up to a multiple of this, so that no seed begins within a vector of the processor."""
+BETAS = (0.9, 0.999)
+
+
+class SeedParameters:
+    """Parameters of S seeds as views of one buffer; changing the buffer changes the networks.
+
+    Args:
+        parameters: [S, ...] each.
+
+    Attributes:
+        parameters: as given.
+        buffer: [S, P] all numbers of a seed in a row.
+    """
+
+    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
+        self.parameters = list(parameters)
+        ends = torch.tensor([p[0].numel() for p in self.parameters]).cumsum(0).tolist()
+        self._parts = list(pairwise([0, *ends]))
+        first = self.parameters[0]
+        self._rest = first.new_zeros(first.shape[0], -ends[-1] % _ALIGNED)
+        self.buffer = self.flat([p.detach() for p in self.parameters])
+        for parameter, view in zip(self.parameters, self.views(self.buffer), strict=True):
+            parameter.data = view
+
+    def flat(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Return a new buffer [S, P] of one tensor for each parameter."""
+        return torch.cat([*(tensor.flatten(1) for tensor in tensors), self._rest], 1)
+
+    def views(self, buffer: Tensor) -> list[Tensor]:
+        """Return the part of a buffer [S, P] that belongs to each parameter, in its shape."""
+        return [
+            buffer[:, begin:end].unflatten(1, parameter.shape[1:])
+            for (begin, end), parameter in zip(self._parts, self.parameters, strict=True)
+        ]
+
+
+class SeedAdam:
+    """Adam (Kingma and Ba, 2015) for S seeds, with the gradients of each seed clipped.
+
+    m <- b1 m + (1 - b1) g, v <- b2 v + (1 - b2) g^2, p <- p - lr (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon).
+
+    Args:
+        groups: parameters [S, ...]; the gradients of a group are clipped by their joint norm.
+        learning_rate: lr before it is annealed.
+        epsilon: see above.
+        max_grad_norm: largest norm of the gradients of a group and seed.
+
+    Attributes:
+        learning_rate: lr of the next step.
+        parameters: of all groups.
+    """
+
+    def __init__(
+        self, *groups: Sequence[nn.Parameter], learning_rate: float, epsilon: float, max_grad_norm: float
+    ) -> None:
+        self.parameters = SeedParameters([parameter for group in groups for parameter in group])
+        self.learning_rate = self.initial_learning_rate = learning_rate
+        self.epsilon, self.max_grad_norm = epsilon, max_grad_norm
+        ends = torch.tensor([sum(p[0].numel() for p in group) for group in groups]).cumsum(0).tolist()
+        self._groups = list(pairwise([0, *ends]))
+        buffer = self.parameters.buffer
+        self.mean, self.square = torch.zeros_like(buffer), torch.zeros_like(buffer)
+        self.count = buffer.new_zeros(())
+
+    def anneal(self, remaining: float) -> None:
+        """Set the learning rate to this share of what it was made with."""
+        self.learning_rate = self.initial_learning_rate * remaining
+
+    def gradient(self, loss: Tensor) -> Tensor:
+        """Return the gradients [S, P] of the losses [S] of all seeds."""
+        parameters = self.parameters.parameters
+        gradients = torch.autograd.grad(loss.sum(), parameters, allow_unused=True, materialize_grads=True)
+        return self.parameters.flat(gradients)
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor) -> list[Tensor]:
+        """Clip the gradients [S, P] in place and take one step; return each group's norms [S] before clipping."""
+        norms = [clip_per_seed(gradient[:, begin:end], self.max_grad_norm) for begin, end in self._groups]
+        self.count += 1
+        torch._fused_adam_(  # what torch.optim.Adam calls, whose Python takes longer than the step
+            [self.parameters.buffer],
+            [gradient],
+            [self.mean],
+            [self.square],
+            [],
+            [self.count],
+            lr=self.learning_rate,
+            beta1=BETAS[0],
+            beta2=BETAS[1],
+            weight_decay=0.0,
+            eps=self.epsilon,
+            amsgrad=False,
+            maximize=False,
+        )
+        return norms
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the moments of every parameter under its number; nothing before the first step."""
+        if not self.count:
+            return {}
+        moments = zip(self.parameters.views(self.mean), self.parameters.views(self.square), strict=True)
+        out: dict[str, Tensor] = {}
+        for index, (mean, square) in enumerate(moments):
+            out |= {f"{index}.step": self.count, f"{index}.exp_avg": mean, f"{index}.exp_avg_sq": square}
+        return out
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            KeyError: the moments are of other parameters.
+        """
+        shapes = {f"{k}.step": self.count.shape for k in range(len(self.parameters.parameters))}
+        for k, parameter in enumerate(self.parameters.parameters):
+            shapes |= {f"{k}.exp_avg": parameter.shape, f"{k}.exp_avg_sq": parameter.shape}
+        for name in {*shapes, *tensors} if tensors else ():
+            if name not in shapes or name not in tensors or tensors[name].shape != shapes[name]:
+                raise KeyError(f"the moments of parameter {name.partition('.')[0]}")
+        for state in (self.mean, self.square, self.count):
+            state.zero_()
+        for name, tensor in tensors.items():
+            index, _, key = name.partition(".")
+            if key == "step":
+                self.count.copy_(tensor)
+            else:
+                self.parameters.views(self.mean if key == "exp_avg" else self.square)[int(index)].copy_(tensor)
+
+
+def clip_per_seed(gradient: Tensor, max_norm: float) -> Tensor:
+    """Scale each seed's gradient [S, P] in place so that its norm is at most `max_norm`; return the old norms [S]."""
+    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
+    gradient.mul_((max_norm / (norm + 1e-6)).clamp_max_(1.0))
+    return norm.squeeze(1)
