@@ -82,7 +82,7 @@ class Learner(ABC):
         generators: random generators by name, one per seed each.
     """
 
-    config_class: ClassVar[type[LearnerConfig]]
+    config_class: ClassVar[type[LearnerConfig]] = LearnerConfig
     task_settings: ClassVar[Mapping[str, object]] = MappingProxyType({})
     replays: ClassVar[bool] = False
     config: LearnerConfig

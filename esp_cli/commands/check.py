@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_tasks
+from esp_cli.commands.options import (
+    JsonOption,
+    OwnAlgoOption,
+    OwnNetworkOption,
+    TaskSetOption,
+    parse_task_settings,
+    register_learners,
+    register_tasks,
+)
 
 if TYPE_CHECKING:
     from esp_cli.checking import PolicyVerdict, SymmetryReport
@@ -37,6 +45,8 @@ def check(
     policy: Annotated[
         Path | None, typer.Option("--policy", help="Also measure how symmetric this policy is.", metavar="RUN|POLICY")
     ] = None,
+    algo: OwnAlgoOption = None,
+    network: OwnNetworkOption = None,
     json: JsonOption = None,
 ) -> None:
     """Check what every task promises, or a task's declared symmetry; exit code 1 where something is broken.
@@ -46,6 +56,7 @@ def check(
     from esp_envs.registry import make
 
     register_tasks([task])
+    register_learners(algo or [], network or [])
     chosen = parse_task_settings(settings or [])
 
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:

@@ -10,11 +10,13 @@ from esp_cli.commands.options import (
     BundledPriorOption,
     EpisodesOption,
     JsonOption,
+    OwnNetworkOption,
     OwnTaskOption,
     PhysicsOption,
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
+    register_learners,
     register_tasks,
 )
 
@@ -35,6 +37,7 @@ def evaluate(
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
     algo: BundledAlgoOption = None,
+    network: OwnNetworkOption = None,
     prior: BundledPriorOption = None,
     json: JsonOption = None,
 ) -> None:
@@ -47,6 +50,7 @@ def evaluate(
     from esp_cli.training.loading import transfer
 
     register_tasks(task)
+    register_learners([algo], network or [])
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)

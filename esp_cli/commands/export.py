@@ -14,8 +14,10 @@ from esp_cli.commands.options import (
     ForceOption,
     JsonOption,
     OutOption,
+    OwnNetworkOption,
     OwnTaskOption,
     PolicyArgument,
+    register_learners,
     register_tasks,
 )
 
@@ -50,6 +52,7 @@ def export(
         int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
     ] = None,
     algo: BundledAlgoOption = None,
+    network: OwnNetworkOption = None,
     prior: BundledPriorOption = None,
     episodes: Annotated[
         int,
@@ -77,6 +80,7 @@ def export(
     if name is not None and "policy" not in formats:
         raise ValueError("--name is for -f policy alone; leave it out")
     register_tasks(task)
+    register_learners([algo], network or [])
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)

@@ -135,6 +135,26 @@ def register_tasks(names: Iterable[str] | None) -> None:
         register(name)
 
 
+def register_learners(algorithms: Iterable[str | None], networks: Iterable[object] = ()) -> None:
+    """Admit the algorithms and networks that this command line names as module:Class.
+
+    Raises:
+        ValueError: a module cannot be imported, or holds no such algorithm or network.
+    """
+    own = [name for name in algorithms if name is not None and ":" in name]
+    if own:
+        from esp_cli.algorithms.registry import ALGORITHMS
+
+        for name in own:
+            ALGORITHMS.register(name)
+    own = [name for name in networks if isinstance(name, str) and ":" in name]
+    if own:
+        from esp_cli.networks.build import NETWORKS
+
+        for name in own:
+            NETWORKS.register(name)
+
+
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     """Wrap a parser so that its message names the option."""
 
@@ -155,7 +175,18 @@ OwnTaskOption = Annotated[
     list[str] | None,
     typer.Option("--task", help="Import this task of yours, which the run or policy is of.", metavar="MODULE:CLASS"),
 ]
-AlgoOption = Annotated[str, typer.Option("--algo", "-a", help="Learning algorithm, such as mappo.", metavar="ALGO")]
+AlgoOption = Annotated[
+    str,
+    typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.", metavar="ALGO"),
+]
+OwnAlgoOption = Annotated[
+    list[str] | None,
+    typer.Option("--algo", help="Import this algorithm of yours, which trained the run.", metavar="MODULE:CLASS"),
+]
+OwnNetworkOption = Annotated[
+    list[str] | None,
+    typer.Option("--network", help="Import this network of yours, which the run has.", metavar="MODULE:CLASS"),
+]
 StepsOption = Annotated[
     int,
     typer.Option(
@@ -226,7 +257,12 @@ PolicyArgument = Annotated[
 ]
 BundledAlgoOption = Annotated[
     str | None,
-    typer.Option("--algo", "-a", help="Choose the bundled policy that this algorithm trained.", metavar="ALGO"),
+    typer.Option(
+        "--algo",
+        "-a",
+        help="Choose the bundled policy that this algorithm trained; or import module:Class, which trained the run.",
+        metavar="ALGO",
+    ),
 ]
 BundledPriorOption = Annotated[
     Literal["esp", "augment", "consistency", "none"] | None,

@@ -14,11 +14,13 @@ from esp_cli.commands.options import (
     BundledAlgoOption,
     BundledPriorOption,
     OutOption,
+    OwnNetworkOption,
     OwnTaskOption,
     PhysicsOption,
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
+    register_learners,
     register_tasks,
 )
 
@@ -70,6 +72,7 @@ def render(
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
     algo: BundledAlgoOption = None,
+    network: OwnNetworkOption = None,
     prior: BundledPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
@@ -79,6 +82,7 @@ def render(
 
     kind = check_target(out, episodes)
     register_tasks(task)
+    register_learners([algo], network or [])
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)

@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, OwnTaskOption, check_finite, parse_count, register_tasks
+from esp_cli.commands.options import (
+    JsonOption,
+    OwnAlgoOption,
+    OwnNetworkOption,
+    OwnTaskOption,
+    check_finite,
+    parse_count,
+    register_learners,
+    register_tasks,
+)
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material
@@ -76,6 +85,8 @@ def report(
     view: ViewOption = None,
     plot: PlotOption = None,
     task: OwnTaskOption = None,
+    algo: OwnAlgoOption = None,
+    network: OwnNetworkOption = None,
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
@@ -83,6 +94,7 @@ def report(
     from esp_cli.studies.study import StudyFolder
 
     register_tasks(task)
+    register_learners(algo or [], network or [])
     if fill is not None:
         _fill(fill)
     if not runs:

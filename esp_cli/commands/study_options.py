@@ -20,6 +20,7 @@ from esp_cli.commands.options import (
     SetOption,
     parse_assignments,
     parse_count,
+    register_learners,
     register_tasks,
 )
 
@@ -128,14 +129,16 @@ class StudyChoices:
         from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
+        overrides = parse_assignments(self.settings or [])
         register_tasks(parse_names(self.tasks))
+        register_learners(parse_names(self.algos) or (), [overrides.get("network.name")])
         return Request(
             tasks=parse_names(self.tasks),
             algorithms=parse_names(self.algos),
             steps=parse_study_steps(self.steps),
             seeds=self.seeds,
             preset=self.preset,
-            overrides=parse_assignments(self.settings or []),
+            overrides=overrides,
             device=resolve_device(self.device),
             episodes=self.episodes,
             command=shlex.join(["esp", *words, *self._options(), "--out", str(self.folder(kind))]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ from esp_cli.commands.options import (
     TaskOption,
     TransformsOption,
     parse_assignments,
+    register_learners,
     register_tasks,
 )
 from esp_cli.commands.stopping import stop_requests
@@ -62,7 +64,7 @@ def train(
         str | None,
         typer.Option(
             "--network",
-            help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn) or equivariant.",
+            help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn), equivariant, or module:Class.",
             metavar="NETWORK",
         ),
     ] = None,
@@ -101,9 +103,12 @@ def train(
     from esp_cli.library.run import Run, begin, plan
     from esp_cli.training.run_folder import RUN_FORMAT
 
+    named = parse_assignments(settings or [])
     register_tasks([task])
+    register_learners([algo], [network, named.get("network.name")])
     if resume is not None:
-        _refuse_beside_resume(context, allowed=("task",) if ":" in task else ())
+        own = {"task": task, "algo": algo, "network": network or ""}
+        _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
         _train(Run(resume), tensorboard)
         return
     short = {
@@ -113,7 +118,7 @@ def train(
         "network.name": network,
         "task.physics": physics,
     }
-    overrides = {name: value for name, value in short.items() if value is not None} | parse_assignments(settings or [])
+    overrides = {name: value for name, value in short.items() if value is not None} | named
     choices: dict[str, Any] = {
         "task": task,
         "algorithm": algo,
@@ -132,7 +137,7 @@ def train(
     _train(begin(resolved, weights, out), tensorboard)
 
 
-def _refuse_beside_resume(context: typer.Context, allowed: tuple[str, ...]) -> None:
+def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> None:
     """Refuse options that a resumed run would ignore: it keeps its own configuration."""
     given = [
         parameter.opts[0]
@@ -166,10 +171,10 @@ def _train(run: Run, tensorboard: bool) -> None:
     if not complete:
         console.note(
             f"stopped at {console.format_count(trainer.step)} steps; continue with: "
-            f"{shlex.join(['esp', 'train', '--resume', str(run.path)])}"
+            f"{shlex.join(['esp', 'train', '--resume', str(run.path), *config.own_words()])}"
         )
         raise typer.Exit(130)
-    _report(trainer, run.path)
+    _report(trainer, run.path, config)
 
 
 def _announce(config: RunConfig, path: Path, step: int) -> None:
@@ -195,7 +200,7 @@ def _shown(news: Progress) -> dict[str, float]:
     return out
 
 
-def _report(trainer: Trainer, path: Path) -> None:
+def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
     import numpy as np
 
     from esp_cli.evaluation.statistics import mean_and_sem
@@ -206,5 +211,5 @@ def _report(trainer: Trainer, path: Path) -> None:
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
-    quoted = shlex.quote(str(path))
-    console.note(f"next: esp eval {quoted}    esp render {quoted} -o out.gif")
+    words = shlex.join([str(path), *config.own_words()])
+    console.note(f"next: esp eval {words}    esp render {words} -o out.gif")

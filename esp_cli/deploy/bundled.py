@@ -58,13 +58,15 @@ def open_policy(
 
     Args:
         where: path or name.
-        algo: of the bundled policies, only those that this algorithm trained.
+        algo: of the bundled policies, only those that this algorithm trained; module:Class chooses none.
         prior: likewise this kind of prior.
         folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: nothing there, damaged, or of another version.
     """
+    if algo is not None and ":" in algo:  # an algorithm of the caller, which trained no bundled policy
+        algo = None
     choosy = algo is not None or prior is not None
     try:
         there = where.exists()

@@ -16,7 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.deploy.bundled import open_policy
+from esp_cli.networks.build import NETWORKS
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_envs.base import Environment
 from esp_envs.registry import register
@@ -136,23 +140,39 @@ class LoadedPolicy:
 
 def load_policy(
     where: str | os.PathLike[str],
-    algo: str | None = None,
+    algo: str | type[Learner] | None = None,
     prior: str | None = None,
     seed: int | None = None,
     task: str | type[Environment] | None = None,
+    network: str | type[NetworkConfig] | None = None,
 ) -> LoadedPolicy:
-    """Load a trained policy; loading runs no code but that of a `task` which you name.
+    """Load a trained policy; loading runs no code but that of a task, algorithm or network which you name.
 
     Args:
         where: a task ("formation") or the name of a bundled policy, a policy file, or a run folder.
-        algo: of a task's policies, the one that this algorithm trained.
+        algo: of a task's policies, the one that this algorithm trained; "module:Class" or the class of your own.
         prior: likewise this kind of prior; "none" is the plain learner.
         seed: which seed of a run acts; by default its first.
         task: the task that the policy is of, as "module:Class" or as the class, where it is not installed.
+        network: the settings class of its network, likewise.
 
     Raises:
         ValueError: nothing there, damaged, of another version, no such seed, or no such task.
     """
+    register_own(task, algo, network)
+    name = algo if isinstance(algo, str) else None
+    return LoadedPolicy(open_policy(Path(where), name, prior), seed)
+
+
+def register_own(
+    task: str | type[Environment] | None,
+    algo: str | type[Learner] | None,
+    network: str | type[NetworkConfig] | None,
+) -> None:
+    """Admit what a caller names; see `Registry.register`."""
     if task is not None:
         register(task)
-    return LoadedPolicy(open_policy(Path(where), algo, prior), seed)
+    if algo is not None:
+        ALGORITHMS.register(algo)
+    if network is not None:
+        NETWORKS.register(network)

@@ -18,13 +18,16 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.deploy.bundled import open_policy
-from esp_cli.deploy.library import LoadedPolicy
+from esp_cli.deploy.library import LoadedPolicy, register_own
 from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.final import evaluate as evaluate_policy
 from esp_cli.formatting import file_name
 from esp_cli.library.metrics import Metrics
 from esp_cli.machine import resolve_device
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.initial import describe, fitted
@@ -46,6 +49,8 @@ class Run:
     Args:
         path: of the run folder.
         task: the task that the run is of, as "module:Class" or as the class, where it is not installed.
+        algo: its algorithm, likewise.
+        network: the settings class of its network, likewise.
 
     Attributes:
         path: of the run folder.
@@ -55,9 +60,14 @@ class Run:
         ValueError: there is no run, or its configuration is damaged or of another version.
     """
 
-    def __init__(self, path: str | os.PathLike[str], task: str | type[Environment] | None = None) -> None:
-        if task is not None:
-            register(task)
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        task: str | type[Environment] | None = None,
+        algo: str | type[Learner] | None = None,
+        network: str | type[NetworkConfig] | None = None,
+    ) -> None:
+        register_own(task, algo, network)
         self.folder = RunFolder.open(Path(path))
         self.path = self.folder.path
         self.config: RunConfig = parse_config(self.folder.config, self.path)
@@ -164,8 +174,8 @@ def plan(
 ) -> tuple[RunConfig, dict[str, Tensor] | None]:
     """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
 
-    Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: a task of
-    the caller is registered already.
+    Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: what
+    the caller brings along is registered already.
     """
     config = resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings)
     learner = build_learner(config)
@@ -184,7 +194,7 @@ def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os
 
 def train(
     task: str | type[Environment] = "navigation",
-    algo: str = "mappo",
+    algo: str | type[Learner] = "mappo",
     *,
     steps: int = 1_000_000,
     seeds: Sequence[int] = (0,),
@@ -199,7 +209,7 @@ def train(
 
     Args:
         task: name of a task, "module:Class", or the class of one.
-        algo: "mappo", "maddpg" or "qmix".
+        algo: "mappo", "maddpg" or "qmix", "module:Class", or the class of one.
         steps: environment steps per seed.
         seeds: the run's seeds.
         preset: "default" or "paper".
@@ -212,9 +222,11 @@ def train(
     Raises:
         ValueError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
     """
-    name = register(task)
+    named = (settings or {}).get("network.name")
+    register_own(None, None, named if isinstance(named, str) else None)
+    name, algorithm = register(task), ALGORITHMS.register(algo)
     config, weights = plan(
-        name, algo, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
+        name, algorithm, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
     )
     run = begin(config, weights, out)
     run.train(listener)

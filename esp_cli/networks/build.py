@@ -1,6 +1,7 @@
 """The networks by name, and how a network is built from its settings.
 
-Adding a network is one file, with its class and its `NetworkConfig`, and one line in `NETWORKS`.
+A network is one file, with its class and its `NetworkConfig`. The settings are built in, installed as entry points of
+`esp.networks`, or named as module and class.
 """
 
 from __future__ import annotations
@@ -12,22 +13,27 @@ import torch
 from pydantic import BeforeValidator, SerializeAsAny
 
 from esp_cli.files.documents import validate
-from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.contract import ActivationName, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
-from esp_cli.networks.plain import GruConfig, MlpConfig, PlainConfig
+from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import Symmetrised
+from esp_envs.installed import Registry
 
 __all__ = ["NETWORKS", "AnyNetworkConfig", "Network", "NetworkConfig", "build_network", "network_class", "perceptron"]
 
-NETWORKS: dict[str, type[NetworkConfig]] = {
-    "mlp": MlpConfig,
-    "gru": GruConfig,
-    "mpn": MpnConfig,
-    "empn": EmpnConfig,
-    "equivariant": EquivariantConfig,
-}
+NETWORKS: Registry[NetworkConfig] = Registry(
+    "network",
+    {
+        "mlp": "esp_cli.networks.plain:MlpConfig",
+        "gru": "esp_cli.networks.plain:GruConfig",
+        "mpn": "esp_cli.networks.message_passing:MpnConfig",
+        "empn": "esp_cli.networks.message_passing:EmpnConfig",
+        "equivariant": "esp_cli.networks.constrained:EquivariantConfig",
+    },
+    base="esp_cli.networks.contract:NetworkConfig",
+    option="--network",
+    example="skip:SkipConfig",
+)
 """The settings of every network, by its name."""
 
 _FLAT_FIELDS = {"activation", "precision", "layer_norm", "group", "separate_parts"}
@@ -40,9 +46,7 @@ def network_class(name: object) -> type[NetworkConfig]:
     Raises:
         ValueError: there is no such network.
     """
-    if not isinstance(name, str) or name not in NETWORKS:
-        raise ValueError(f"unknown network '{str(name)[:40]}'; the networks are {', '.join(NETWORKS)}")
-    return NETWORKS[name]
+    return NETWORKS[str(name)]
 
 
 def _stored(data: object) -> object:

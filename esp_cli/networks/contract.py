@@ -20,6 +20,7 @@ class NetworkConfig(BaseModel, ABC):
     """The settings of one kind of network; a subclass has the fields of its kind and builds it.
 
     Attributes:
+        name: by which the user chose the network.
         recurrent: whether the network carries memory from step to step.
     """
 
@@ -27,7 +28,7 @@ class NetworkConfig(BaseModel, ABC):
 
     recurrent: ClassVar[bool] = False
 
-    name: str
+    name: str = Field("", max_length=100)
     hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(
         (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
     )

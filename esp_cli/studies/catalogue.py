@@ -79,7 +79,7 @@ def _pairs(
     for team, steps, algorithm in (
         (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
     ):
-        stem = f"{file_name(team.label)}-{_count(steps)}-{algorithm}"
+        stem = f"{file_name(team.label)}-{_count(steps)}-{file_name(algorithm)}"
         for prior in variants:
             settings = {**team.settings, **kind.variants[prior]}
             config = _config(task, algorithm, steps, request, settings, kind.common)
@@ -98,7 +98,7 @@ def _variants(
 ) -> Iterator[Cell]:
     """Yield the variants of each algorithm, which are compared with the first of them."""
     for algorithm, steps in ((a, s) for a in algorithms for s in _steps(kind, task, request)):
-        stem = f"{file_name(task)}-{algorithm}-{_count(steps)}"
+        stem = f"{file_name(task)}-{file_name(algorithm)}-{_count(steps)}"
         for variant in variants:
             choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
             config = _config(task, algorithm, steps, request, choice, kind.common)
@@ -106,7 +106,7 @@ def _variants(
             place = tuple(part.format(**fields) for part in kind.place)
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
-                panel=f"{task}, {algorithm.upper()}, {_count(steps)}",
+                panel=f"{task}, {_paired_name(algorithm, 'none')}, {_count(steps)}",
                 variant=variant,
                 config=config,
                 reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
@@ -175,7 +175,7 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
 
 def _paired_name(algorithm: str, prior: str) -> str:
     """Return how the paper calls an algorithm without the prior and with it: "MADDPG", "MADDPG-ESP"."""
-    return algorithm.upper() + ("" if prior == "none" else "-ESP")
+    return algorithm.rpartition(":")[2].upper() + ("" if prior == "none" else "-ESP")
 
 
 def _count(steps: int) -> str:

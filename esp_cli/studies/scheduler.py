@@ -187,8 +187,7 @@ class Scheduler:
             arguments += ["--json", str(folder.evaluation_path(cell))]
         else:
             run.status, arguments = "training", ["train", "--resume", path]
-        if ":" in cell.config.task:  # the study's command line names it; a job imports nothing for a folder's sake
-            arguments += ["--task", cell.config.task]
+        arguments += cell.config.own_words()  # a job imports what the study's command line names, not its folder
         try:
             if run.status != "training":  # a damaged evaluation is made again, and a link there is not followed
                 remove_file(folder.evaluation_path(cell))

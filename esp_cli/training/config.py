@@ -60,6 +60,11 @@ class RunConfig(BaseModel):
     device: Literal["cpu", "cuda"] = "cpu"
     init_from: InitialPolicy | None = Field(None, description="the policy that it started from")
 
+    def own_words(self) -> list[str]:
+        """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""
+        chosen = (("--task", self.task), ("--algo", self.algorithm), ("--network", self.network.name))
+        return [word for option, name in chosen if ":" in name for word in (option, name)]
+
     def command(self) -> str:
         """Return the `esp train` command line that resolves to this configuration, quoted for a shell.
 
@@ -169,12 +174,11 @@ def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[s
     Raises:
         ValueError: there is no such algorithm, or it has no such preset.
     """
-    if algorithm not in ALGORITHMS:
-        raise ValueError(f"unknown algorithm '{algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    learner = ALGORITHMS[algorithm]
     presets = PRESETS.get(algorithm, {"default": {}})
     if preset not in presets:
         raise ValueError(f"{algorithm} has no preset '{preset}'; it has {', '.join(presets)}")
-    asked = ALGORITHMS[algorithm].task_settings
+    asked = learner.task_settings
     known = task_class(task).Settings.model_fields
     sections: dict[str, dict[str, object]] = {"task": {name: asked[name] for name in asked if name in known}}
     sections |= {name: {} for name in (algorithm, "network", "prior", "evaluation")}

@@ -65,10 +65,12 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         # Another version may have had another name for a setting; of one version that is damage.
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
         raise ValueError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
-    if config.algorithm not in ALGORITHMS:
-        raise ValueError(f"{source} was trained by '{config.algorithm}'; the algorithms are {', '.join(ALGORITHMS)}")
+    try:
+        learner = ALGORITHMS[config.algorithm]
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
     _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
-    _check_settings(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm, source)
+    _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)
     return config
 
 

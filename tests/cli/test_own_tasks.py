@@ -79,7 +79,7 @@ def test_a_program_loads_such_a_policy_by_naming_its_task(folder: Path, monkeypa
     from esp_envs import registry
 
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(registry.TASKS, "_registered", {})
     with pytest.raises(ValueError, match="add --task rendezvous:Rendezvous"):
         load_policy(folder / "run")
     policy = load_policy(folder / "run", task=TASK)

@@ -16,7 +16,7 @@ from tests.cli.running import esp, refused
 @pytest.fixture(autouse=True)
 def no_task_of_another_test(monkeypatch: pytest.MonkeyPatch) -> None:
     """Show the built-in tasks alone: other tests register tasks with long names."""
-    monkeypatch.setattr("esp_envs.registry._REGISTERED", {})
+    monkeypatch.setattr("esp_envs.registry.TASKS._registered", {})
 
 
 def test_the_list_names_every_task_with_the_symmetries_that_it_carries() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_envs import BatchedTask, Environment, make, register, registry, task_class, task_names
+from esp_envs import BatchedTask, Environment, installed, make, register, registry, task_class, task_names
 from tests.own_tasks import save_page_files
 
 
@@ -15,7 +15,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working directory of its own, whose modules are forgotten afterwards."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(registry.TASKS, "_registered", {})
     before = set(sys.modules)
     yield tmp_path
     for name in set(sys.modules) - before:
@@ -63,7 +63,7 @@ def test_an_ordinary_name_needs_no_registration() -> None:
         ),
         ("def f(:\n", "cannot import the module 'mine' of the task: SyntaxError: "),
         ("raise RuntimeError('first\\nlast')\n", "cannot import the module 'mine' of the task: RuntimeError: last"),
-        ("Task = 3\n", "'mine:Task' is not a task; a task is a subclass of esp_envs.Environment"),
+        ("Task = 3\n", "'mine:Task' is not a task; a task is a subclass of esp_envs.base.Environment"),
         ("class Task: pass\n", "'mine:Task' is not a task"),
         ("class Other: pass\n", "the module 'mine' has no class 'Task'"),
         ("from esp_envs import BatchedTask\nclass Task(BatchedTask): pass\n", "lacks _advance, _describe, _observe"),
@@ -97,7 +97,7 @@ def test_an_installed_task_is_known_by_its_entry_point(monkeypatch: pytest.Monke
         EntryPoint("theirs", "esp_envs.mpe.navigation:Navigation", "esp.tasks"),
         EntryPoint("broken", "no_such_package:Task", "esp.tasks"),
     ]
-    monkeypatch.setattr(registry, "entry_points", lambda group: entries if group == "esp.tasks" else [])
+    monkeypatch.setattr(installed, "entry_points", lambda group: entries if group == "esp.tasks" else [])
     assert {"theirs", "broken", "navigation"} <= set(task_names())
     assert issubclass(task_class("theirs"), Environment)
     with pytest.raises(ValueError, match="the installed task 'broken' cannot be imported: ModuleNotFoundError"):

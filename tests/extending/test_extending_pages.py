@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from esp_cli import load_policy
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
@@ -25,7 +26,6 @@ PAGES = Path(__file__).parents[2] / "docs"
 def code_of(page: str) -> ModuleType:
     """Run all Python blocks of a page, in one module, and return its names."""
     blocks = re.findall(r"```python\n(.*?)```", (PAGES / page).read_text(encoding="utf-8"), re.S)
-    assert len(blocks) == 2, "the file and the line"
     module = ModuleType(f"extending_{page.removesuffix('.md').replace('-', '_')}")
     sys.modules[module.__name__] = module  # dataclasses and pydantic look their module up
     for block in blocks:
@@ -34,56 +34,141 @@ def code_of(page: str) -> ModuleType:
 
 
 @pytest.fixture(autouse=True)
-def registries_as_before():
-    """Take what a page registers out again."""
-    tables = ALGORITHMS.copy(), NETWORKS.copy(), parse.READERS.copy()
+def registries_as_before(monkeypatch):
+    """Take what a test registers out again."""
+    readers = parse.READERS.copy()
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for table in (ALGORITHMS, NETWORKS):
+        monkeypatch.setattr(table, "_registered", {})
+    before = set(sys.modules)
     yield
-    for table, before in zip((ALGORITHMS, NETWORKS), tables[:2], strict=True):
-        table.clear()
-        table.update(before)
-    parse.READERS[:] = tables[2]
+    parse.READERS[:] = readers
+    for name in set(sys.modules) - before:
+        if name in ("reinforce", "skip"):
+            del sys.modules[name]
 
 
+@pytest.fixture
+def saved(tmp_path, monkeypatch):
+    """Save the file of each page where the page says, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    for page in ("add-an-algorithm.md", "add-a-network.md"):
+        text = (PAGES / page).read_text(encoding="utf-8")
+        name = re.search(r"Save this as `([\w.]+)`", text)[1]
+        (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
+        (tmp_path / name).write_text(code, encoding="utf-8")
+
+
+ALGO, NETWORK = ["--algo", "reinforce:Reinforce"], ["--network", "skip:SkipConfig"]
 TINY = ["--set", "evaluation.episodes=4", "--set", "evaluation.every_steps=1000000"]
 
 
 @pytest.mark.parametrize("prior", ["esp", "none"])
-def test_the_algorithm_trains_resumes_is_evaluated_and_exported(tmp_path, prior):
-    code_of("add-an-algorithm.md")
-    run = tmp_path / "run"
-    esp("train", "--algo", "reinforce", "--task", "navigation", "--prior", prior, "--seeds", 2, "--steps", "8k", *TINY,
-        "--out", run)  # fmt: skip
-    assert "after 8k steps" in esp("eval", run, "--episodes", 4).stdout
-    esp("export", run, "-f", "numpy", "-o", tmp_path / "export")
-    esp("train", "--resume", run)
+def test_the_algorithm_trains_resumes_is_evaluated_and_exported(saved, prior):
+    esp("train", *ALGO, "--task", "navigation", "--prior", prior, "--seeds", 2, "--steps", "8k", *TINY, "--out", "run",
+        "--set", "reinforce:Reinforce.learning_rate=1e-3")  # fmt: skip
+    assert "after 8k steps" in esp("eval", "run", "--episodes", 4, *ALGO).stdout
+    esp("export", "run", "-f", "numpy", "-o", "export", *ALGO)
+    esp("train", "--resume", "run", *ALGO)
 
 
-def test_the_algorithm_learns_and_the_prior_moves_it(tmp_path):
-    code_of("add-an-algorithm.md")
+def test_the_algorithm_learns_and_the_prior_moves_it(saved):
     returns = {}
     for prior in ("esp", "none"):
-        run = tmp_path / prior
-        esp("train", "--algo", "reinforce", "--task", "navigation", "--prior", prior, "--steps", "40k",
-            "--set", "evaluation.episodes=64", "--set", "evaluation.every_steps=1000000", "--out", run)  # fmt: skip
-        returns[prior] = column(read_metrics(run / "metrics.jsonl"), "eval/return_stochastic")[1].ravel()
+        esp("train", *ALGO, "--task", "navigation", "--prior", prior, "--steps", "40k",
+            "--set", "evaluation.episodes=64", "--set", "evaluation.every_steps=1000000", "--out", prior)  # fmt: skip
+        returns[prior] = column(read_metrics(Path(prior) / "metrics.jsonl"), "eval/return_stochastic")[1].ravel()
     assert all(values[-1] > values[0] + 5 for values in returns.values()), returns
     assert returns["esp"][-1] != returns["none"][-1]
 
 
-def test_the_network_trains_and_refuses_what_it_lacks(tmp_path):
-    code_of("add-a-network.md")
-    options = ["train", "--task", "navigation", "--network", "skip", "--steps", "1k", *TINY]
-    esp(*options, "--set", "network.hidden=[16,16,16]", "--out", tmp_path / "run")
-    assert "skip" in (tmp_path / "run" / "config.json").read_text()
-    esp("eval", tmp_path / "run", "--episodes", 4)
-    assert "equal hidden widths" in refused(*options, "--set", "network.hidden=[16,8]", "--out", tmp_path / "no")
-    assert "activation" in refused(*options, "--set", "network.activation=tanh", "--out", tmp_path / "no")
+def test_the_network_trains_and_refuses_what_it_lacks(saved):
+    options = ["train", "--task", "navigation", *NETWORK, "--steps", "1k", *TINY]
+    esp(*options, "--set", "network.hidden=[16,16,16]", "--out", "run")
+    assert "skip:SkipConfig" in Path("run/config.json").read_text()
+    esp("eval", "run", "--episodes", 4, *NETWORK)
+    assert "equal hidden widths" in refused(*options, "--set", "network.hidden=[16,8]", "--out", "no")
+    assert "activation" in refused(*options, "--set", "network.activation=tanh", "--out", "no")
+
+
+def test_a_folder_never_imports_an_algorithm_or_a_network(saved):
+    own = [*ALGO, *NETWORK]
+    esp("train", "--task", "navigation", "--steps", "800", *own, *TINY, "--out", "run")
+    commands = {
+        "eval": ["eval", "run", "--episodes", 4],
+        "render": ["render", "run", "-o", "film.gif", "--size", 64],
+        "export": ["export", "run", "-f", "numpy", "-o", "export"],
+        "report": ["report", "run"],
+        "check": ["check", "symmetry", "navigation", "--policy", "run", "--transforms", "rot90"],
+        "resume": ["train", "--resume", "run"],
+    }
+    for table in (ALGORITHMS, NETWORKS):
+        table._registered.clear()
+    for command in commands.values():
+        assert "the network 'skip:SkipConfig' is not installed; add --network skip:SkipConfig" in refused(*command)
+    with pytest.raises(ValueError, match="add --network skip:SkipConfig"):
+        load_policy("run")
+    NETWORKS.register("skip:SkipConfig")
+    for command in commands.values():
+        assert "the algorithm 'reinforce:Reinforce' is not installed; add --algo" in refused(*command)
+    NETWORKS._registered.clear()
+    for name, command in commands.items():
+        if name == "export":
+            assert "skip" in refused(*command, *own).lower()  # it has no rule for this network
+        else:
+            esp(*command, *own)
+        for table in (ALGORITHMS, NETWORKS):
+            table._registered.clear()
+    policy = load_policy("run", algo="reinforce:Reinforce", network="skip:SkipConfig")
+    assert policy.act([[0.0] * policy.spec.observation.width]).shape == (1,)
+
+
+@pytest.mark.slow
+def test_a_study_trains_both_in_jobs_of_their_own(saved):
+    esp("ablate", "prior", *ALGO, "--set", "network.name=skip:SkipConfig", "--steps", "800", "--seeds", 1,
+        "--episodes", 2, *TINY, "--jobs", 1, "--out", "study")  # fmt: skip
+    table = esp("report", "study", *ALGO, *NETWORK).stdout
+    assert "REINFORCE-ESP" in table
+
+
+DISTRIBUTION = """[esp.algorithms]
+theirs = reinforce:Reinforce
+[esp.networks]
+deep = skip:SkipConfig
+"""
+
+
+def test_an_installed_distribution_brings_both_under_names_of_its_own(saved, tmp_path, monkeypatch):
+    place = tmp_path / "site"
+    (place / "theirs-1.0.dist-info").mkdir(parents=True)
+    (place / "theirs-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (place / "theirs-1.0.dist-info" / "entry_points.txt").write_text(DISTRIBUTION)
+    for name in ("reinforce.py", "skip.py"):
+        (tmp_path / name).rename(place / name)
+    monkeypatch.syspath_prepend(str(place))
+    esp("train", "--algo", "theirs", "--network", "deep", "--steps", "800", *TINY, "--out", "run")
+    assert "after 800 steps" in esp("eval", "run", "--episodes", 4).stdout
+    assert load_policy("run").spec.name == "navigation"
 
 
 def test_an_unknown_algorithm_and_network_are_refused(tmp_path):
-    """Negative control: without the pages' lines there is neither."""
-    assert "reinforce" in refused("train", "--algo", "reinforce", "--out", tmp_path / "no")
-    assert "skip" in refused("train", "--network", "skip", "--out", tmp_path / "no")
+    """Negative control: without an entry point and without module:Class there is neither."""
+    assert "unknown algorithm 'theirs'" in refused("train", "--algo", "theirs", "--out", tmp_path / "no")
+    assert "unknown network 'deep'" in refused("train", "--network", "deep", "--out", tmp_path / "no")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--algo", "no_such_module:A"], "cannot import the module 'no_such_module' of the algorithm: ModuleNotFound"),
+        (["--algo", "skip:SkipConfig"], "'skip:SkipConfig' is not an algorithm; an algorithm is a subclass of"),
+        (["--network", "skip:Skip"], "'skip:Skip' is not a network; a network is a subclass of"),
+        (["--network", "skip:Other"], "the module 'skip' has no class 'Other'"),
+        (["--algo", "esp_cli.algorithms.learner:Learner"], "lacks build, build_policy, iterate, steps_per_iteration"),
+    ],
+)
+def test_what_is_no_algorithm_or_network_is_answered_by_a_sentence(saved, words, sentence):
+    assert sentence in refused("train", *words, "--out", "no")
 
 
 def walker(kind: Kind) -> Spaces:

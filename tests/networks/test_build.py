@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Literal
 
 import pytest
 import torch
@@ -32,18 +31,19 @@ class Scaled(Memoryless):
 
 
 class ScaledConfig(NetworkConfig):
-    name: Literal["scaled"] = "scaled"
     scale: float = Field(2.0, gt=0)
 
     def build(self, generators, inputs, outputs, output_gain, io):
         return Scaled(generators, inputs, outputs, output_gain, self.scale)
 
 
-def test_a_network_of_ones_own_is_a_class_and_a_line_in_the_table(monkeypatch):
-    with pytest.raises(ValueError, match="unknown network 'scaled'"):
-        resolve_config("navigation", overrides={"network.name": "scaled"})
-    monkeypatch.setitem(NETWORKS, "scaled", ScaledConfig)
-    config = resolve_config("navigation", overrides={"network.name": "scaled", "network.scale": 3})
+def test_a_network_of_ones_own_is_a_class(monkeypatch):
+    monkeypatch.setattr(NETWORKS, "_registered", {})
+    own = f"{__name__}:ScaledConfig"
+    with pytest.raises(ValueError, match=f"the network '{own}' is not installed; add --network {own}"):
+        resolve_config("navigation", overrides={"network.name": own})
+    assert NETWORKS.register(ScaledConfig) == own
+    config = resolve_config("navigation", overrides={"network.name": own, "network.scale": 3})
     assert parse_config(json.loads(config.model_dump_json()), Path("run")) == config
     spec = make("navigation", 2, [0]).spec
     policy = StochasticPolicy(spec, config.network, generators([0, 1], "policy"))
@@ -52,7 +52,7 @@ def test_a_network_of_ones_own_is_a_class_and_a_line_in_the_table(monkeypatch):
     step, _ = policy.step(obs[:, :, -1], policy.initial_memory(1, obs))
     torch.testing.assert_close(whole, step)
     with pytest.raises(ValueError, match=r"bad value 0 for 'network.scale'"):
-        resolve_config("navigation", overrides={"network.name": "scaled", "network.scale": 0})
+        resolve_config("navigation", overrides={"network.name": own, "network.scale": 0})
 
 
 @pytest.mark.parametrize("name", ["mpn", "empn", "equivariant"])

@@ -119,7 +119,7 @@ def test_prior_is_each_learner_without_the_prior_and_with_it():
 
 
 def test_a_setting_names_a_task_of_the_caller_whose_module_is_in_a_package(monkeypatch):
-    monkeypatch.setattr(registry, "_REGISTERED", {})
+    monkeypatch.setattr(registry.TASKS, "_registered", {})
     own = registry.register(task_class("navigation"))
     assert own == "esp_envs.mpe.navigation:Navigation"
     request = Request(tasks=("navigation", own), steps=((None, 20_000),), overrides={f"{own}.num_agents": 2})

@@ -121,7 +121,7 @@ def test_a_configuration_lacks_nothing_and_has_nothing_foreign():
     for data, sentence in (
         (without, "run: the setting 'config.algorithm' is missing"),
         (stored | {"mood": "good"}, "run: unknown setting 'config.mood'"),
-        (stored | {"algorithm": "magic"}, "run was trained by 'magic'; the algorithms are mappo"),
+        (stored | {"algorithm": "magic"}, "run: unknown algorithm 'magic'; the algorithms are mappo"),
         (stored | {"seeds": []}, "for 'config.seeds'"),
         (stored | {"seeds": list(range(1001))}, "for 'config.seeds'"),
         ([], "run: bad value"),

@@ -1,0 +1,146 @@
+"""Classes by name: built in, installed by other packages, or named by the caller as module and class.
+
+A package installs classes as entry points. A class `module:Class` is known only after the caller has passed it to
+`Registry.register`: its name in a file never imports anything.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module, invalidate_caches
+from importlib.metadata import EntryPoint, entry_points
+from inspect import isabstract
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+_MODULE_AND_CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+
+class Registry(Mapping[str, type[T]]):
+    """The classes of one kind by name. A class that is built in or installed is imported when it is looked up.
+
+    Args:
+        noun: what messages call one of them, as "task"; their entry points are in the group "esp.tasks".
+        built_in: name -> "module:Class".
+        base: "module:Class" of the class that every one of them derives from.
+        option: by which a command takes a name.
+        example: a name that a user may write.
+    """
+
+    def __init__(self, noun: str, built_in: Mapping[str, str], base: str, option: str, example: str) -> None:
+        self.noun, self.option, self.example = noun, option, example
+        self.group = f"esp.{noun}s"
+        self._built_in, self._base = dict(built_in), base
+        self._registered: dict[str, type[T]] = {}
+
+    def register(self, given: str | type[T]) -> str:
+        """Admit a class that is not installed; return the name by which it is then known.
+
+        The working directory is importable while the module is imported, as it is for a script. Call this for a class
+        that the user named, never for a name that was read from a file.
+
+        Args:
+            given: "module:Class", or the class itself. Any other name is returned as it is.
+
+        Raises:
+            ValueError: the module cannot be imported, or holds no such class.
+        """
+        if isinstance(given, str):
+            if ":" not in given:
+                return given
+            name, cls = given, self._import(given)
+        else:
+            name, cls = f"{given.__module__}:{given.__qualname__}", self._checked(given, given.__qualname__)
+        self._registered[name] = cls
+        return name
+
+    def __getitem__(self, name: str) -> type[T]:
+        """Return a class by its name, imported if it is built in or installed.
+
+        Raises:
+            ValueError: there is no such class, or it is neither installed nor registered.
+        """
+        if name in self._registered:
+            return self._registered[name]
+        if name in self._built_in:
+            return self._checked(_load(self._built_in[name]), name)
+        if entry := self._installed().get(name):
+            try:
+                return self._checked(entry.load(), name)
+            except Exception as error:
+                raise ValueError(
+                    f"the installed {self.noun} '{name}' cannot be imported: {_last_line(error)}"
+                ) from error
+        if _MODULE_AND_CLASS.fullmatch(name):
+            raise ValueError(
+                f"the {self.noun} '{name}' is not installed; add {self.option} {name} to let esp import and run it"
+            )
+        raise ValueError(
+            f"unknown {self.noun} '{name[:80]}'; the {self.noun}s are {', '.join(self)}; name your own as module:Class"
+        )
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is a class of this name."""
+        return name in list(self)
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names: built-in ones, installed ones, those that the caller registered."""
+        return iter(dict.fromkeys((*self._built_in, *self._installed(), *self._registered)))
+
+    def __len__(self) -> int:
+        """Return the number of names."""
+        return sum(1 for _ in self)
+
+    def _installed(self) -> dict[str, EntryPoint]:
+        return {entry.name: entry for entry in entry_points(group=self.group)}
+
+    def _import(self, name: str) -> type[T]:
+        if not _MODULE_AND_CLASS.fullmatch(name):
+            raise ValueError(f"'{name[:80]}' names no {self.noun}; write module:Class, as in {self.example}")
+        module_name, class_name = name.split(":")
+        here = str(Path.cwd())
+        # First while the module is found, as for a script; last afterwards, so that no other import meets the user's
+        # files.
+        sys.path.insert(0, here)
+        invalidate_caches()  # the user may have written the file a moment ago
+        try:
+            module = import_module(module_name)
+        except Exception as error:
+            raise ValueError(
+                f"cannot import the module '{module_name}' of the {self.noun}: {_last_line(error)}"
+            ) from error
+        finally:
+            sys.path.remove(here)
+            if here not in sys.path:
+                sys.path.append(here)
+        if not hasattr(module, class_name):
+            raise ValueError(f"the module '{module_name}' has no class '{class_name}'; check the name after the colon")
+        return self._checked(getattr(module, class_name), name)
+
+    def _checked(self, cls: object, name: str) -> type[T]:
+        base: type[T] = _load(self._base)
+        if not (isinstance(cls, type) and issubclass(cls, base)):
+            article = "an" if self.noun[0] in "aeiou" else "a"
+            raise ValueError(
+                f"'{name}' is not {article} {self.noun}; {article} {self.noun} is a subclass of "
+                f"{self._base.replace(':', '.')}"
+            )
+        if isabstract(cls):
+            missing = ", ".join(sorted(vars(cls)["__abstractmethods__"]))
+            raise ValueError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")
+        return cls
+
+
+def _load(target: str) -> Any:
+    module, attribute = target.split(":")
+    return getattr(import_module(module), attribute)
+
+
+def _last_line(error: Exception) -> str:
+    """Return the last line of a traceback."""
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__
