@@ -22,6 +22,8 @@ RANKS = {
     "files": 0,
     "machine": 0,
     "formatting": 0,
+    "settings_index": 0,
+    "console": 0.5,
     "symmetry": 1,
     "prior": 2,
     "networks": 2,

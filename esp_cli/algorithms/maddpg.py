@@ -32,7 +32,7 @@ class MaddpgConfig(OffPolicyConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
     learning_rate: float = Field(4e-3, gt=0, description="of the critic; paper: 7e-4")
-    actor_learning_rate: float = Field(4e-3, gt=0, description="paper: 7e-4")
+    actor_learning_rate: float = Field(4e-3, gt=0, description="of the actor; paper: 7e-4")
     td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")

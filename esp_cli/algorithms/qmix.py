@@ -30,7 +30,7 @@ from esp_envs.spec import Discrete, TaskSpec
 class QmixConfig(OffPolicyConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
-    learning_rate: float = Field(4e-3, gt=0, description="paper: 7e-4")
+    learning_rate: float = Field(4e-3, gt=0, description="of Adam; paper: 7e-4")
     td_lambda: float = Field(0.9, ge=0, le=1, description="TD(lambda) along the episode; paper: 0, one-step targets")
     mixer_width: int = Field(32, ge=1, le=1024, description="hidden units of the mixer")
     hyper_width: int = Field(64, ge=1, le=1024, description="hidden units of the hypernetwork")

@@ -19,5 +19,6 @@ COMMANDS: dict[str, str] = {
     "compare-homomorphic": "esp_cli.commands.compare_homomorphic:compare_homomorphic",
     "check": "esp_cli.commands.check:check",
     "tasks": "esp_cli.commands.tasks:tasks",
+    "settings": "esp_cli.commands.settings:settings",
 }
 """Command name -> "module:function", in the order in which `esp --help` lists them."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import Progress, TaskID
 
 from esp_cli import console
 
@@ -34,10 +34,9 @@ class StudyProgress:
         self._live: Progress | None = None
 
     def __enter__(self) -> StudyProgress:
-        if console.err.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[status]}"))
-            self._live = Progress(*columns, console=console.err)
-            self._total = self._live.add_task("whole study", total=1.0, status="")
+        self._live = console.live_progress()
+        if self._live is not None:
+            self._total = self._live.add_task("whole study", total=1.0, status=[])
             self._live.start()
         return self
 
@@ -76,13 +75,13 @@ class StudyProgress:
         for run in snapshot.runs:
             name, active = run.cell.name, run.status in ("training", "evaluating", "elsewhere")
             if active and name not in self._bars:
-                self._bars[name] = live.add_task(name, total=run.cell.config.steps, status="")
+                self._bars[name] = live.add_task(name, total=run.cell.config.steps, status=[])
             if name in self._bars:
                 if active:
-                    live.update(self._bars[name], completed=run.step, status=run_status(run))
+                    live.update(self._bars[name], completed=run.step, status=[run_status(run)])
                 else:
                     live.remove_task(self._bars.pop(name))
-        live.update(self._total, completed=share(snapshot), status=whole_status(snapshot))
+        live.update(self._total, completed=share(snapshot), status=[whole_status(snapshot)])
 
 
 def share(snapshot: Snapshot) -> float:

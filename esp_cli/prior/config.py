@@ -16,7 +16,9 @@ class PriorConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: Literal["esp", "augment", "consistency", "none"] = "esp"
+    kind: Literal["esp", "augment", "consistency", "none"] = Field(
+        "esp", description="copies and consistency losses, one of them alone, or neither: the plain learner"
+    )
     transforms: str = Field("d4", description="elements or a group; paper: rot90; ours: measured best on navigation")
     copies: Literal["draw", "all"] = Field(
         "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"

@@ -1,0 +1,107 @@
+"""`esp settings`: every setting with its default, its bounds, its unit and what it does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.options import JsonOption
+from esp_cli.settings_index import Section, Setting, read_index
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from esp_cli.settings_index import Value
+
+EPILOG = """Examples:\n
+    esp settings mappo\n
+    esp settings formation\n
+    esp settings gru --json -"""
+
+
+def settings(
+    of: Annotated[
+        str | None,
+        typer.Argument(
+            help="Algorithm, task (also module:Class), network, 'prior' or 'evaluation'; by default all.",
+            metavar="[ALGO|TASK|NETWORK]",
+        ),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """List the settings that --set and --config change: default, values, unit and meaning."""
+    found = _sections(of)
+    if json != "-":
+        with console.paged():
+            for section in found:
+                _print(section)
+    if json is not None:
+        console.write_json(json, found)
+
+
+def _sections(of: str | None) -> Sequence[Section]:
+    """Return the sections that a name asks for.
+
+    Raises:
+        ValueError: there is nothing of that name.
+    """
+    built_in = read_index()
+    found = [section for section in built_in if of in (None, section.name)]
+    if of is None or found:
+        return found
+    if ":" in of or of in _installed():
+        from esp_cli.commands.options import register_tasks
+        from esp_cli.training.settings import task_section
+
+        register_tasks([of])
+        return [task_section(of)]
+    from esp_cli.files.suggesting import did_you_mean
+
+    names = [section.name for section in built_in]
+    hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
+    raise ValueError(f"nothing with settings is called '{of}'{hint}")
+
+
+def _installed() -> set[str]:
+    from importlib.metadata import entry_points
+
+    return {entry.name for entry in entry_points(group="esp.tasks")}
+
+
+def _print(section: Section) -> None:
+    prefix = section.settings[0].name.partition(".")[0] if section.settings else section.name
+    chosen = {
+        "task": f"--task {section.name}",
+        "algorithm": f"--algo {section.name}",
+        "network": f"--network {section.name}",
+    }
+    title = f"{section.name}: --set {prefix}.NAME=VALUE" + (
+        f", with {chosen[section.kind]}" if section.kind in chosen else ""
+    )
+    rows = [
+        (one.name.partition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
+        for one in section.settings
+    ]
+    console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
+
+
+def _meaning(setting: Setting) -> str:
+    """Return what a setting does, and what presets and tasks set it to instead."""
+    changed = {} if "paper:" in setting.description else dict(setting.presets)
+    texts = [f"{name} {_written(value)}" for name, value in {**changed, **setting.tasks}.items()]
+    return f"{setting.description} ({'; '.join(texts)})" if texts else setting.description
+
+
+def _written(value: Value) -> str:
+    """Write a value as --set takes it."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, int | str):
+        return str(value)
+    return f"[{','.join(map(str, value))}]"

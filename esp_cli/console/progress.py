@@ -1,0 +1,147 @@
+"""Progress of one long computation: a live line on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+from rich.progress import Progress, ProgressColumn, Task
+from rich.text import Text
+
+from esp_cli.console.streams import err, note
+from esp_cli.formatting import format_count, format_duration
+
+LINE_INTERVAL_S = 10.0
+"""Seconds between two plain progress lines where standard error is no terminal."""
+RATE_WINDOW_S = 30.0
+"""Seconds over which the shown rate is averaged."""
+_WIDEST_BAR = 40
+
+
+def progress_line(description: str, share: float, status: Sequence[str], width: int) -> str:
+    """Return a line of at most `width` characters; what matters least goes first.
+
+    Args:
+        description: what is computed.
+        share: of it that is done, for the bar.
+        status: what to say, most important first: the first two stay, then come description, bar and the rest.
+        width: of the terminal.
+    """
+    said = "  ".join(status[:2])
+    head = f"{description} " if len(description) + 1 + len(said) <= width else ""
+    for item in status[2:]:
+        if len(head) + len(said) + 2 + len(item) <= width:
+            said += f"  {item}"
+    bar = min(_WIDEST_BAR, width - len(head) - len(said) - 2)
+    if bar >= 5:
+        done = round(bar * min(max(share, 0.0), 1.0))
+        head += f"{'━' * done}{'╌' * (bar - done)}  "
+    return head + said
+
+
+class LineColumn(ProgressColumn):
+    """The whole line of a task, fitted to the terminal; its status is a list in the task's field `status`."""
+
+    max_refresh = None
+
+    def render(self, task: Task) -> Text:
+        """Return the line."""
+        share = task.completed / task.total if task.total else 1.0
+        width = err.width - 1
+        return Text(progress_line(task.description, share, task.fields["status"], width), no_wrap=True, overflow="crop")
+
+
+def live_progress() -> Progress | None:
+    """Return a live display with a line per task, or None where standard error is no terminal."""
+    return Progress(LineColumn(), console=err) if err.is_terminal else None
+
+
+class TrainingProgress:
+    """Show how far a long computation is: a live bar on a terminal, elsewhere a plain line every ten seconds.
+
+        with TrainingProgress(total=500_000, num_seeds=10) as progress:
+            ...
+            progress.update(step, {"return": -131.4})
+
+    Steps are counted per seed, as `--steps` is; the rate counts the steps of all seeds together.
+    """
+
+    def __init__(
+        self,
+        total: int,
+        num_seeds: int = 1,
+        start: int = 0,
+        description: str = "train",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare to show progress from `start` (where a resumed run goes on) to `total` steps per seed."""
+        self.total = total
+        self.num_seeds = num_seeds
+        self.description = description
+        self._clock = clock
+        self._start = self._done = start
+        self._metrics: dict[str, float] = {}
+        self._history: deque[tuple[float, int]] = deque()
+        self._last_line_s = -math.inf
+        self._shown: int | None = None
+        self._live: Progress | None = None
+
+    def __enter__(self) -> TrainingProgress:
+        self._begin_s = self._clock()
+        self._history.append((self._begin_s, self._start))
+        self._live = live_progress()
+        if self._live is not None:
+            self._task = self._live.add_task(self.description, total=self.total, completed=self._start, status=[])
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+        elif self._shown not in (None, self._done):
+            self._print_line()
+
+    def update(self, done: int, metrics: Mapping[str, float] | None = None) -> None:
+        """Tell that `done` of the `total` steps per seed are behind us.
+
+        Args:
+            done: steps per seed so far, those before a resume included.
+            metrics: the latest values to show beside the bar; earlier ones stay until a new value is told.
+        """
+        now = self._clock()
+        self._done = done
+        self._metrics.update(metrics or {})
+        self._history.append((now, done))
+        while len(self._history) > 2 and now - self._history[1][0] >= RATE_WINDOW_S:
+            self._history.popleft()
+        if self._live is not None:
+            self._live.update(self._task, completed=done, status=self.parts())
+        elif now - self._last_line_s >= LINE_INTERVAL_S:
+            self._last_line_s = now
+            self._print_line()
+
+    def rate(self) -> float:
+        """Return the steps of all seeds per second over the last half minute (0 before the first update)."""
+        (first_s, first), (last_s, last) = self._history[0], self._history[-1]
+        return (last - first) * self.num_seeds / (last_s - first_s) if last_s > first_s else 0.0
+
+    def status(self) -> str:
+        """Return steps, rate, time left and metrics in one line."""
+        return "  ".join(self.parts())
+
+    def parts(self) -> list[str]:
+        """Return steps, rate and time left together, then each metric."""
+        rate = self.rate()
+        left_s = (self.total - self._done) * self.num_seeds / rate if rate > 0 else math.inf
+        return [
+            f"{format_count(self._done)}/{format_count(self.total)}  {format_count(rate)} steps/s  "
+            f"{format_duration(left_s)} left",
+            *(f"{name} {value:.4g}" for name, value in self._metrics.items()),
+        ]
+
+    def _print_line(self) -> None:
+        self._shown = self._done
+        share = self._done / self.total if self.total else 1.0
+        note(f"{self.description}  {share:4.0%}  {self.status()}")

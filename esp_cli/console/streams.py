@@ -1,0 +1,46 @@
+"""Standard output for results, standard error for the person at the screen."""
+
+from __future__ import annotations
+
+import os
+import pydoc
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.text import Text
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+def say(text: str) -> None:
+    """Print one line of result on standard output, as it is (no markup, no wrapping)."""
+    out.print(Text(text), soft_wrap=True)
+
+
+def note(text: str) -> None:
+    """Print one line for the person at the screen on standard error."""
+    err.print(Text(text), soft_wrap=True)
+
+
+def error(text: str) -> None:
+    """Print what went wrong as one line on standard error, whatever line breaks the message came with."""
+    err.print(Text.assemble(("error: ", "bold red"), " ".join(text.split())), soft_wrap=True)
+
+
+@contextmanager
+def paged() -> Iterator[None]:
+    """Show what is printed in it through the user's pager, on a terminal and where it is longer than the screen."""
+    if not (out.is_terminal and sys.stdin.isatty()):
+        yield
+        return
+    with out.capture() as captured:
+        yield
+    text = captured.get()
+    if text.count("\n") < out.height:
+        out.file.write(text)
+    else:
+        os.environ.setdefault("LESS", "-FRX")  # colours, and no empty screen behind it
+        pydoc.pager(text)

@@ -1,0 +1,117 @@
+"""What can be set, read from the models that hold the defaults: `esp settings` and the reference pages show it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from pydantic import BaseModel
+
+from esp_cli.algorithms.presets import PRESETS, TUNED, Sections
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.networks.build import NETWORKS
+from esp_cli.prior import PriorConfig
+from esp_cli.settings_index import Section, Setting
+from esp_cli.training.config import EvaluationConfig
+from esp_envs.registry import task_class, task_names
+
+_UNITS = {
+    "_m": "m",
+    "_s": "s",
+    "_rad": "rad",
+    "_steps": "steps",
+    "_horizon": "steps",
+    "_truncation": "steps",
+    "_action_delay": "steps",
+    "_episodes": "episodes",
+    "_num_epochs": "epochs",
+    "_num_envs": "worlds",
+    "_num_agents": "agents",
+    "_landmark_extent": "length",
+}
+"""Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
+
+
+def sections() -> Iterator[Section]:
+    """Yield the sections of everything that is built in: learners, tasks, networks, prior, evaluation."""
+    for name, learner in ALGORITHMS.items():
+        yield Section(name, "algorithm", _settings(name, learner.config_class))
+    for name in task_names():
+        if ":" not in name:  # a task of the caller is not built in
+            yield task_section(name)
+    for name, network in NETWORKS.items():
+        yield Section(name, "network", _settings("network", network))
+    yield Section("prior", "prior", _settings("prior", PriorConfig))
+    yield Section("evaluation", "evaluation", _settings("evaluation", EvaluationConfig))
+
+
+def task_section(name: str) -> Section:
+    """Return the settings of one task, which may be of the caller.
+
+    Raises:
+        ValueError: there is no such task.
+    """
+    return Section(name, "task", _settings("task", task_class(name).Settings))
+
+
+def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
+    """Return the settings of a model, in its order; a name that cannot be another is no setting."""
+    schema = model.model_json_schema()["properties"]
+    return tuple(
+        Setting(
+            name=f"{section}.{name}",
+            type=_type(schema[name]),
+            default=schema[name].get("default"),
+            bounds=_bounds(schema[name]),
+            unit=str(schema[name].get("unit", "")) or _unit(name),
+            description=field.description or "",
+            presets=_changes(section, name, PRESETS),
+            tasks=_changes(section, name, TUNED),
+        )
+        for name, field in model.model_fields.items()
+        if "const" not in schema[name]
+    )
+
+
+def _changes(section: str, name: str, layers: Mapping[str, Mapping[str, Sections]]) -> dict[str, Any]:
+    """Return the values that presets or tasks set; in a section that algorithms share, with the algorithm before."""
+    return {
+        layer if algorithm == section else f"{algorithm} {layer}": values[section][name]
+        for algorithm, by_layer in layers.items()
+        for layer, values in by_layer.items()
+        if name in values.get(section, {})
+    }
+
+
+def _shapes(schema: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the alternatives of a setting without null, which stands for its default."""
+    return [shape for shape in schema.get("anyOf", [schema]) if shape.get("type") != "null"]
+
+
+def _type(schema: Mapping[str, Any]) -> str:
+    words = {"boolean": "flag", "string": "text", "array": "list"}
+    found = []
+    for shape in _shapes(schema):
+        word = str(shape.get("type", "text"))
+        inner = f" of {_type(shape['items'])}s" if "items" in shape else ""
+        found.append(words.get(word, word) + inner)
+    return " or ".join(dict.fromkeys(found))
+
+
+def _bounds(schema: Mapping[str, Any]) -> str:
+    """Say which values a setting may have: "from 1", "above 0 to 1", "relu, tanh"."""
+    found = []
+    for shape in _shapes(schema):
+        if "enum" in shape:
+            found.append(", ".join(map(str, shape["enum"])))
+        elif "items" in shape:
+            inner = _bounds(shape["items"])
+            found.append(f"each {inner}" if inner else "")
+        else:
+            words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
+            found.append(" ".join(f"{word} {shape[key]:g}" for key, word in words.items() if key in shape))
+    return ", ".join(filter(None, found))
+
+
+def _unit(name: str) -> str:
+    return next((unit for ending, unit in _UNITS.items() if f"_{name}".endswith(ending)), "")

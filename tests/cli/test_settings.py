@@ -1,0 +1,101 @@
+"""`esp settings`: what it lists is what the models say, and what --set takes."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from esp_cli.settings_index import INDEX, Section, read_index
+from esp_cli.training.config import resolve_config
+from esp_cli.training.settings import task_section
+from tests.cli.running import esp, refused
+
+ROOT = Path(__file__).parents[2]
+SECTIONS = read_index()
+
+
+def test_the_index_is_that_of_the_models() -> None:
+    maker = runpy.run_path(str(ROOT / "docs" / "make_settings.py"))
+    assert INDEX.read_text(encoding="utf-8") == maker["index"](), "run python docs/make_settings.py"
+
+
+def test_every_setting_says_what_it_does() -> None:
+    silent = [one.name for section in SECTIONS for one in section.settings if len(one.description) < 3]
+    assert silent == []
+
+
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
+def test_every_default_is_what_a_run_has_without_a_preset_and_can_be_set(section: Section) -> None:
+    choice: dict[str, Any] = {"task": "navigation", "algorithm": "mappo"}
+    if section.kind in choice:
+        choice[section.kind] = section.name
+    overrides: dict[str, object] = {"network.name": section.name} if section.kind == "network" else {}
+    overrides |= {one.name: one.default for one in section.settings if one.default is not None}
+    stored = resolve_config(**choice, overrides=overrides).model_dump(mode="json")
+    key = {"algorithm": "algorithm_settings", "task": "task_settings"}.get(section.kind, section.kind)
+    for one in section.settings:
+        assert stored[key][one.name.partition(".")[2]] == one.default, one.name
+
+
+def test_bounds_units_presets_and_tasks_are_told() -> None:
+    found = {
+        one.name: one for section in SECTIONS for one in section.settings if section.name in ("mappo", "formation")
+    }
+    rate, envs, arena = found["mappo.learning_rate"], found["mappo.num_envs"], found["task.arena_m"]
+    assert (rate.type, rate.bounds, rate.presets) == ("number", "above 0", {"paper": 7e-4})
+    assert (envs.bounds, envs.unit, envs.tasks) == ("from 1", "worlds", {"formation": 8, "wildlife": 64})
+    assert (arena.bounds, arena.unit) == ("above 0 to 20", "m")
+    assert found["mappo.critic_input"].bounds == "state, observations, own"
+
+
+def test_a_bound_that_is_told_is_a_bound() -> None:
+    assert "should be greater than 0" in refused("train", "--print-config", "--set", "mappo.learning_rate=0")
+
+
+def test_the_table_and_the_json_name_every_setting_of_a_section() -> None:
+    told = esp("settings", "mappo", "--json", "-").stdout
+    names = [one["name"] for section in json.loads(told) for one in section["settings"]]
+    table = esp("settings", "mappo").stdout
+    assert names
+    assert all(name.removeprefix("mappo.") in table for name in names)
+    assert "task.num_agents" not in names
+    everything = json.loads(esp("settings", "--json", "-").stdout)
+    assert [section["name"] for section in everything] == [section.name for section in SECTIONS]
+
+
+def test_a_task_of_ones_own_has_settings_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "wide.py").write_text(
+        "from esp_envs.mpe.navigation import Navigation, NavigationSettings\n"
+        "from pydantic import Field\n\n"
+        "class WideSettings(NavigationSettings):\n"
+        "    slope_rad: float = Field(0.5, ge=0, description='of the ground')\n\n"
+        "class Wide(Navigation):\n"
+        "    Settings = WideSettings\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    (section,) = json.loads(esp("settings", "wide:Wide", "--json", "-").stdout)
+    (slope,) = [one for one in section["settings"] if one["name"] == "task.slope_rad"]
+    assert (slope["default"], slope["unit"], slope["bounds"]) == (0.5, "rad", "from 0")
+    assert task_section("wide:Wide").kind == "task"
+
+
+def test_a_name_without_settings_is_one_sentence() -> None:
+    assert refused("settings", "mapo") == "nothing with settings is called 'mapo'; did you mean 'mappo'?"
+    assert "there is mappo, maddpg, qmix, navigation" in refused("settings", "colour")
+
+
+def test_the_list_needs_no_torch() -> None:
+    code = (
+        "import sys; from esp_cli.app import app\n"
+        "try: app(['settings', 'mappo'])\n"
+        "except SystemExit as end: assert end.code == 0\n"
+        "assert 'torch' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
