@@ -118,7 +118,7 @@ class Lines:
 
     def _setting_line(self, rng: random.Random) -> list[str]:
         """Return a training command with one bad setting."""
-        task, algorithm, network = rng.choice(task_names()), rng.choice(list(ALGORITHMS)), rng.choice(list(NETWORKS))
+        task, algorithm, network = rng.choice(_tasks()), rng.choice(list(ALGORITHMS)), rng.choice(list(NETWORKS))
         words = ["train", "--task", task, "--algo", algorithm, "--network", network, "--steps", "100", "--out", "out"]
         section = rng.choice(["task", algorithm, "network", "prior", "evaluation"])
         model = self.settings[{"task": f"task {task}", "network": f"network {network}"}.get(section, section)]
@@ -128,9 +128,14 @@ class Lines:
         return [*words, "--set", f"{section}.{name}={_bad_setting(model, name, rng)}"]
 
 
+def _tasks() -> list[str]:
+    """Return the tasks of every installation; the kills register one of their own."""
+    return [name for name in task_names() if ":" not in name]
+
+
 def _settings() -> Iterator[tuple[str, type[BaseModel]]]:
     yield from ((name, cls.config_class) for name, cls in ALGORITHMS.items())
-    yield from ((f"task {name}", task_class(name).Settings) for name in task_names())
+    yield from ((f"task {name}", task_class(name).Settings) for name in _tasks())
     yield from ((f"network {name}", cls) for name, cls in NETWORKS.items())
     yield from (("prior", PriorConfig), ("evaluation", EvaluationConfig))
 

@@ -7,9 +7,11 @@ import pytest
 from esp_cli.files import writing
 from esp_cli.training import run_folder
 from tests.torture.files import KINDS, Files
+from tests.torture.forks import fork, wait
 from tests.torture.kills import Kills
 from tests.torture.lines import Lines
 from tests.torture.record import Record
+from tests.torture.studies import forked_study, kill_members, real_study, study_state
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +48,20 @@ def test_runs_that_were_killed_end_as_runs_that_were_not(kills, monkeypatch, tmp
     monkeypatch.chdir(tmp_path)
     assert [kills.run(number) for number in range(4)] == [None] * 4
     assert kills.count() >= 4
+
+
+@pytest.mark.slow  # two real processes a round import everything
+def test_a_study_of_real_processes_loses_nothing_when_any_or_all_of_them_are_killed(tmp_path):
+    whole, path = tmp_path / "whole" / "study", tmp_path / "killed" / "study"
+    for folder in (whole, path):
+        folder.parent.mkdir()
+    assert wait(fork(lambda: forked_study(whole), whole)) == 0
+    checkpoint = "runs/*/checkpoints/step-*"
+    assert kill_members(real_study, path, "job", "KILL", lambda members: any(path.glob(checkpoint))) == 1
+    assert kill_members(real_study, path, "parent", "KILL", lambda members: len(members) > 1) == -9
+    assert kill_members(real_study, path, "all", "KILL", lambda members: len(members) > 1) == -9
+    assert wait(fork(lambda: real_study(path), path)) == 0
+    assert study_state(path) == study_state(whole)
 
 
 def test_a_run_folder_that_forgets_a_checkpoint_is_found(kills, monkeypatch, tmp_path):

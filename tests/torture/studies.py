@@ -1,0 +1,139 @@
+"""Studies of two runs at once, whose scheduler, any job, or everything is killed; jobs are forks or real processes."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import random
+import signal
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from esp_cli import app
+from esp_cli.files import faults
+from esp_cli.studies.catalogue import plan
+from esp_cli.studies.engine import Engine
+from esp_cli.studies.engine_local import LocalEngine, follow_parent
+from esp_cli.studies.scheduler import Scheduler
+from esp_cli.studies.study import StudyFolder
+from esp_cli.training import trainer
+from tests.benchmarks.growth import family
+from tests.studies.small_studies import request
+from tests.torture.forks import PATIENCE_S, Job, fork, wait
+from tests.torture.runs import run_state
+
+TARGETS = ("parent", "job", "all")
+
+
+def study_job(path: Path, engine: Engine) -> None:
+    """Run a small study, or go on with it, two runs at once."""
+    trainer.CHECKPOINT_SECONDS = trainer.CHECKPOINT_SPACING = 0
+    os.environ["ESP_CHECKPOINT_SECONDS"] = "0"  # of real processes
+    folder = StudyFolder.create(
+        path, plan("table1", request(tasks=("navigation",), seeds=(0, 1), steps=((None, 200),)))
+    )
+    with folder.lock():
+        scheduler = Scheduler(folder, folder.study.cells, 2, engine)
+        scheduler.run(lambda snapshot: True, 0.02)
+    failed = [run.message for run in scheduler.runs if run.status != "finished"]
+    if failed:
+        print(f"runs failed: {'; '.join(failed)}")
+        raise SystemExit(1)
+
+
+def forked_study(path: Path) -> None:
+    """Run the study with jobs that are forks, which takes a second."""
+    study_job(path, ForkEngine())
+
+
+def real_study(path: Path) -> None:
+    """Run the study as `esp reproduce` does, every job a process that imports everything."""
+    study_job(path, LocalEngine())
+
+
+def kill_some(rng: random.Random, job: Job, path: Path, seconds: float) -> tuple[str, int]:
+    """Start a study and kill a part of it at a random moment; return how, and the exit code of its scheduler."""
+    target, name = rng.choice(TARGETS), rng.choice(("KILL", "KILL", "TERM", "INT"))
+    end = time.monotonic() + rng.uniform(0, seconds * 1.2)
+    return f"{target} {name}", kill_members(job, path, target, name, lambda members: time.monotonic() > end)
+
+
+def kill_members(job: Job, path: Path, target: str, name: str, is_due: Callable[[list[int]], bool]) -> int:
+    """Start a study; when due, signal its scheduler, its newest job, or everything.
+
+    Args:
+        job: the study.
+        path: its folder.
+        target: one of TARGETS.
+        name: of the signal.
+        is_due: whether it is time, told the numbers of all its processes.
+
+    Returns:
+        The scheduler's exit code.
+    """
+    members, end = [fork(lambda: job(path), path)], time.monotonic() + PATIENCE_S
+    while not is_due(members) and time.monotonic() < end:
+        time.sleep(0.002)
+        members = list(family(members[0]))
+    for member in {"parent": members[:1], "job": members[1:][-1:], "all": members}[target]:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(member, getattr(signal, f"SIG{name}"))
+    return wait(members[0])
+
+
+def study_state(path: Path) -> str:
+    """Return a digest of what a study leaves: its runs and their final evaluations."""
+    folder = StudyFolder.open(path)
+    digest = hashlib.sha256((path / "study.json").read_bytes())
+    for cell in folder.study.cells:
+        digest.update(run_state(folder.run_path(cell)).encode())
+        text = folder.evaluation_path(cell).read_text().replace(str(path), "")
+        digest.update(text.encode())
+    return digest.hexdigest()
+
+
+class ForkEngine:
+    """Starts the jobs of a study as forks of its process."""
+
+    def start(self, arguments: Sequence[str], log: Path) -> ForkJob:
+        """Start one; it is told to stop when its parent ends."""
+        os.environ["ESP_PARENT_PROCESS"] = str(os.getpid())
+
+        def job() -> None:
+            os.closerange(3, 256)  # the lock of the study is not theirs
+            follow_parent()
+            faults.planned = None
+            app.app(list(arguments))
+
+        return ForkJob(fork(job, log.parent, log), log)
+
+
+class ForkJob:
+    """A fork that runs one command line; see `LocalJob`."""
+
+    def __init__(self, pid: int, log: Path) -> None:
+        self.pid, self.log, self._code = pid, log, None
+
+    def poll(self) -> int | None:
+        """Return the exit code, or None while it runs."""
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def ask_to_stop(self) -> None:
+        """Ask it to end after its iteration."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
+            self._code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+
+    def last_words(self) -> str:
+        """Return the end of its log."""
+        return self.log.read_text(errors="replace")[-300:]
