@@ -288,4 +288,6 @@ def _same(a: Tensor, b: Tensor) -> bool:
     """Return whether two tensors are equal bit for bit, NaN included."""
     if a.dtype != b.dtype or a.shape != b.shape:
         return False
-    return torch.equal(a.cpu().reshape(-1).view(torch.uint8), b.cpu().reshape(-1).view(torch.uint8))
+    # a part of a longer buffer has strides that no view as bytes can have
+    a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
+    return torch.equal(a, b)
