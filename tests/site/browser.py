@@ -22,7 +22,8 @@ FRAMES = """<!doctype html><meta charset="utf-8"><body>
 window.onload = () => {{
   const found = [];
   for (const frame of document.querySelectorAll("iframe")) {{
-    const page = frame.contentDocument, root = page.documentElement, say = text => found.push(frame.title + ": " + text);
+    const page = frame.contentDocument, root = page.documentElement;
+    const say = text => found.push(frame.title + ": " + text);
     if (!page.querySelector("h1")) say("has no heading");
     if (root.scrollWidth > root.clientWidth) say("is " + (root.scrollWidth - root.clientWidth) + " px too wide");
     for (const picture of page.images) if (!picture.naturalWidth) say("does not show " + picture.getAttribute("src"));

@@ -1,4 +1,4 @@
-"""The built site: every link leads somewhere, nothing is loaded from elsewhere, and a browser shows every page whole."""
+"""The built site: links lead somewhere, nothing is loaded from elsewhere, and a browser shows every page whole."""
 
 from __future__ import annotations
 
