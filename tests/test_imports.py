@@ -25,6 +25,7 @@ RANKS = {
     "formatting": 0,
     "settings_index": 0,
     "console": 0.5,
+    "trackers": 0.5,
     "symmetry": 1,
     "prior": 2,
     "networks": 2,
