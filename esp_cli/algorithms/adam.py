@@ -81,7 +81,9 @@ class SeedAdam:
     def gradient(self, loss: Tensor) -> Tensor:
         """Return the gradients [S, P] of the losses [S] of all seeds."""
         parameters = self.parameters.parameters
-        gradients = torch.autograd.grad(loss.sum(), parameters, allow_unused=True, materialize_grads=True)
+        gradients = torch.autograd.grad(
+            loss, parameters, torch.ones_like(loss), allow_unused=True, materialize_grads=True
+        )
         return self.parameters.flat(gradients)
 
     @torch.no_grad()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import islice
 
 import torch
 from torch import Tensor, nn
@@ -126,7 +127,7 @@ class SeedMLP(nn.Module):
         return torch.cat(idle, 1).float().mean(1)
 
     def _from_layer(self, first: int, x: Tensor) -> Tensor:
-        parameters = [p for layer in self.layers[first:] for p in (layer.weight, layer.bias)]
+        parameters = [p for layer in islice(self.layers, first, None) for p in (layer.weight, layer.bias)]
         return _Perceptron.apply(  # type: ignore[no-untyped-call]
             x, self.activation, self.activate_output, self.precision, *parameters
         )
@@ -151,32 +152,38 @@ class _Perceptron(Function):
 
     @staticmethod
     def forward(ctx, x, activation, activate_output, precision, *parameters):  # type: ignore[no-untyped-def]
-        ctx.dtype, x = x.dtype, x.to(precision)
-        inputs, weights, last = [x], [w.to(precision) for w in parameters[::2]], len(parameters) // 2 - 1
-        for k in range(last + 1):
-            x = affine(parameters[2 * k + 1].to(precision), x, weights[k])
-            if k < last or activate_output:
-                inputs.append(activate_(x, activation))
+        ctx.dtype, ctx.rounds = x.dtype, precision != torch.float32
+        if ctx.rounds:
+            x, parameters = x.to(precision), tuple(p.to(precision) for p in parameters)
+        inputs, weights, biases = [x], parameters[::2], parameters[1::2]
+        last = len(weights) - (0 if activate_output else 1)
+        for bias, weight in zip(biases[:last], weights, strict=False):
+            inputs.append(_hidden(bias, inputs[-1], weight, activation))
+        x = inputs[-1] if activate_output else affine(biases[-1], inputs[-1], weights[-1])
         ctx.save_for_backward(*inputs, *weights)
         ctx.activation, ctx.activate_output = activation, activate_output
-        return x.float()
+        return x.float() if ctx.rounds else x
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         saved = ctx.saved_tensors
         count = (len(saved) - 1) // 2 if ctx.activate_output else len(saved) // 2
         inputs, weights = saved[:-count], saved[-count:]
-        grad = grad.to(weights[0].dtype)
+        if ctx.rounds:
+            grad = grad.to(weights[0].dtype)
         if ctx.activate_output:
             grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
         grads: list[Tensor | None] = [None] * (2 * count)
         for k in reversed(range(count)):
             if ctx.needs_input_grad[4 + 2 * k]:  # not where a critic only passes a gradient on to the actor
-                grads[2 * k] = _outer(inputs[k], grad).float()
-                grads[2 * k + 1] = grad.sum(1, keepdim=True).float()
+                grads[2 * k] = _outer(inputs[k], grad)
+                grads[2 * k + 1] = grad.sum(1, keepdim=True)
             if k > 0:
                 grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
-        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)).to(ctx.dtype) if ctx.needs_input_grad[0] else None
+        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)) if ctx.needs_input_grad[0] else None
+        if ctx.rounds:
+            grads = [None if g is None else g.float() for g in grads]
+            grad_x = None if grad_x is None else grad_x.to(ctx.dtype)
         return grad_x, None, None, None, *grads
 
 
@@ -188,13 +195,22 @@ THIN = 16
 # otherwise than the batched product that several seeds take.
 
 
-def affine(bias: Tensor, x: Tensor, weight: Tensor) -> Tensor:
-    """Return x W + b [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost in memory."""
+def affine(bias: Tensor, x: Tensor, weight: Tensor, scale: float = 1.0) -> Tensor:
+    """Return scale (x W + b) [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost."""
     if weight.shape[-1] >= THIN:
-        return torch.baddbmm(bias, x, weight)
+        return torch.baddbmm(bias, x, weight, beta=scale, alpha=scale)
     if weight.shape[-1] == 1:
-        return affine(pad(bias, (0, 1)), x, pad(weight, (0, 1)))[..., :1]
-    return torch.baddbmm(bias.transpose(1, 2), weight.transpose(1, 2), x.transpose(1, 2)).transpose(1, 2)
+        return affine(pad(bias, (0, 1)), x, pad(weight, (0, 1)), scale)[..., :1]
+    return torch.baddbmm(
+        bias.transpose(1, 2), weight.transpose(1, 2), x.transpose(1, 2), beta=scale, alpha=scale
+    ).transpose(1, 2)
+
+
+def _hidden(bias: Tensor, x: Tensor, weight: Tensor, activation: str) -> Tensor:
+    """Return act(x W + b)."""
+    if activation == "relu" or x.dtype == torch.bfloat16:
+        return activate_(affine(bias, x, weight), activation)
+    return _tanh_from_sigmoid_(affine(bias, x, weight, 2.0).sigmoid_())
 
 
 def _outer(x: Tensor, grad: Tensor) -> Tensor:
@@ -212,7 +228,14 @@ def activate_(x: Tensor, activation: str) -> Tensor:
         return torch.relu_(x)
     if x.dtype == torch.bfloat16:  # too coarse around s(0) = 1/2
         return x.copy_(activate_(x.float(), activation))
-    return x.mul_(2).sigmoid_().mul_(2).sub_(1)
+    return _tanh_from_sigmoid_(x.mul_(2).sigmoid_())
+
+
+_MINUS_ONE = torch.tensor(-1.0)
+
+
+def _tanh_from_sigmoid_(x: Tensor) -> Tensor:
+    return torch.add(_MINUS_ONE, x, alpha=2, out=x)
 
 
 def _activation_backward(grad: Tensor, output: Tensor, activation: str) -> Tensor:
@@ -220,90 +243,3 @@ def _activation_backward(grad: Tensor, output: Tensor, activation: str) -> Tenso
     if activation == "relu":
         return torch.ops.aten.threshold_backward.grad_input(grad, output, 0, grad_input=grad)
     return torch.ops.aten.tanh_backward.grad_input(grad, output, grad_input=grad)
-
-
-class SeedGRU(nn.Module):
-    """A gated recurrent unit (Cho et al., 2014) for S seeds.
-
-    r = s(x W_r + h U_r), z = s(x W_z + h U_z), n = tanh(x W_n + r * (h U_n + b_n)), h' = (1 - z) n + z h.
-    """
-
-    def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int) -> None:
-        super().__init__()
-        self.hidden = hidden
-        self.input = SeedLinear(generators, inputs, 3 * hidden, 1.0)
-        self.recurrent = SeedLinear(generators, hidden, 3 * hidden, 1.0)
-
-    def forward(self, x: Tensor, h: Tensor) -> Tensor:
-        """Advance one step: x [S, B, in], h [S, B, H] -> h' [S, B, H]."""
-        return self.advance(self.input(x), h)
-
-    def advance(self, projected: Tensor, h: Tensor) -> Tensor:
-        """Advance one step from the already projected input [S, B, 3H]."""
-        xr, xz, xn = projected.chunk(3, -1)
-        hr, hz, hn = self.recurrent(h).chunk(3, -1)
-        reset, update = torch.sigmoid(xr + hr), torch.sigmoid(xz + hz)
-        candidate = torch.tanh(torch.addcmul(xn, reset, hn))
-        return torch.lerp(candidate, h, update)
-
-    def unroll(self, projected: Tensor, truncation: int = 0) -> Tensor:
-        """Advance through whole episodes from empty memory: [T, S, B, 3H] -> every memory [T, S, B, H].
-
-        The same as `advance` step by step, with a backward written by hand that works in place and makes one product
-        for the gradient of the weights of all steps; gradients through time are cut every `truncation` steps (0:
-        never).
-        """
-        weight, bias = self.recurrent.weight, self.recurrent.bias
-        return _Unrolled.apply(projected, weight, bias, truncation)  # type: ignore[no-untyped-call]
-
-
-class _Unrolled(Function):
-    """All steps of a gated recurrent unit; `SeedGRU.advance` under autograd is the reference in the tests."""
-
-    @staticmethod
-    def forward(ctx, projected, weight, bias, truncation):  # type: ignore[no-untyped-def]
-        num_steps, num_seeds, batch, width = projected.shape
-        hidden = width // 3
-        memories = projected.new_zeros(num_steps + 1, num_seeds, batch, hidden)
-        gates = torch.empty_like(projected, memory_format=torch.contiguous_format)  # r, z, n of every step
-        inner = torch.empty_like(memories[1:])  # h U_n + b_n of every step
-        recurrent = torch.empty_like(gates[0])  # h U + b
-        for t in range(num_steps):
-            memory, x, gate = memories[t], projected[t], gates[t]
-            opened, candidate = gate[..., : 2 * hidden], gate[..., 2 * hidden :]
-            torch.baddbmm(bias, memory, weight, out=recurrent)
-            torch.add(x[..., : 2 * hidden], recurrent[..., : 2 * hidden], out=opened).sigmoid_()
-            inner[t].copy_(recurrent[..., 2 * hidden :])
-            reset, update = opened.chunk(2, -1)
-            torch.addcmul(x[..., 2 * hidden :], reset, inner[t], out=candidate)
-            activate_(candidate, "tanh")
-            torch.lerp(candidate, memory, update, out=memories[t + 1])
-        ctx.save_for_backward(memories, gates, inner, weight)
-        ctx.truncation = truncation
-        return memories[1:]
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        memories, gates, inner, weight = ctx.saved_tensors
-        num_steps, hidden = grad.shape[0], grad.shape[3]
-        into, back = torch.empty_like(gates), torch.empty_like(gates)  # of x W and of h U + b
-        backwards, carry = weight.transpose(1, 2), torch.zeros_like(memories[0])
-        passed, gap = torch.empty_like(carry), torch.empty_like(carry)
-        for t in reversed(range(num_steps)):
-            reset, update, candidate = gates[t].chunk(3, -1)
-            opening, inward = into[t, ..., : 2 * hidden], into[t, ..., 2 * hidden :]
-            carry += grad[t]
-            torch.mul(carry, update, out=passed)
-            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=inward)
-            torch.mul(inward, inner[t], out=opening[..., :hidden])
-            torch.mul(torch.sub(memories[t], candidate, out=gap), carry, out=opening[..., hidden:])
-            torch.ops.aten.sigmoid_backward.grad_input(opening, gates[t, ..., : 2 * hidden], grad_input=opening)
-            back[t, ..., : 2 * hidden].copy_(opening)
-            torch.mul(inward, reset, out=back[t, ..., 2 * hidden :])
-            if ctx.truncation and t % ctx.truncation == 0:
-                carry.zero_()
-            else:
-                torch.baddbmm(passed, back[t], backwards, out=carry)
-        rows = back.transpose(0, 1).flatten(1, 2)
-        before = memories[:-1].transpose(0, 1).flatten(1, 2)
-        return into, torch.bmm(before.transpose(1, 2), rows), rows.sum(1, keepdim=True), None

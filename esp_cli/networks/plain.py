@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.networks.layers import GAINS, SeedGRU, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.recurrent import SeedGRU
 
 
 class PlainConfig(NetworkConfig):

@@ -53,8 +53,20 @@ class Copies(Generic[Rows]):
         parts = [self.originals, *(copy if self.adapt is None else self.adapt(copy) for copy in made)]
         return type(self.originals).concatenate(parts)
 
+    @cached_property
+    def obs(self) -> Tensor:
+        """The observations of `rows` alone."""
+        return self._pushed(self.originals.obs, lambda g: g.obs)
+
+    @cached_property
+    def state(self) -> Tensor:
+        """The states of `rows` alone."""
+        return self._pushed(self.originals.state, lambda g: g.state)
+
     def chunks(self, size: int) -> list[Copies[Rows]]:
         """Cut the originals into pieces of at most `size`, each with its own copies."""
+        if size >= self.originals.count:
+            return [self]
         parts = self.originals.chunks(size)
         return [Copies(self.config, part, self.transforms, self.augments, self.adapt) for part in parts]
 
@@ -110,6 +122,9 @@ class Copies(Generic[Rows]):
                 value, lambda g, moved, here: value_consistency_loss(g.values(moved), here, stop)
             )
         return gaps
+
+    def _pushed(self, x: Tensor, push: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
+        return torch.cat([x, *(push(g)(x) for g in self.transforms)], 1) if self.transforms else x
 
     def _mean(self, x: Tensor, gap: Callable[[Transform, Tensor, Tensor], Tensor]) -> Tensor:
         """Return the mean [S] over the copies of the gap between each and the originals."""

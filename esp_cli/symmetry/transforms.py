@@ -209,6 +209,7 @@ class TransformSet:
         # Built once where it fits: a draw is then a selection.
         stacked = 0 < self.size <= _STACK_LIMIT
         self._stack = self._build(self._elements) if stacked else None
+        self._singles: dict[int, Transform] = {}
 
     def draw(self, generators: Sequence[torch.Generator]) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
@@ -223,9 +224,9 @@ class TransformSet:
         if self._group is not None:
             return self._build([_draw_moving(self._group, g) for g in generators])
         picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
-        if self._stack is not None:
-            return self._stack.select(picks)
-        return self._build([self._elements[i] for i in picks])
+        if self._stack is None:
+            return self._build([self._elements[i] for i in picks])
+        return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
 
     def each(self) -> list[Transform]:
         """Return every element in order, each the same for all seeds.
@@ -236,8 +237,15 @@ class TransformSet:
         if not self.is_finite:
             raise ValueError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
         if self._stack is not None:
-            return [self._stack.select([i]) for i in range(self.size)]
+            return [self._single(i) for i in range(self.size)]
         return [self._build([e]) for e in self._elements]
+
+    def _single(self, index: int) -> Transform:
+        """Return one element of the stack, selected once."""
+        assert self._stack is not None
+        if index not in self._singles:
+            self._singles[index] = self._stack.select([index])
+        return self._singles[index]
 
     def _build(self, elements: Sequence[Element]) -> Transform:
         return build_transform(elements, self.spaces, self.device, self.dtype)

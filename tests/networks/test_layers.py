@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from esp_cli.networks.build import NETWORKS, build_network
-from esp_cli.networks.layers import SeedGRU, SeedMLP, orthogonal
+from esp_cli.networks.layers import SeedMLP, orthogonal
+from esp_cli.networks.recurrent import SeedGRU
 from tests.networks.gradients import assert_same_gradients
 
 

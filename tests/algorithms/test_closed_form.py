@@ -1,0 +1,147 @@
+"""The losses with gradients worked out by hand against the same losses in the terms of the paper, under autograd."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from esp_cli.algorithms import closed_form
+from esp_cli.algorithms.closed_form import Weights, carries, critic_loss, policy_loss
+from esp_cli.symmetry import transform_set
+from esp_envs import Field, Kind, Spaces, layout
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
+from tests.algorithms.test_mappo import learner
+
+WEIGHTS = Weights(
+    clip_epsilon=0.2,
+    entropy_coef=0.0,
+    huber_delta=10.0,
+    value_coef=1.0,
+    policy_gap=0.0,
+    value_gap=0.0,
+    augments=True,
+    stop_gradient="none",
+)
+SPACES = Spaces(
+    num_agents=2,
+    observation=layout(Field("velocity", Kind.VECTOR)),
+    state=layout(Field("velocity", Kind.VECTOR)),
+    action=Discrete(Kind.VECTOR, (RIGHT, UP, LEFT, DOWN), ("right", "up", "left", "down")),
+    symmetry="d4*agents",
+)
+
+
+def weights(**changes):
+    return dataclasses.replace(WEIGHTS, **changes)
+
+
+def gradients(trained, reference):
+    """Return the loss and the gradients of a minibatch, by the closed form or by the reference.
+
+    The networks are far from their first weights, where the policy is uniform and the entropy has no gradient.
+    """
+    trained.iterate(0.0)
+    trained.optimiser.parameters.buffer.mul_(1.5)
+    last = list(trained.policy.actor.parameters())[-2]
+    last.data.mul_(50)
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    copies = trained.prior.copies(trained._minibatches(batch)[0], trained.generators["prior"])
+    assert carries(copies.transforms)
+    loss = (trained.reference_loss if reference else trained._loss)(copies, 0.01, 1.0, None)
+    gradient, size = trained.optimiser.gradient(loss), sum(p[0].numel() for p in trained.policy.parameters())
+    return loss.detach(), gradient[:, :size], gradient[:, size:]
+
+
+def gap(ours, theirs):
+    """Return the largest difference in units of the largest number."""
+    return ((ours - theirs).abs().max() / theirs.abs().max()).item()
+
+
+CHOICES = [
+    {"prior__kind": "none"},
+    {"prior__kind": "esp"},
+    {"prior__kind": "esp", "prior__copies": "all", "prior__transforms": "c4"},
+    {"prior__kind": "augment", "prior__transforms": "rot90"},
+    {"prior__kind": "consistency", "prior__consistency_coef": 3.0},
+    {"prior__kind": "esp", "prior__stop_gradient": "original", "prior__consistency_coef": 3.0},
+    {"prior__kind": "esp", "prior__stop_gradient": "transformed", "prior__copies": "all"},
+    {"prior__kind": "consistency", "prior__terms": "policy"},
+    {"prior__kind": "consistency", "prior__terms": "value"},
+    {"prior__kind": "esp", "network__name": "gru", "mappo__critic_input": "own"},
+    {"prior__kind": "esp", "task__convention": "pettingzoo", "mappo__critic_input": "state"},
+]
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_the_closed_form_is_the_reference_to_rounding(choice):
+    loss, *ours = gradients(learner(**choice), reference=False)
+    expected_loss, *theirs = gradients(learner(**choice), reference=True)
+    torch.testing.assert_close(loss, expected_loss, rtol=1e-4, atol=1e-5)
+    assert max(map(gap, ours, theirs)) < 1e-4
+
+
+@pytest.mark.parametrize("change", ["entropy_coef", "policy_gap", "value_gap", "value_coef", "augments"])
+def test_each_term_of_the_closed_form_moves_the_gradient(change, monkeypatch):
+    """The negative control of the comparison above."""
+    _, *theirs = gradients(learner(), reference=True)
+    monkeypatch.setattr("esp_cli.algorithms.closed_form.Weights", lambda **k: Weights(**k | {change: k[change] * 0}))
+    _, *ours = gradients(learner(), reference=False)
+    assert max(map(gap, ours, theirs)) > 3e-3
+
+
+@pytest.mark.parametrize(
+    ("advantage", "old", "slope"),
+    # pi(a) = 1/2; the ratio is 1/2 / old, and the objective's slope by log pi is rho A, or 0 where it is clipped
+    [(1.0, 0.5, 1.0), (1.0, 0.25, 0.0), (1.0, 1.0, 0.5), (-1.0, 0.25, -2.0), (-1.0, 1.0, 0.0)],
+)
+def test_the_clipped_objective_by_hand(advantage, old, slope):
+    logits = torch.zeros(1, 1, 1, 1, 2, requires_grad=True)
+    old, advantage = (torch.full((1, 1, 1, 1), number) for number in (old, advantage))
+    action = torch.zeros(1, 1, 1, 1, dtype=torch.int64)
+    loss = policy_loss(logits, [], action, old.log(), advantage, weights())
+    ratio = 0.5 / old
+    torch.testing.assert_close(-loss, torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).view(1))
+    (grad,) = torch.autograd.grad(loss.sum(), logits)
+    # d log pi_0 / d logits = (1 - 1/2, -1/2)
+    torch.testing.assert_close(grad.flatten(), torch.tensor([-slope / 2, slope / 2]))
+
+
+def test_the_copies_of_a_policy_that_turns_with_the_world_have_no_divergence_and_others_have():
+    (turn,) = transform_set("rot90", SPACES).each()
+    here = torch.tensor([0.5, 0.25, 0.125, 0.125]).log()
+    ahead = turn.push_outputs(here.view(1, 1, 1, 4)).view(4)
+    none = torch.zeros(1, 1, 1, 1)
+    # pulled back, the copy says 1/4, 1/8, 1/8, 1/2: its divergence is (-1/4 - 1/8 + 1) log 2
+    for there, gap in ((ahead, 0.0), (here, 0.625 * math.log(2))):
+        logits = torch.stack([here, there]).view(1, 2, 1, 1, 4)
+        loss = policy_loss(logits, [turn], none.long(), here[:1].view(1, 1, 1, 1), none, weights(policy_gap=1.0))
+        assert loss.item() == pytest.approx(gap, abs=1e-6)
+
+
+def test_the_critics_loss_by_hand():
+    values = torch.tensor([1.0, 2.0, 1.0, 4.0]).view(1, 4, 1, 1).requires_grad_()
+    target = torch.tensor([0.0, 2.0]).view(1, 2, 1, 1)
+    loss = critic_loss(values, target, weights(huber_delta=1.0, value_gap=0.5))
+    # Huber: 1/2, 0 of the originals, 1/2, 2 - 1/2 of the copies; gaps 0 and 2
+    assert loss.item() == pytest.approx(2.5 / 4 + 0.5 * 4 / 2)
+    (grad,) = torch.autograd.grad(loss.sum(), values)
+    assert grad.flatten().tolist() == [0.25, -1.0, 0.25, 0.25 + 1.0]
+
+
+def test_copies_whose_agents_change_places_take_the_reference():
+    assert carries(learner(prior__transforms="d4").prior.transforms.each())
+    assert not carries(learner(prior__transforms="agents").prior.transforms.each())
+
+
+def test_default_training_takes_the_closed_form_and_clipped_values_do_not(monkeypatch):
+    calls = []
+    monkeypatch.setattr(
+        "esp_cli.algorithms.mappo.policy_loss", lambda *a: calls.append(1) or closed_form.policy_loss(*a)
+    )
+    learner(mappo__clip_value=True).iterate(0.0)
+    assert not calls
+    learner().iterate(0.0)
+    assert calls
