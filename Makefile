@@ -45,7 +45,7 @@ docs: $(VENV)/.installed-test ## check the documentation: links lead somewhere, 
 	$(BIN)/python -m pytest tests/test_docs.py
 
 site: $(VENV)/.installed-dev ## build the site of the documentation into site/, for reading without a network
-	$(BIN)/python -m mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 	@echo "Open site/index.html"
 
 torture: $(VENV)/.installed-test ## kill, spoil and mistype for MINUTES (10); SEED chooses the cases, RECORD goes on

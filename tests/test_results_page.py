@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from esp_cli.evaluation.statistics import mean_and_sem
 from esp_cli.reporting.pages import files_of, filled
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.tables import TABLES
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if files_of(page)]
-FILES = sorted({page.parent / file for page in PAGES for file in files_of(page)})
+FILES = sorted({(page.parent / file).resolve() for page in PAGES for file in files_of(page)})
 LARGEST_BYTES = 200_000
 
 
@@ -34,16 +36,48 @@ def test_a_file_is_small_and_says_what_made_it(file: Path) -> None:
         assert all(len(values) == len(cell.seeds) for values in cell.returns.values())
 
 
-def test_the_results_page_is_among_them() -> None:
-    assert DOCS / "results.md" in PAGES
+def test_the_measurements_are_among_them() -> None:
+    names = {page.stem for page in PAGES if page.parent == DOCS / "measurements"}
+    assert names >= {"learners", "long-runs", "parts", "coefficient", "transforms"}
 
 
 def test_a_number_changed_by_hand_is_noticed(tmp_path: Path) -> None:
-    page = DOCS / "results.md"
+    page = DOCS / "measurements" / "coefficient.md"
     text = page.read_text(encoding="utf-8")
-    number = next(cell for row in TABLES["returns"](read_results(FILES[0])).rows for cell in row if "±" in cell)
+    results = read_results(DOCS / "measured" / "ablate-coefficient.json")
+    number = next(cell for row in TABLES["returns"](results).rows for cell in row if "±" in cell)
     assert number in text
-    copy = tmp_path / "results.md"
+    (tmp_path / "pages").mkdir()
+    copy = tmp_path / "pages" / "coefficient.md"
     copy.write_text(text.replace(number, "-99.99 ± 0.01"), encoding="utf-8")
     (tmp_path / "measured").symlink_to(DOCS / "measured")
     assert filled(copy) == text
+
+
+def readme_rows(text: str) -> dict[tuple[str, str], str]:
+    """Return the returns of the table in the README by learner and task."""
+    header, _, *rows = re.findall(r"^\|(.*)\|$", text[text.index("| | navigation") :], re.MULTILINE)
+    tasks = [cell.strip() for cell in header.split("|")[1:]]
+    found = {}
+    for row in rows[:8]:
+        name, *cells = (cell.strip() for cell in row.split("|"))
+        found |= {(name, task): cell for task, cell in zip(tasks, cells, strict=True)}
+    return found
+
+
+def measured_rows() -> dict[tuple[str, str], str]:
+    """Return the same from the results file."""
+    found = {}
+    for cell in read_results(DOCS / "measured" / "table1.json").cells:
+        task = cell.panel.split(",")[0]
+        mean, sem = mean_and_sem(cell.returns["greedy"])
+        found[cell.variant.replace("-ESP", " with the prior"), task] = f"{mean:.2f} ± {sem:.2f}"
+        if cell.variant == "MAPPO":
+            by_hand = max(value for policy, value in cell.anchors.items() if policy != "random")
+            found["random policy", task] = f"{cell.anchors['random']:.0f}"
+            found["best hand-written policy", task] = f"{by_hand:.0f}"
+    return found
+
+
+def test_the_table_of_the_readme_says_what_the_file_says() -> None:
+    assert readme_rows((DOCS.parent / "README.md").read_text(encoding="utf-8")) == measured_rows()

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Iterable, Iterator
-from typing import Any, get_args
+from typing import Any
 
 import typer
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 
-from esp_cli.algorithms.presets import PRESETS, TUNED
-from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.app import app
-from esp_cli.networks.build import NETWORKS
-from esp_cli.prior import PriorConfig
+from esp_cli.settings_index import Setting, read_index
 from esp_cli.symmetry import carried_groups
-from esp_cli.training.config import EvaluationConfig
 from esp_envs.registry import make, task_class, task_names
-
-_BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 
 
 def pages() -> dict[str, str]:
@@ -57,59 +50,35 @@ def _option(parameter: Any) -> tuple[str, str, str]:
 
 
 def settings() -> str:
-    """Return the page of all settings with default, the paper's value, bounds and meaning."""
+    """Return the page of all settings, as `esp settings` lists them."""
     text = (
-        "# Settings\n\n`--set SECTION.NAME=VALUE` changes one setting; `--preset paper` takes the paper's values."
-        " A cell of *paper* is empty where the paper's value is the default.\n"
+        "# Settings\n\n`--set NAME=VALUE` changes one setting, `--preset paper` takes the paper's values."
+        " `esp settings` prints the same. [Configuration](../configuration.md) says which source of a value wins.\n"
     )
-    for name, algorithm in ALGORITHMS.items():
-        text += _section(name, algorithm.config_class, name, {name})
-        changed = [
-            (task, f"`{section}.{key}`", written(value))
-            for task, sections in TUNED.get(name, {}).items()
-            for section, values in sections.items()
-            for key, value in values.items()
+    for section in read_index():
+        title = section.name if section.kind in (section.name, "algorithm") else f"{section.kind} {section.name}"
+        rows = [
+            (
+                f"`{s.name}`",
+                _written(s.default),
+                _elsewhere(s),
+                " ".join(filter(None, (s.bounds, s.unit))),
+                s.description,
+            )
+            for s in section.settings
         ]
-        if changed:
-            text += "\nOn these tasks the preset `default` differs:\n\n"
-            text += "\n".join(_table(("task", "setting", "default"), changed))
-    for name, network in NETWORKS.items():
-        text += _section(f"network `{name}`", network, "network", set(ALGORITHMS))
-    text += _section("prior", PriorConfig, "prior", set(ALGORITHMS))
-    text += _section("evaluation", EvaluationConfig, "evaluation", set(ALGORITHMS))
-    for name in task_names():
-        text += _section(f"task `{name}`", task_class(name).Settings, "task", set())
+        header = ("setting", "default", "presets and tasks", "values", "meaning")
+        text += f"\n## {title}\n\n" + "\n".join(_table(header, rows))
     return text
 
 
-def _section(title: str, model: type[BaseModel], section: str, algorithms: set[str]) -> str:
-    rows = []
-    for name, field in model.model_fields.items():
-        papers = {PRESETS[algorithm]["paper"].get(section, {}).get(name, field.default) for algorithm in algorithms}
-        paper = ", ".join(sorted(written(value) for value in papers)) if papers - {field.default} else ""
-        rows.append((f"`{section}.{name}`", written(field.default), paper, _allowed(field), field.description or ""))
-    header = ("setting", "default", "paper", "allowed", "meaning")
-    return f"\n## {title}\n\n" + "\n".join(_table(header, rows))
+def _elsewhere(setting: Setting) -> str:
+    """Return what presets and tasks set instead of the default."""
+    return ", ".join(f"{name}: {_written(value)}" for name, value in [*setting.presets.items(), *setting.tasks.items()])
 
 
-def written(value: object) -> str:
-    """Return a value as `--set` takes it."""
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return "[" + ",".join(map(written, value)) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _allowed(field: FieldInfo) -> str:
-    """Return the choices of a setting, or its bounds."""
-    choices = [choice for choice in get_args(field.annotation) if isinstance(choice, str)]
-    bounds = [
-        f"{sign} {getattr(m, name):g}" for m in field.metadata for name, sign in _BOUNDS.items() if hasattr(m, name)
-    ]
-    return ", ".join([f"`{choice}`" for choice in choices] + bounds)
+def _written(value: object) -> str:
+    return "" if value is None else f"`{json.dumps(value)}`".replace('"', "")
 
 
 def tasks() -> str:

@@ -18,10 +18,8 @@ from esp_envs.spec import (
 
 if TYPE_CHECKING:
     from esp_envs.base import (
-        Body,
         Environment,
         Observation,
-        Scene,
         Step,
         TaskSettings,
         generator_states,
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
     )
     from esp_envs.lockstep import BatchedTask, Outcome, World, to_others
     from esp_envs.registry import make, register, task_class, task_names
+    from esp_envs.scene import Body, Scene
 
 __all__ = [
     "BatchedTask",

@@ -10,14 +10,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
+from esp_envs.scene import Painter, Scene
 from esp_envs.spec import Continuous, TaskSpec
 
 
@@ -28,10 +27,12 @@ class Observation:
     Shape:
         obs: [S, E, N, D] float32; a fresh tensor, never a view of the simulator's buffers.
         state: [S, E, state width] float32.
+        action_mask: [S, E, N, A] bool, which actions each agent may take; None where `spec.masks` is off.
     """
 
     obs: Tensor
     state: Tensor
+    action_mask: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,19 @@ class Step:
     truncated: Tensor
     final: Observation | None
     metrics: dict[str, Tensor]
+
+
+def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
+    """Return an allowed action, each with the same probability.
+
+    Args:
+        allowed: [..., A] bool; a row that allows nothing allows all.
+        number: [...] uniform in [0, 1).
+    """
+    allowed = allowed | ~allowed.any(-1, keepdim=True)
+    count = allowed.sum(-1)
+    place = (number * count).long().minimum(count - 1)
+    return (allowed.cumsum(-1) <= place.unsqueeze(-1)).sum(-1)
 
 
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
@@ -215,68 +229,20 @@ class Environment(ABC):
         """Shape of the global states: [S, E, state width]."""
         return self.num_seeds, self.num_envs, self.spec.state.width
 
+    def action_mask(self) -> Tensor | None:
+        """Return which actions each agent may take now, [S, E, N, A] bool; None where `spec.masks` is off."""
+        return None
+
     def random_action(self) -> Tensor:
-        """Return a uniformly random joint action, drawn from each seed's own generator."""
+        """Return a uniformly random joint action among the allowed ones, drawn from each seed's own generator."""
         shape = self.action_shape[1:]
+        mask = self.action_mask()
+        if mask is not None:
+            numbers = torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self.generators])
+            return random_choice(mask, numbers)
         if isinstance(self.spec.action, Continuous):
             draws = [torch.rand(shape, generator=g, device=self.device) * 2 - 1 for g in self.generators]
         else:
             count = self.spec.action.count
             draws = [torch.randint(count, shape, generator=g, device=self.device) for g in self.generators]
         return torch.stack(draws)
-
-
-@dataclass(frozen=True)
-class Body:
-    """One thing to draw.
-
-    Attributes:
-        position: (x, y) in world units.
-        radius: in world units.
-        color: "#rrggbb".
-        shape: "disc", "ring", "cross" or "square".
-        heading: direction of a nose mark in radians, or None.
-        trail: whether a renderer may draw its path.
-        model: what a renderer in space builds of it ("robot", "pillar", "goal"); flat pictures ignore it.
-    """
-
-    position: tuple[float, float]
-    radius: float
-    color: str
-    shape: str = "disc"
-    heading: float | None = None
-    trail: bool = False
-    model: str | None = None
-
-
-GRID_SPACING = 0.5
-"""Distance of the lines behind a scene, unless it says otherwise."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order.
-
-    `grid` is the distance of the lines behind them and where one of them lies, along either axis.
-    """
-
-    bodies: tuple[Body, ...]
-    window: tuple[float, float, float, float]
-    grid: tuple[float, float] = (GRID_SPACING, 0.0)
-
-
-class Painter(Protocol):
-    """What draws scenes.
-
-    Attributes:
-        note: a sentence for the user about how it draws, or None.
-    """
-
-    note: str | None
-
-    def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-        """Draw one scene with the trails that bodies left in earlier scenes of the same world, oldest first.
-
-        Shape:
-            [H, W, 3] uint8, red, green and blue; the first row is the top.
-        """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
-from esp_envs.base import Body, Scene
+from esp_envs.scene import Body, Scene
 
 _OVERSAMPLING = 3
 """Everything is drawn this much larger and averaged down, which smooths the edges."""

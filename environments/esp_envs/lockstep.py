@@ -101,9 +101,9 @@ class LockstepTask(Environment):
 class BatchedTask(LockstepTask):
     """A task whose world is one tensor for each field of its state.
 
-    A subclass implements `_describe`, `_start`, `_advance` and `_observe`, and may add `heuristic` and `scene`. All
-    randomness comes from `draw` or from the generator that `_start` is given. Vectors of a continuous action arrive
-    in `_advance` with a length of at most 1, its other numbers in [-1, 1].
+    A subclass implements `_describe`, `_start`, `_advance` and `_observe`, and may add `_allow`, `heuristic` and
+    `scene`. All randomness comes from `draw` or from the generator that `_start` is given. Vectors of a continuous
+    action arrive in `_advance` with a length of at most 1, its other numbers in [-1, 1].
     """
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -126,6 +126,17 @@ class BatchedTask(LockstepTask):
     @abstractmethod
     def _observe(self, world: World) -> Tensor:
         """Return each agent's observation [S, E, N, D] as the layout says; any trailing axes are flattened."""
+
+    def _allow(self, world: World) -> Tensor | None:
+        """Return which actions each agent may take, [S, E, N, A] bool, where `spec.masks` is on."""
+        return None
+
+    def action_mask(self) -> Tensor | None:
+        """Return which actions each agent may take now."""
+        mask = self._allow(self.world)
+        if (mask is not None) != self.spec.masks:
+            raise ValueError(f"{self.spec.name}: implement '_allow' and set 'masks' in the spec, or do neither")
+        return None if mask is None else mask.contiguous().clone()
 
     def draw(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
         """Return numbers uniform in [-1, 1]: [E, *shape] from one generator, else [S, E, *shape] from each seed's."""
@@ -173,7 +184,7 @@ class BatchedTask(LockstepTask):
     def _seen(self) -> Observation:
         obs = self._observe(self.world).flatten(3).float().clone(memory_format=torch.contiguous_format)
         require_shape("observation", obs, (*self.action_shape[:3], self.spec.observation.width))
-        return Observation(obs, self._state())
+        return Observation(obs, self._state(), self.action_mask())
 
     def _put(self, state: Tensor) -> None:
         self.world = self._split(state.clone())

@@ -235,6 +235,7 @@ class Spaces:
         action: the action space, the same for every agent.
         symmetry: under what the *dynamics and reward* are invariant: the largest planar group or one element ("d4",
             "o2", "flip-y"), with "*agents" where the agents may also be exchanged ("d4*agents").
+        masks: whether each observation says which of the discrete actions each agent may take.
     """
 
     num_agents: int
@@ -242,6 +243,7 @@ class Spaces:
     state: Layout
     action: ActionSpace
     symmetry: str
+    masks: bool = False
 
     @property
     def label(self) -> str:
@@ -282,6 +284,8 @@ class TaskSpec(Spaces):
     def __post_init__(self) -> None:
         if self.num_agents < 1 or self.horizon < 1 or not math.isfinite(self.control_period_s):
             raise ValueError(f"task {self.name}: agents and horizon must be positive")
+        if self.masks and not isinstance(self.action, Discrete):
+            raise ValueError(f"task {self.name}: masks are for discrete actions; leave 'masks' out")
 
 
 def describe_action(action: ActionSpace) -> Sequence[tuple[str, str]]:

@@ -39,10 +39,10 @@ class EpisodeCollector:
         observation = env.reset()
         memory = policy.initial_memory(env.num_envs, observation.obs)
         running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-        obs, state = [observation.obs], [observation.state]
+        obs, state, allowed = [observation.obs], [observation.state], [observation.action_mask]
         actions, rewards, terminated, valid = [], [], [], []
         for t in range(steps):
-            outputs, memory = policy.step(observation.obs, memory)
+            outputs, memory = policy.step(observation.obs, memory, observation.action_mask)
             action = head.sample(outputs, noise[:, t])
             memory = policy.remember(memory, action)
             step = env.step(head.to_environment(action))
@@ -50,6 +50,7 @@ class EpisodeCollector:
             after = step.next if step.final is None else step.final
             obs.append(after.obs)
             state.append(after.state)
+            allowed.append(after.action_mask)
             actions.append(action)
             rewards.append(step.reward)
             terminated.append(step.terminated)
@@ -65,6 +66,7 @@ class EpisodeCollector:
             shared,
             torch.stack(terminated, 2),
             mask,
+            action_mask=torch.stack([x for x in allowed if x is not None], 2) if env.spec.masks else None,
         )
         return batch, returns
 

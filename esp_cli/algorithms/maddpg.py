@@ -104,7 +104,11 @@ class Maddpg(OffPolicyLearner):
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return what actor and critic say of rows, for `SymmetryPrior.errors`."""
         values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
-        return {"policy": (self.head, self.policy.unroll(rows.obs[:, :, :-1], rows.action)), "value": values}
+        return {"policy": (self.head, self._outputs(rows)), "value": values}
+
+    def _outputs(self, rows: EpisodeBatch) -> Tensor:
+        """Return the actor's outputs [S, B, T, N, A] for every step."""
+        return self.policy.unroll(rows.obs[:, :, :-1], rows.action, rows.action_mask)
 
     def _learn_critic(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q; `seen` is what the critic sees of every row."""
@@ -117,7 +121,7 @@ class Maddpg(OffPolicyLearner):
     def _learn_actor(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `seen` is what the critic sees of every row."""
         rows, batch = copies.rows, copies.batch
-        outputs = self.policy.unroll(rows.obs[:, :, :-1], rows.action)
+        outputs = self._outputs(rows)
         lead = (copies.originals.count, *outputs.shape[2:])
         noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]]).to(self.device)
         learned = copies.learned(outputs)
@@ -162,6 +166,6 @@ class Maddpg(OffPolicyLearner):
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
-        outputs = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
+        outputs = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
         following = self.head.encode(self.head.mode(outputs))
         return self._td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))

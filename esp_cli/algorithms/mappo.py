@@ -121,7 +121,7 @@ class Mappo(Learner):
         self.collector = Collector(env, self.policy, self.generators["learner"])
         self._old: tuple[StochasticPolicy, Critic] | None = None
         reevaluates = config.clip_value or self.prior.recomputes
-        self._closed_form = isinstance(self.policy.head, Categorical) and not reevaluates
+        self._closed_form = isinstance(self.policy.head, Categorical) and not reevaluates and not env.spec.masks
 
     @classmethod
     def build_policy(
@@ -184,7 +184,8 @@ class Mappo(Learner):
             self.normaliser.normalise(target),
             raw_value,
         )
-        batch = Batch(*(self._as_sequences(x) for x in fields))
+        allowed = None if rollout.action_mask is None else self._as_sequences(rollout.action_mask)
+        batch = Batch(*(self._as_sequences(x) for x in fields), action_mask=allowed)
         return batch, {"train/explained_variance": explained_variance(value, target)}
 
     def _as_sequences(self, x: Tensor) -> Tensor:
@@ -208,7 +209,8 @@ class Mappo(Learner):
             return copied
         policy, critic = self._old
         if self.prior.recomputes:
-            copied = replace(copied, log_prob=policy.head.log_prob(policy.unroll(copied.obs), copied.action))
+            outputs = policy.unroll(copied.obs, action_mask=copied.action_mask)
+            copied = replace(copied, log_prob=policy.head.log_prob(outputs, copied.action))
         if self.config.clip_value:
             copied = replace(copied, value=critic.unroll(copied.obs, copied.state))
         return copied
@@ -256,7 +258,7 @@ class Mappo(Learner):
     ) -> Tensor:
         """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S]."""
         config, head, rows, batch = self.config, self.policy.head, copies.rows, copies.batch
-        outputs = self.policy.unroll(rows.obs, config.truncation)
+        outputs = self.policy.unroll(rows.obs, config.truncation, rows.action_mask)
         values = self.critic.unroll(rows.obs, rows.state, config.truncation)
 
         learned = copies.learned(outputs)
@@ -291,7 +293,8 @@ class Mappo(Learner):
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""
-        outputs, values = self.policy.unroll(rows.obs), self.critic.unroll(rows.obs, rows.state)
+        outputs = self.policy.unroll(rows.obs, action_mask=rows.action_mask)
+        values = self.critic.unroll(rows.obs, rows.state)
         return {"policy": (self.policy.head, outputs), "value": values}
 
 

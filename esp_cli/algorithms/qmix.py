@@ -89,7 +89,7 @@ class Qmix(OffPolicyLearner):
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q."""
         copies = self.prior.copies(batch, self.generators["prior"])
-        utilities = self.policy.unroll(copies.rows.obs, copies.rows.action)
+        utilities = self._utilities(copies.rows)
         values = self._total(utilities, copies.rows)
         target = self._targets(batch, copies.original(utilities).detach())
         loss, metrics = self._td_loss(values, target, copies)
@@ -101,7 +101,10 @@ class Qmix(OffPolicyLearner):
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return Q_tot of rows, for `SymmetryPrior.errors`."""
-        return {"value": self._total(self.policy.unroll(rows.obs, rows.action), rows)}
+        return {"value": self._total(self._utilities(rows), rows)}
+
+    def _utilities(self, rows: EpisodeBatch) -> Tensor:
+        return self.policy.unroll(rows.obs, rows.action, rows.action_mask)
 
     def _total(self, utilities: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A]."""
@@ -111,7 +114,7 @@ class Qmix(OffPolicyLearner):
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, utilities: Tensor) -> Tensor:
         """Return y = r + gamma Q_tot^-(s', argmax_a Q(o', a)) for the originals: [S, B, T, 1]."""
-        following = self.target_policy.unroll(batch.obs, batch.action)[:, :, 1:]
+        following = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
         chooser = utilities[:, :, 1:] if self.config.double_q else following
         chosen = following.gather(-1, best(chooser).unsqueeze(-1)).squeeze(-1)
         next_value = self.target_mixer(chosen, self._critic_rows(batch)[:, :, 1:]).unsqueeze(-1)

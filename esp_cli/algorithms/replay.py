@@ -18,7 +18,7 @@ class EpisodeBatch(SeedBatch):
     Shape:
         obs [S, B, T + 1, N, D] and state [S, B, T + 1, Ds], the last row being the final one,
         action [S, B, T, N(, width)], reward [S, B, T, C] with C = 1 if shared, else N,
-        terminated and valid [S, B, T] bool.
+        terminated and valid [S, B, T] bool, action_mask [S, B, T + 1, N, A] bool or None.
     """
 
     per_agent = ("reward",)
@@ -49,12 +49,15 @@ class EpisodeReplay:
         self.capacity, self.size, self.cursor = capacity, 0, 0
         lead = (num_seeds, capacity)
         steps, agents = spec.horizon, spec.num_agents
-        discrete = isinstance(spec.action, Discrete)
-        action = (agents,) if isinstance(spec.action, Discrete) else (agents, spec.action.width)
+        space, allowed = spec.action, None
+        discrete = isinstance(space, Discrete)
+        action = (agents,) if isinstance(space, Discrete) else (agents, space.width)
 
         def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.empty(*lead, *shape, dtype=dtype, device=device)
 
+        if spec.masks and isinstance(space, Discrete):
+            allowed = room(steps + 1, agents, space.count, dtype=torch.bool)
         self._store = EpisodeBatch(
             obs=room(steps + 1, agents, spec.observation.width),
             state=room(steps + 1, spec.state.width),
@@ -62,12 +65,13 @@ class EpisodeReplay:
             reward=room(steps, 1 if spec.shared_reward else agents),
             terminated=room(steps, dtype=torch.bool),
             valid=room(steps, dtype=torch.bool),
+            action_mask=allowed,
         )
 
     @property
     def num_bytes(self) -> int:
         """Memory of the whole store."""
-        return sum(tensor.nbytes for tensor in vars(self._store).values())
+        return sum(tensor.nbytes for tensor in self._store.tensors.values())
 
     def add(self, episodes: EpisodeBatch) -> None:
         """Store episodes; the oldest give way.
@@ -79,7 +83,7 @@ class EpisodeReplay:
         if count > self.capacity:
             raise ValueError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
         places = (self.cursor + torch.arange(count, device=episodes.obs.device)) % self.capacity
-        for name, tensor in vars(self._store).items():
+        for name, tensor in self._store.tensors.items():
             tensor.index_copy_(1, places, getattr(episodes, name).to(tensor.dtype))
         self.cursor = (self.cursor + count) % self.capacity
         self.size = min(self.size + count, self.capacity)
@@ -98,7 +102,7 @@ class EpisodeReplay:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the filled part and the cursor."""
-        filled = {name: tensor[:, : self.size] for name, tensor in vars(self._store).items()}
+        filled = {name: tensor[:, : self.size] for name, tensor in self._store.tensors.items()}
         return filled | {"cursor": torch.tensor(self.cursor)}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -107,10 +111,10 @@ class EpisodeReplay:
         Raises:
             ValueError: episodes of another task or another number of seeds, or more than fit.
         """
-        if tensors.keys() != {*vars(self._store), "cursor"} or tensors["obs"].dim() < 2:
+        if tensors.keys() != {*self._store.tensors, "cursor"} or tensors["obs"].dim() < 2:
             raise ValueError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]
-        for name, tensor in vars(self._store).items():
+        for name, tensor in self._store.tensors.items():
             saved = tensors[name]
             if size > self.capacity or saved.shape != tensor[:, :size].shape:
                 raise ValueError("the saved episodes do not fit into the replay of this configuration")

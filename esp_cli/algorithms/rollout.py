@@ -20,7 +20,7 @@ class Rollout:
 
     Shape:
         obs [S, E, T, N, D], state [S, E, T, state width], action [S, E, T, N(, width)] (latent, as the head drew it),
-        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool.
+        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool, action_mask [S, E, T, N, A] bool or None.
 
     `last` is the observation after the final step; `finals[t]` the final observation of episodes that ended at t.
     """
@@ -34,6 +34,7 @@ class Rollout:
     ended: Tensor
     last: Observation
     finals: dict[int, Observation] = field(default_factory=dict)
+    action_mask: Tensor | None = None
 
 
 @dataclass
@@ -82,10 +83,11 @@ class Collector:
         reward = torch.empty(*lead, spec.num_agents, device=device)
         terminated = torch.empty(lead, dtype=torch.bool, device=device)
         ended = torch.empty_like(terminated)
-        outputs, actions, finals = [], [], {}
+        outputs, actions, masks, finals = [], [], [], {}
         for t in range(num_steps):
             obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
-            output, self.memory = self.policy.step(self.observation.obs, self.memory)
+            output, self.memory = self.policy.step(self.observation.obs, self.memory, self.observation.action_mask)
+            masks.append(self.observation.action_mask)
             action = self.policy.head.sample(output, noise[:, t])
             step = self.env.step(self.policy.head.to_environment(action))
             outputs.append(output)
@@ -98,7 +100,19 @@ class Collector:
             self.observation = step.next
         action_rows = torch.stack(actions, 2)
         log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
-        return Rollout(obs, state, action_rows, log_prob, reward, terminated, ended, self.observation, finals)
+        allowed = [mask for mask in masks if mask is not None]
+        return Rollout(
+            obs,
+            state,
+            action_rows,
+            log_prob,
+            reward,
+            terminated,
+            ended,
+            self.observation,
+            finals,
+            torch.stack(allowed, 2) if allowed else None,
+        )
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
         """Add up returns (mean over agents of the sum over time) and empty the memory of ended episodes."""
@@ -127,6 +141,8 @@ class Collector:
             "memory": self.memory,
             "episode_return": self.episode_return,
         }
+        if self.observation.action_mask is not None:
+            own["action_mask"] = self.observation.action_mask
         return own | {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -134,7 +150,8 @@ class Collector:
         own = {name: tensors[name].to(self.env.device) for name in ("obs", "state", "memory", "episode_return")}
         if own["obs"].shape != self.observation.obs.shape:
             raise ValueError("the saved worlds have other seeds, worlds or observations than these; use their settings")
-        self.observation = Observation(own["obs"], own["state"])
+        mask = tensors["action_mask"].to(self.env.device) if self.env.spec.masks else None
+        self.observation = Observation(own["obs"], own["state"], mask)
         self.memory, self.episode_return = own["memory"], own["episode_return"]
         self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
 

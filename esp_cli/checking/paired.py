@@ -164,6 +164,9 @@ def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) 
             add(f"{prefix}obs.", spec.observation, seen.obs if transform is None else transform.obs(seen.obs))
             if not joint:
                 add(f"{prefix}state.", spec.state, seen.state if transform is None else transform.state(seen.state))
+            if seen.action_mask is not None:
+                mask = seen.action_mask if transform is None else transform.push_outputs(seen.action_mask)
+                parts.setdefault(f"{prefix}action mask", []).append(mask.float().flatten(0, 1).flatten(1))
         reward = step.reward if transform is None else transform.per_agent(step.reward)
         parts.setdefault("reward", []).append(reward.flatten(0, 1))
         parts.setdefault("end", []).append(step.terminated.float().flatten(0, 1).unsqueeze(-1))

@@ -41,20 +41,24 @@ def check_policy(trained: TrainedPolicy, make: MakeWorlds, transforms: str | Non
         raise ValueError(f"{trained.source} is a policy of {trained.config.task}, which sees or does other things")
     policy = trained.policy.cpu()
     seen: list[Tensor] = []
-    obs = env.reset().obs
-    memory = policy.initial_memory(_WORLDS, obs)
+    masks: list[Tensor] = []
+    observation = env.reset()
+    memory = policy.initial_memory(_WORLDS, observation.obs)
     with torch.no_grad():
         for _ in range(min(env.spec.horizon, 10)):
-            seen.append(obs)
-            action, memory = policy.act(obs, memory)
-            obs = env.step(action).next.obs
+            seen.append(observation.obs)
+            masks += [] if observation.action_mask is None else [observation.action_mask]
+            action, memory = policy.act(observation.obs, memory, action_mask=observation.action_mask)
+            observation = env.step(action).next
         verdicts = []
-        rows = torch.cat(seen, 1)
+        rows, mask = torch.cat(seen, 1), torch.cat(masks, 1) if masks else None
         blank = policy.initial_memory(rows.shape[1], rows)
-        here = policy.act(rows, blank)[0]
+        here = policy.act(rows, blank, action_mask=mask)[0]
         for element in candidates(env.spec, transforms):
             transform = build_transform([element], env.spec)
-            there, expected = policy.act(transform.obs(rows), blank)[0], transform.action(here)
+            turned = None if mask is None else transform.push_outputs(mask)
+            there = policy.act(transform.obs(rows), blank, action_mask=turned)[0]
+            expected = transform.action(here)
             same = there == expected if not there.is_floating_point() else ((there - expected).abs() < _CLOSE).all(-1)
             verdicts.append(PolicyVerdict(element.name, float(same.float().mean())))
     return verdicts

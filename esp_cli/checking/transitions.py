@@ -40,12 +40,14 @@ class Transitions:
         obs, next_obs: [M, T, N, D], M episodes from their starts, T steps of each.
         action: [M, T, N] int64, or [M, T, N, width] float32.
         reward: [M, T, N].
+        action_mask: [M, T, N, A] bool, the actions that were allowed; None where all always are.
     """
 
     obs: Tensor
     action: Tensor
     reward: Tensor
     next_obs: Tensor
+    action_mask: Tensor | None = None
 
 
 def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> Transitions:
@@ -62,6 +64,7 @@ def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> T
             action = env.random_action()
             step = env.step(action)
             row: tuple[Tensor, ...] = (observation.obs, action, step.reward, (step.final or step.next).obs)
+            row += () if observation.action_mask is None else (observation.action_mask,)
             if rows:
                 row = tuple(
                     torch.where(over.view(*over.shape, *(1,) * (new.dim() - 2)), old, new)
@@ -72,7 +75,8 @@ def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> T
             observation = step.next
         found.append(rows)
     parts = [
-        torch.cat([torch.stack([row[k] for row in rows], 2).flatten(0, 1) for rows in found]).cpu() for k in range(4)
+        torch.cat([torch.stack(column, 2).flatten(0, 1) for column in columns]).cpu()
+        for columns in zip(*(zip(*rows, strict=True) for rows in found), strict=True)
     ]
     return Transitions(*parts)
 
@@ -88,7 +92,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     half = len(data.obs) // 2
     inputs, outputs = _rows(spaces, data)
     model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
-    held = Transitions(data.obs[half:], data.action[half:], data.reward[half:], data.next_obs[half:])
+    held = Transitions(*(part[half:] for part in vars(data).values() if part is not None))
     return [_judge(element, spaces, held, model) for element in elements]
 
 
@@ -106,6 +110,8 @@ def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -
         verdicts.append(_field_verdict(f"obs.{name}", here, there, where, moved))
     reward = slice(layout.width, layout.width + 1)
     verdicts.append(_field_verdict("reward", here, there, reward, True))
+    if data.action_mask is not None:
+        verdicts.append(_field_verdict("action mask", here, there, slice(layout.width + 1, None), True))
     return ElementVerdict(element.name, declared, tuple(verdicts))
 
 
@@ -119,7 +125,7 @@ def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: 
 
 
 def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
-    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1] of each agent: change and reward."""
+    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1] of each agent: change, reward and any mask."""
     action = data.action
     acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
     row = torch.cat([data.obs, acted], -1)
@@ -128,7 +134,9 @@ def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
     if row.shape[-1] <= _WIDEST:
         first, second = torch.triu_indices(row.shape[-1], row.shape[-1])
         features.append(row[..., first] * row[..., second])
-    return torch.cat(features, -1), torch.cat([data.next_obs - data.obs, data.reward.unsqueeze(-1)], -1)
+    outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
+    outputs += [] if data.action_mask is None else [data.action_mask.float()]
+    return torch.cat(features, -1), torch.cat(outputs, -1)
 
 
 def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
@@ -158,6 +166,7 @@ def _turned(data: Transitions, transform: Transform) -> Transitions:
         transform.action(one(data.action))[0],
         transform.per_agent(one(data.reward))[0],
         transform.obs(one(data.next_obs))[0],
+        None if data.action_mask is None else transform.push_outputs(one(data.action_mask))[0],
     )
 
 

@@ -97,19 +97,33 @@ def train(
             metavar="RUN|POLICY",
         ),
     ] = None,
-    tensorboard: Annotated[bool, typer.Option("--tensorboard", help="Write TensorBoard files too.")] = False,
+    track: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--track",
+            help="Give the metrics to tensorboard, wandb or mlflow too; repeatable. Offline, in the run folder.",
+            metavar="TRACKER",
+        ),
+    ] = None,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Old for --track tensorboard.", hidden=True)
+    ] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     from esp_cli.library.run import Run, begin, plan
+    from esp_cli.trackers import require
     from esp_cli.training.run_folder import RUN_FORMAT
 
+    if tensorboard:
+        console.note("--tensorboard is now --track tensorboard")
+    trackers = (*(track or ()), *(("tensorboard",) if tensorboard else ()))
     named = parse_assignments(settings or [])
     register_tasks([task])
     register_learners([algo], [network, named.get("network.name")])
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
-        _train(Run(resume), tensorboard)
+        _train(Run(resume), trackers)
         return
     short = {
         "prior.kind": prior,
@@ -134,7 +148,8 @@ def train(
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    _train(begin(resolved, weights, out), tensorboard)
+    require(trackers)
+    _train(begin(resolved, weights, out), trackers)
 
 
 def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> None:
@@ -142,7 +157,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "tensorboard", *allowed)
+        if parameter.name not in ("resume", "track", "tensorboard", *allowed)
         and getattr(context.get_parameter_source(str(parameter.name)), "name", "") == "COMMANDLINE"
     ]
     if given:
@@ -151,9 +166,9 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
         )
 
 
-def _train(run: Run, tensorboard: bool) -> None:
+def _train(run: Run, trackers: Sequence[str]) -> None:
     """Train until the end or an interrupt, then print the result and the next command."""
-    with run.trainer(tensorboard) as trainer, stop_requests("stopping after this iteration") as requests:
+    with run.trainer(trackers) as trainer, stop_requests("stopping after this iteration") as requests:
         if trainer.is_complete and run.is_complete:
             console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
             return
@@ -168,6 +183,8 @@ def _train(run: Run, tensorboard: bool) -> None:
                 return not requests
 
             complete = trainer.run(listen)
+        for text in trainer.notes:  # of a tracker that could not be closed
+            console.note(text)
     if not complete:
         console.note(
             f"stopped at {console.format_count(trainer.step)} steps; continue with: "

@@ -132,6 +132,11 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
         ValueError: a file exists already, a library is missing, or the format does not support the policy.
     """
     formats = tuple(dict.fromkeys(formats))
+    if alone.spec.masks:
+        raise ValueError(
+            f"{alone.spec.name} says which actions are allowed, and no exported file takes such a mask; "
+            "use load_policy, whose 'act' takes action_mask"
+        )
     program = program_of(alone.policy)
     sample = take_sample(alone, program)
     job = _Job(alone, program, sample, describe(alone, program, sample))

@@ -24,7 +24,7 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_envs.base import Environment
 from esp_envs.registry import register
-from esp_envs.spec import Continuous, TaskSpec
+from esp_envs.spec import Continuous, Discrete, TaskSpec
 
 Floats = NDArray[np.float32]
 Action = NDArray[np.int64] | NDArray[np.float32]
@@ -51,12 +51,15 @@ class LoadedPolicy:
         self.team = alone.policy.actor.team
         self.memory_width = int(alone.policy.initial_memory(1, torch.empty(0)).shape[-1])
 
-    def act(self, obs: ArrayLike, rng: np.random.Generator | None = None) -> Action:
+    def act(
+        self, obs: ArrayLike, rng: np.random.Generator | None = None, action_mask: ArrayLike | None = None
+    ) -> Action:
         """Return what each agent does, for a policy that remembers nothing.
 
         Args:
             obs: [..., D] as `spec.observation` lays it out.
             rng: draws the actions; without it the policy is greedy.
+            action_mask: [..., A] bool, the allowed actions; needed where `spec.masks` says so.
 
         Returns:
             [...] int64, indices of `spec.action.names`, or [..., width] float32 within the task's bounds.
@@ -70,20 +73,27 @@ class LoadedPolicy:
                 "act with action, memory = policy.step(obs, memory)"
             )
         rows = self._checked_obs(obs)
-        return self.step(rows, self.initial_memory(*rows.shape[:-1]), rng)[0]
+        return self.step(rows, self.initial_memory(*rows.shape[:-1]), rng, action_mask)[0]
 
     def initial_memory(self, *lead: int) -> Floats:
         """Return the memory with which an episode begins: zeros [*lead, H]."""
         return np.zeros((*lead, self.memory_width), np.float32)
 
     @torch.no_grad()
-    def step(self, obs: ArrayLike, memory: ArrayLike, rng: np.random.Generator | None = None) -> tuple[Action, Floats]:
+    def step(
+        self,
+        obs: ArrayLike,
+        memory: ArrayLike,
+        rng: np.random.Generator | None = None,
+        action_mask: ArrayLike | None = None,
+    ) -> tuple[Action, Floats]:
         """Return what each agent does, and its next memory.
 
         Args:
             obs: [..., D] as `spec.observation` lays it out.
             memory: [..., H] of `initial_memory`, or of the step before.
             rng: draws the actions; without it the policy is greedy.
+            action_mask: as of `act`.
 
         Returns:
             Actions as of `act`, and memory [..., H]; the arguments stay as they are.
@@ -99,6 +109,7 @@ class LoadedPolicy:
                 f"the memory has shape {carried.shape}, but observations of shape {rows.shape} need "
                 f"{(*lead, self.memory_width)}: one row for each agent"
             )
+        mask = self._checked_mask(action_mask, lead)
         space = self.spec.action
         shape = (*lead, space.width) if isinstance(space, Continuous) else lead
         count = math.prod(lead)  # told to reshape, as it cannot be guessed where a width is 0
@@ -109,8 +120,23 @@ class LoadedPolicy:
             generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
             noise = policy.head.noise((1, count), [generator])
         seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
-        action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise)
+        action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise, mask)
         return action.numpy().reshape(shape), after.numpy().reshape((*lead, self.memory_width))
+
+    def _checked_mask(self, action_mask: ArrayLike | None, lead: tuple[int, ...]) -> torch.Tensor | None:
+        """Return the mask as [1, 1, rows, A]; None for a task without masks."""
+        space = self.spec.action
+        if not (isinstance(space, Discrete) and self.spec.masks):
+            if action_mask is not None:
+                raise ValueError(f"{self.spec.name} has no action masks; leave action_mask out")
+            return None
+        expected = (*lead, space.count)
+        if action_mask is None:
+            raise ValueError(f"{self.spec.name} says which actions are allowed; give action_mask of shape {expected}")
+        mask = np.asarray(action_mask, bool)
+        if mask.shape != expected:
+            raise ValueError(f"the action mask has shape {mask.shape}, expected {expected}")
+        return torch.from_numpy(mask.reshape(1, 1, -1, space.count))
 
     def _checked_obs(self, obs: ArrayLike) -> Floats:
         layout = self.spec.observation

@@ -24,8 +24,9 @@ from esp_cli.files.writing import write_file
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
-from esp_envs.base import Body, Environment, Painter, Scene
+from esp_envs.base import Environment
 from esp_envs.drawing import GRID, TopPainter, trails
+from esp_envs.scene import Body, Painter, Scene
 from esp_envs.spec import TaskSpec
 
 View = Literal["auto", "top", "3d"]

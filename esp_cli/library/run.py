@@ -28,6 +28,7 @@ from esp_cli.formatting import file_name
 from esp_cli.library.metrics import Metrics
 from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
+from esp_cli.trackers import require
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.initial import describe, fitted
@@ -88,21 +89,25 @@ class Run:
         return self.folder.policy_path.is_file()
 
     @contextmanager
-    def trainer(self, tensorboard: bool = False) -> Iterator[Trainer]:
+    def trainer(self, track: Sequence[str] = ()) -> Iterator[Trainer]:
         """Hold the folder against other processes, and yield what trains it from its newest checkpoint on.
 
+        Args:
+            track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
+
         Raises:
-            ValueError: another process trains it, or its device is not there.
+            ValueError: another process trains it, or its device or a tracker is not there.
         """
         resolve_device(self.config.device)
         with self.folder.lock():
-            yield Trainer(self.config, self.folder, tensorboard)
+            yield Trainer(self.config, self.folder, track)
 
-    def train(self, listener: Listener | None = None) -> bool:
+    def train(self, listener: Listener | None = None, track: Sequence[str] = ()) -> bool:
         """Train on from the newest checkpoint, bit for bit as without a break.
 
         Args:
             listener: told of progress after every update; False asks for a clean stop.
+            track: as of `trainer`.
 
         Returns:
             Whether the run is complete.
@@ -110,7 +115,7 @@ class Run:
         Raises:
             ValueError: another process trains it, or no seed has finite numbers any more.
         """
-        with self.trainer() as trainer:
+        with self.trainer(track) as trainer:
             return (trainer.is_complete and self.is_complete) or trainer.run(listener or _go_on)
 
     def evaluate(self, episodes: int = 320, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
@@ -204,6 +209,7 @@ def train(
     out: str | os.PathLike[str] | None = None,
     init_from: str | os.PathLike[str] | None = None,
     listener: Callable[[Progress], bool] | None = None,
+    track: Sequence[str] = (),
 ) -> Run:
     """Train S seeds at once, as `esp train` does, and return the run.
 
@@ -218,6 +224,7 @@ def train(
         out: the run folder; by default a new one in runs/.
         init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
         listener: told of progress after every update; False asks for a clean stop, after which `Run.train` goes on.
+        track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
 
     Raises:
         ValueError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
@@ -228,8 +235,9 @@ def train(
     config, weights = plan(
         name, algorithm, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
     )
+    require(track)
     run = begin(config, weights, out)
-    run.train(listener)
+    run.train(listener, track)
     return run
 
 

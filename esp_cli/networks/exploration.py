@@ -14,7 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from esp_cli.networks.heads import Categorical, Head, best, same_disc, squash
+from esp_cli.networks.heads import MASKED, Categorical, Head, best, same_disc, squash
+from esp_envs.base import random_choice
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 
@@ -67,7 +68,10 @@ class EpsilonGreedy(ExploringChoice):
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Explore where the first number is below epsilon; the second then names the action."""
         whether, where = noise.unbind(-1)
-        anything = (where * self.num_outputs).long().clamp_(max=self.num_outputs - 1)
+        if self.masks:
+            anything = random_choice(outputs > MASKED / 2, where)
+        else:
+            anything = (where * self.num_outputs).long().clamp_(max=self.num_outputs - 1)
         return torch.where(whether < self._epsilon(whether), anything, self.mode(outputs))
 
     def mode(self, outputs: Tensor) -> Tensor:
@@ -80,12 +84,16 @@ class EpsilonGreedy(ExploringChoice):
 
 
 class ExploringCategorical(ExploringChoice, Categorical):
-    """One of A actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""
+    """One of A allowed actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""
 
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
         """Draw an action from the mixture by inverting its cumulative distribution at `noise`."""
         share = self._epsilon(log_probs)
-        return Categorical.sample(self, ((1 - share) * log_probs.exp() + share / self.num_outputs).log(), noise)
+        uniform = share / self.num_outputs
+        if self.masks:
+            allowed = log_probs > MASKED / 2
+            uniform = share * allowed / allowed.sum(-1, keepdim=True)
+        return Categorical.sample(self, ((1 - share) * log_probs.exp() + uniform).log(), noise)
 
     @property
     def choices(self) -> Tensor:
@@ -109,7 +117,13 @@ class ExploringCategorical(ExploringChoice, Categorical):
 
     def penalty(self, log_probs: Tensor) -> Tensor:
         """Return the mean square of the centred logits, which keeps a policy from getting too sure: [S, B, N]."""
-        return (log_probs - log_probs.mean(-1, keepdim=True)).square().mean(-1)
+        if not self.masks:
+            return (log_probs - log_probs.mean(-1, keepdim=True)).square().mean(-1)
+        allowed = log_probs > MASKED / 2
+        count = allowed.sum(-1, keepdim=True)
+        known = torch.where(allowed, log_probs, 0.0)
+        centred = torch.where(allowed, known - known.sum(-1, keepdim=True) / count, 0.0)
+        return centred.square().sum(-1) / count.squeeze(-1)
 
     def statistics(self, log_probs: Tensor) -> dict[str, Tensor]:
         """Return what is worth logging of the outputs: the entropy without epsilon, [S, B, N]."""

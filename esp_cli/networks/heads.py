@@ -18,11 +18,29 @@ from torch import Tensor, nn
 
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
+MASKED = -1e9
+"""Output of an action that is not allowed: its probability is exactly 0, and it is never the best."""
+
+
+def masked(outputs: Tensor, action_mask: Tensor | None) -> Tensor:
+    """Return outputs [..., A] in which actions that the mask [..., A] forbids have the output `MASKED`.
+
+    No gradient flows to what is masked. A row that allows nothing stays as it is.
+    """
+    if action_mask is None:
+        return outputs
+    return outputs.masked_fill(~action_mask & action_mask.any(-1, keepdim=True), MASKED)
+
 
 class Head(nn.Module, ABC):
-    """Reads actions out of a network's outputs; what every learner's policy has at its end."""
+    """Reads actions out of a network's outputs; what every learner's policy has at its end.
+
+    Attributes:
+        masks: whether outputs come with masked actions.
+    """
 
     num_outputs: int
+    masks: bool = False
 
     @abstractmethod
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
@@ -72,7 +90,11 @@ class Categorical(Head):
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
         """Draw an action by inverting the cumulative distribution at `noise`."""
         cumulative = log_probs.exp().cumsum(-1)
-        return (cumulative < noise.unsqueeze(-1)).sum(-1).clamp_(max=self.num_outputs - 1)
+        if not self.masks:
+            return (cumulative < noise.unsqueeze(-1)).sum(-1).clamp_(max=self.num_outputs - 1)
+        # Within the sum of the probabilities and above 0, so that rounding chooses no action of probability 0.
+        inside = noise.unsqueeze(-1).clamp_min(torch.finfo(noise.dtype).tiny).minimum(cumulative[..., -1:])
+        return (cumulative < inside).sum(-1)
 
     def mode(self, log_probs: Tensor) -> Tensor:
         """Return the most probable action."""

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from esp_cli.networks.build import Network, NetworkConfig, build_network
 from esp_cli.networks.exploration import ExploringHead
-from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head
+from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.separate import Separate, action_parts
@@ -46,6 +46,7 @@ class Policy(nn.Module):
         self.num_seeds = len(generators)
         self.num_agents = spec.num_agents
         self.head = head
+        head.masks = spec.masks
         inputs = spec.observation.width + num_extra
         if isinstance(network, PlainConfig) and network.separate_parts:
             parts = action_parts(spec.action)
@@ -58,14 +59,25 @@ class Policy(nn.Module):
         """Return the memory [S, E * N, H] with which an episode begins."""
         return self.actor.initial_memory(self.num_seeds, num_envs * self.num_agents, like)
 
-    def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the normalised outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory."""
-        outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
-        return self.head.normalise(outputs.unflatten(1, obs.shape[1:3])), memory
+    def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the normalised outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory.
 
-    def act(self, obs: Tensor, memory: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        Args:
+            obs: see above.
+            memory: see `initial_memory`.
+            action_mask: [S, E, N, A] bool, the allowed actions; None allows all.
+        """
+        outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
+        return self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask), memory
+
+    def _normalised(self, outputs: Tensor, action_mask: Tensor | None) -> Tensor:
+        return self.head.normalise(masked(outputs, action_mask))
+
+    def act(
+        self, obs: Tensor, memory: Tensor, noise: Tensor | None = None, action_mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
-        outputs, memory = self.step(obs, memory)
+        outputs, memory = self.step(obs, memory, action_mask)
         action = self.head.mode(outputs) if noise is None else self.head.sample(outputs, noise)
         return self.head.to_environment(action), memory
 
@@ -78,9 +90,9 @@ class StochasticPolicy(Policy):
     def __init__(self, spec: Spaces, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
         super().__init__(spec, network, generators, build_head(spec.action, len(generators)), POLICY_GAIN)
 
-    def unroll(self, obs: Tensor, truncation: int = 0) -> Tensor:
+    def unroll(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""
-        return self.head.normalise(self.rows(obs, truncation).transpose(2, 3))
+        return self._normalised(self.rows(obs, truncation).transpose(2, 3), action_mask)
 
     def rows(self, obs: Tensor, truncation: int = 0) -> Tensor:
         """Return the actor's outputs as they are, agent by agent: [S, B, N, T, outputs]; see `unroll`."""
@@ -114,13 +126,14 @@ class HistoryPolicy(Policy):
         hidden = super().initial_memory(num_envs, like)
         return torch.nn.functional.pad(hidden, (0, self.head.action_width)) if self.recurrent else hidden
 
-    def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the normalised outputs for obs [S, E, N, D], and the memory, in which the action is still missing."""
         if not self.recurrent:
-            return super().step(obs, memory)
+            return super().step(obs, memory, action_mask)
         hidden, previous = memory.split((self.actor.memory_width, self.head.action_width), -1)
         outputs, hidden = self.actor.step(torch.cat([obs.flatten(1, 2), previous], -1), hidden)
-        return self.head.normalise(outputs.unflatten(1, obs.shape[1:3])), torch.cat([hidden, previous], -1)
+        outputs = self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask)
+        return outputs, torch.cat([hidden, previous], -1)
 
     def remember(self, memory: Tensor, action: Tensor) -> Tensor:
         """Put the action [S, E, N(, width)] that was really taken into the memory."""
@@ -128,17 +141,20 @@ class HistoryPolicy(Policy):
             return memory
         return torch.cat([memory[..., : self.actor.memory_width], self.head.encode(action).flatten(1, 2)], -1)
 
-    def act(self, obs: Tensor, memory: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def act(
+        self, obs: Tensor, memory: Tensor, noise: Tensor | None = None, action_mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
-        action, memory = super().act(obs, memory, noise)
+        action, memory = super().act(obs, memory, noise, action_mask)
         return action, self.remember(memory, action)
 
-    def unroll(self, obs: Tensor, action: Tensor) -> Tensor:
+    def unroll(self, obs: Tensor, action: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs over whole episodes, from empty memory.
 
         Args:
             obs: [S, B, T + 1, N, D]; the last row may be left out.
             action: [S, B, T, N(, width)] what was done in each step.
+            action_mask: [S, B, T + 1, N, A] bool, the allowed actions; None allows all.
 
         Returns:
             [S, B, T + 1, N, outputs], one row for each row of `obs`.
@@ -149,4 +165,5 @@ class HistoryPolicy(Policy):
             previous = torch.cat([torch.zeros_like(done[:, :, :1]), done], 2)[:, :, : obs.shape[2]]
             rows = torch.cat([rows, previous.transpose(2, 3).flatten(1, 2)], -1)
         outputs = self.actor.unroll(rows).unflatten(1, (obs.shape[1], obs.shape[3]))
-        return self.head.normalise(outputs.transpose(2, 3))
+        allowed = None if action_mask is None else action_mask[:, :, : obs.shape[2]]
+        return self._normalised(outputs.transpose(2, 3), allowed)

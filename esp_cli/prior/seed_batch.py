@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, TypeVar
 
 import torch
@@ -22,6 +22,7 @@ class SeedBatch:
         obs: [S, B, ..., N, D].
         state: [S, B, ..., Ds].
         action: [S, B, ..., N(, width)].
+        action_mask: [S, B, ..., N, A] bool, the allowed actions; None allows all.
         per_agent: names of fields [S, B, ..., N] that move with their agents; those with one number per world stay.
     """
 
@@ -30,6 +31,12 @@ class SeedBatch:
     obs: Tensor
     state: Tensor
     action: Tensor
+    action_mask: Tensor | None = field(default=None, kw_only=True)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The fields that this batch has, by name."""
+        return {name: tensor for name, tensor in vars(self).items() if tensor is not None}
 
     @property
     def count(self) -> int:
@@ -43,7 +50,7 @@ class SeedBatch:
 
     def map(self: Rows, function: Callable[[Tensor], Tensor]) -> Rows:
         """Return the batch with every tensor put through a function."""
-        return type(self)(**{name: function(tensor) for name, tensor in vars(self).items()})
+        return type(self)(**{name: function(tensor) for name, tensor in self.tensors.items()})
 
     def first(self: Rows, count: int) -> Rows:
         """Return the first `count` rows of each seed; views."""
@@ -56,12 +63,14 @@ class SeedBatch:
 
     def chunks(self: Rows, size: int) -> list[Rows]:
         """Cut the batch axis into pieces of at most `size`; views."""
-        pieces = zip(*(tensor.split(size, 1) for tensor in vars(self).values()), strict=True)
-        return [type(self)(*piece) for piece in pieces]
+        pieces = zip(*(tensor.split(size, 1) for tensor in self.tensors.values()), strict=True)
+        return [type(self)(**dict(zip(self.tensors, piece, strict=True))) for piece in pieces]
 
     def transformed(self: Rows, g: Transform) -> Rows:
         """Return (L_g s, K_g a); all else stays (Eq. 5, Prop. 1), or moves with its agents."""
         moved = {name: g.per_agent(getattr(self, name)) for name in self.per_agent}
+        if self.action_mask is not None:
+            moved["action_mask"] = g.push_outputs(self.action_mask)
         return replace(self, obs=g.obs(self.obs), state=g.state(self.state), action=g.action(self.action), **moved)
 
     @classmethod
@@ -69,7 +78,7 @@ class SeedBatch:
         """Concatenate batches along the batch axis."""
         if len(parts) == 1:
             return parts[0]
-        return cls(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in vars(parts[0])})
+        return cls(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in parts[0].tensors})
 
 
 def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:

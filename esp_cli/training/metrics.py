@@ -23,6 +23,7 @@ from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import replace_file
+from esp_cli.trackers import Sink
 
 Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
@@ -43,21 +44,15 @@ class MetricsWriter:
 
     Args:
         path: the JSONL file; made if missing.
-        tensorboard: folder for TensorBoard event files, or None. It gets the mean over seeds, and a sub-folder
-            ``seed-k`` per seed, which TensorBoard lays over the mean under the same name.
-        first_step: rows of TensorBoard from this step on are hidden, as a resumed run writes them again.
+        sinks: what takes each row after the file has it; closed with the file.
 
     Raises:
-        MetricsError: the file cannot be opened, or TensorBoard is asked for and not installed.
+        MetricsError: the file cannot be opened.
     """
 
-    def __init__(self, path: str | os.PathLike[str], tensorboard: Path | None = None, first_step: int = 0) -> None:
+    def __init__(self, path: str | os.PathLike[str], sinks: Sequence[Sink] = ()) -> None:
         self._path = Path(path)
-        self._folder = tensorboard
-        self._first_step = first_step
-        self._boards: dict[str, Any] = {}  # TensorBoard's writers, whose package has no types
-        if tensorboard is not None:
-            self._board("mean")
+        self._sinks = sinks
         with attempting("write", self._path, MetricsError):
             _remove_torn_line(self._path)
             # closed by close(), which __exit__ calls
@@ -91,38 +86,15 @@ class MetricsWriter:
             # a disk about to be full takes a part only; writing the rest then says so
             while line:
                 line = line[self._file.write(line) :]
-        if self._folder is not None:
-            self._write_boards(row)
+        del row["step"]
+        for sink in self._sinks:
+            sink.write(int(step), row)
 
     def close(self) -> None:
-        """Close the file, and TensorBoard's."""
+        """Close the file and the sinks."""
         self._file.close()
-        for board in self._boards.values():
-            board.close()
-
-    def _write_boards(self, row: Mapping[str, Any]) -> None:
-        step = row["step"]
-        for name, value in row.items():
-            numbers = value if isinstance(value, list) else [value]
-            if name == "step" or any(number is None for number in numbers):
-                continue
-            self._board("mean").add_scalar(name, sum(numbers) / max(len(numbers), 1), step)
-            if len(numbers) > 1:
-                for seed, number in enumerate(numbers):
-                    self._board(f"seed-{seed}").add_scalar(name, number, step)
-
-    def _board(self, name: str) -> Any:
-        if name not in self._boards:
-            try:
-                # only here: the import takes a second, and the package is an extra
-                from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415
-            except ImportError:
-                raise MetricsError(
-                    "TensorBoard is not installed: pip install 'esp-marl[tensorboard]', or train without it"
-                ) from None
-            folder = str(self._folder if name == "mean" else Path(str(self._folder)) / name)
-            self._boards[name] = SummaryWriter(folder, purge_step=self._first_step or None, flush_secs=10)
-        return self._boards[name]
+        for sink in self._sinks:
+            sink.close()
 
 
 def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:

@@ -44,7 +44,7 @@ class PolicyController:
         if self.generators is not None:
             shape = (env.num_envs, env.spec.num_agents)
             noise = self.policy.head.noise(shape, self.generators).to(env.device)
-        action, self.memory = self.policy.act(observation.obs, self.memory, noise)
+        action, self.memory = self.policy.act(observation.obs, self.memory, noise, observation.action_mask)
         return action
 
 

@@ -6,7 +6,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from esp_cli.files.faults import reach
+from esp_cli.trackers import TrackedRun, open_trackers, require
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.initial import read_initial
@@ -88,14 +89,15 @@ class Trainer:
     Args:
         config: what to train.
         folder: where results go; held by the caller's lock. A checkpoint found there is continued.
+        track: names of trackers that get the metrics too.
 
     Raises:
-        ValueError: the checkpoint does not fit the configuration.
+        ValueError: the checkpoint does not fit the configuration, or a tracker is not installed.
     """
 
-    def __init__(self, config: RunConfig, folder: RunFolder, tensorboard: bool = False) -> None:
-        self.config, self.folder = config, folder
-        self.tensorboard = folder.path / "tensorboard" if tensorboard else None
+    def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = ()) -> None:
+        self.config, self.folder, self.track = config, folder, tuple(track)
+        require(self.track)
         self.learner = build_learner(config)
         self.iteration = 0
         self.stopped_seeds: dict[int, int] = {}
@@ -140,7 +142,9 @@ class Trainer:
             ValueError: every seed stopped on a number that is not finite.
         """
         started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
-        with MetricsWriter(self.folder.metrics_path, self.tensorboard, self.step) as writer:
+        tracked = TrackedRun(self.folder.path, self.config.seeds, self.folder.config, self.step)
+        sinks = open_trackers(self.track, tracked, self.notes.append)
+        with MetricsWriter(self.folder.metrics_path, sinks) as writer:
             if self.iteration == 0:
                 self._record(writer, self._evaluate(), listener)
             while not self.is_complete:
@@ -218,7 +222,8 @@ class Trainer:
                 numbers = [None if k in self.stopped_seeds else x for k, x in enumerate(numbers)]
             values[name] = numbers
         writer.write(self.step, values)
-        notes, self.notes = tuple(self.notes), []
+        notes = tuple(self.notes)
+        self.notes.clear()
         return listener(Progress(self.step, self.config.steps, values, notes))
 
     def _checkpoint(self) -> float:
@@ -288,4 +293,6 @@ def _same(a: Tensor, b: Tensor) -> bool:
     """Return whether two tensors are equal bit for bit, NaN included."""
     if a.dtype != b.dtype or a.shape != b.shape:
         return False
-    return torch.equal(a.cpu().reshape(-1).view(torch.uint8), b.cpu().reshape(-1).view(torch.uint8))
+    # a part of a longer buffer has strides that no view as bytes can have
+    a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
+    return torch.equal(a, b)

@@ -39,7 +39,7 @@ def test_targets_by_hand_on_the_last_two_transitions():
     linear_critic(trained, torch.arange(10.0))
     outputs = torch.zeros(2, 2, 26, 2, 5)
     outputs[:, :, 24, 0, 3] = outputs[:, :, 24, 1, 1] = 1.0  # encoded at 3 and 5 + 1
-    trained.target_policy.unroll = lambda obs, action: outputs
+    trained.target_policy.unroll = lambda obs, action, mask: outputs
     y = trained._targets(episodes, trained._critic_rows(episodes))
     torch.testing.assert_close(y[:, :, 23], episodes.reward[:, :, 23] + 0.5 * 9.0)
     torch.testing.assert_close(y[:, :, 24], episodes.reward[:, :, 24])

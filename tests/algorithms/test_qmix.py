@@ -37,14 +37,14 @@ def test_double_q_targets_by_hand_on_the_last_two_transitions():
     target[:, :, 24, 0, 3], target[:, :, 24, 1, 1] = 10.0, 20.0
     target[:, :, 24, 0, 0] = 99.0  # the target network's own favourite
     target[:, :, 25] = 7.0
-    trained.target_policy.unroll = lambda obs, action: target
+    trained.target_policy.unroll = lambda obs, action, mask: target
     reward = episodes.reward.mean(-1)
     y = trained._targets(episodes, online)[..., 0]
     torch.testing.assert_close(y[:, :, 23], reward[:, :, 23] + 0.5 * 30.0)
     torch.testing.assert_close(y[:, :, 24], reward[:, :, 24])
 
     single, _ = prepared(algo__double_q=False, algo__bootstrap_truncated=True)
-    single.target_policy.unroll = lambda obs, action: target
+    single.target_policy.unroll = lambda obs, action, mask: target
     y = single._targets(episodes, online)[..., 0]
     torch.testing.assert_close(y[:, :, 23], reward[:, :, 23] + 0.5 * 119.0)
     torch.testing.assert_close(y[:, :, 24], reward[:, :, 24] + 0.5 * 14.0)

@@ -10,13 +10,13 @@ from esp_cli.training.streams import stream_seeds
 from esp_envs.base import (
     Environment,
     Observation,
-    Scene,
     Step,
     TaskSettings,
     generator_states,
     generators_for,
     restore_generators,
 )
+from esp_envs.scene import Scene
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, joint_layout, layout
 
 SEEDS = (0, 1)

@@ -1,4 +1,4 @@
-"""The built site: every link leads somewhere, and nothing is loaded from elsewhere."""
+"""The built site: links lead somewhere, nothing is loaded from elsewhere, and a browser shows every page whole."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.site.browser import BROWSER, DESKTOP, PHONE, complaints
 from tests.site.built import faults
 
 ROOT = Path(__file__).parents[2]
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: .ci/install-chromium, or apt-get")
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +65,25 @@ def test_the_reference_pages_name_every_command_setting_and_task(site: Path) -> 
     assert "<code>--consistency-coef</code>" in commands
     assert [name for name in MappoConfig.model_fields if f"<code>mappo.{name}</code>" not in settings] == []
     assert [name for name in task_names() if f'id="{name}"' not in tasks] == []
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [DESKTOP, PHONE])
+def test_a_browser_shows_every_page_whole_and_says_nothing(site: Path, width: int, tmp_path: Path) -> None:
+    pages = [page for page in sorted(site.rglob("*.html")) if "source" not in page.parts and page.name != "404.html"]
+    assert len(pages) > 40
+    assert complaints(pages, width, tmp_path) == []
+
+
+@needs_browser
+def test_a_browser_notices_a_wide_page_a_cut_table_a_lost_picture_and_a_failing_script(tmp_path: Path) -> None:
+    page = tmp_path / "bad.html"
+    page.write_text(
+        "<h1>Bad</h1><article><table><tr><td style='min-width: 2000px'>x</table></article><img src='lost.png'>"
+        "<script>nothing.here()</script>"
+    )
+    (tmp_path / "scratch").mkdir()
+    found = "\n".join(complaints([page], PHONE, tmp_path / "scratch"))
+    assert "nothing is not defined" in found
+    for part in ("px too wide", "cuts a table", "does not show lost.png"):
+        assert f"bad: {part}" in found or part in found

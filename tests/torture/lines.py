@@ -56,7 +56,7 @@ class Lines:
         self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
         self.settings = dict(_settings())
         self._runner, self._done = CliRunner(), 0
-        train._train = lambda run, tensorboard: None  # a run that can begin is not a wrong line
+        train._train = lambda run, trackers: None  # a run that can begin is not a wrong line
 
     def count(self) -> int:
         """Return the command lines since the last call."""

@@ -1,10 +1,9 @@
-"""Metrics files: rows per update and seed, torn ends, resuming, TensorBoard."""
+"""Metrics files: rows per update and seed, torn ends, resuming."""
 
 from __future__ import annotations
 
 import json
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -163,29 +162,3 @@ def test_a_torn_line_does_not_swallow_the_next_row(path):
         with MetricsWriter(path) as writer:
             writer.write(999, {"train/loss": [1.0]})
         assert read_metrics(path) == [*before, {"step": 999, "train/loss": [1.0]}]
-
-
-def test_tensorboard_gets_the_mean_and_each_seed(tmp_path):
-    pytest.importorskip("tensorboard")
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    board = tmp_path / "tensorboard"
-    with MetricsWriter(tmp_path / "m.jsonl", tensorboard=board) as writer:
-        writer.write(100, {"train/loss": [1.0, 3.0], "time/seconds": 0.5, "train/kl": [math.nan, 1.0]})
-        writer.write(200, {"train/loss": [2.0, 6.0], "time/seconds": 0.75})
-
-    def scalars(folder, name):
-        accumulator = EventAccumulator(str(folder)).Reload()
-        return [(event.step, event.value) for event in accumulator.Scalars(name)]
-
-    assert scalars(board, "train/loss") == [(100, 2.0), (200, 4.0)]
-    assert scalars(board, "time/seconds") == [(100, 0.5), (200, 0.75)]
-    assert scalars(board / "seed-1", "train/loss") == [(100, 3.0), (200, 6.0)]
-    assert "train/kl" not in EventAccumulator(str(board)).Reload().Tags()["scalars"]
-
-
-def test_tensorboard_missing_is_one_sentence(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(MetricsError, match=r"pip install 'esp-marl\[tensorboard\]', or train without it"):
-        MetricsWriter(tmp_path / "m.jsonl", tensorboard=tmp_path / "tensorboard")
-    assert list(tmp_path.iterdir()) == []

@@ -21,16 +21,15 @@ from torch import Tensor
 from esp_envs.adapters import simulation
 from esp_envs.base import (
     OTHER_SIZE,
-    Body,
     Environment,
     Observation,
-    Scene,
     Step,
     TaskSettings,
     generator_states,
     require_shape,
     restore_generators,
 )
+from esp_envs.scene import Body, Scene
 from esp_envs.spec import Continuous, Field, Kind, Layout, TaskSpec, layout
 
 FORCE = Continuous(layout(Field("force", Kind.VECTOR, unit="share of the full force")))

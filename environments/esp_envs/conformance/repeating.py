@@ -51,8 +51,10 @@ def worlds_do_not_touch_each_other(subject: Subject) -> None:
     for _ in range(env.spec.horizon + 3):
         action = env.random_action()
         twin.random_action()
-        different = action.clone()
-        if isinstance(env.spec.action, Continuous):
+        different, mask = action.clone(), twin.action_mask()
+        if mask is not None:
+            different[:, 0] = mask[:, 0].int().argmax(-1)
+        elif isinstance(env.spec.action, Continuous):
             different[:, 0] = -action[:, 0]
         else:
             different[:, 0] = (action[:, 0] + 1) % env.spec.action.count

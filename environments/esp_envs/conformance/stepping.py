@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import torch
+from functools import partial
 
+import torch
+from torch import Tensor
+
+from esp_envs.base import Environment
 from esp_envs.conformance.subject import (
     WORLDS,
     Broken,
@@ -14,7 +18,7 @@ from esp_envs.conformance.subject import (
     same_observation,
     tensors_of,
 )
-from esp_envs.spec import Continuous
+from esp_envs.spec import Continuous, Discrete
 
 
 def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
@@ -25,6 +29,7 @@ def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
     for _ in range(spec.horizon + 2):
         require_equal("obs", tuple(observation.obs.shape), (*lead, spec.num_agents, spec.observation.width))
         require_equal("state", tuple(observation.state.shape), (*lead, spec.state.width))
+        _require_mask(env, observation.action_mask)
         step = env.step(env.random_action())
         observation = step.next
         require_equal("reward", tuple(step.reward.shape), (*lead, spec.num_agents))
@@ -41,13 +46,26 @@ def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
             require(same, "the spec says that agents share the reward, but they get different ones")
 
 
+def _require_mask(env: Environment, mask: Tensor | None) -> None:
+    spec, now = env.spec, env.action_mask()
+    if not isinstance(spec.action, Discrete) or not spec.masks:
+        require(mask is None and now is None, "an action mask is given, but the spec does not say 'masks'")
+        return
+    if mask is None or now is None:
+        raise Broken("the spec says 'masks', but an observation or 'action_mask()' gives none")
+    require_equal("action mask", (tuple(mask.shape), mask.dtype), ((*env.action_shape, spec.action.count), torch.bool))
+    require(bool(mask.any(-1).all()), "an action mask allows an agent nothing")
+    require(torch.equal(mask, now), "the observation's action mask differs from that of 'action_mask()'")
+
+
 def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -> None:
     """Shape, type and range of every joint action that the task itself proposes."""
     env = subject.worlds()
     env.reset()
     action = env.spec.action
     for name in (None, *env.heuristics):
-        for joint in (env.random_action(), env.heuristic(name) if env.heuristics else env.random_action()):
+        for propose in (env.random_action, partial(env.heuristic, name) if env.heuristics else env.random_action):
+            joint = propose()
             require_equal("a joint action", tuple(joint.shape), env.action_shape)
             if isinstance(action, Continuous):
                 require(joint.dtype == torch.float32, f"a continuous action is {joint.dtype}, not float32")
@@ -55,6 +73,9 @@ def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -
             else:
                 require(joint.dtype == torch.int64, f"a discrete action is {joint.dtype}, not int64")
                 require(int(joint.min()) >= 0 and int(joint.max()) < action.count, "an action is out of range")
+                mask = env.action_mask()
+                allowed = mask is None or bool(mask.gather(-1, joint.unsqueeze(-1)).all())
+                require(allowed, "an action is not among those that the mask allows")
             env.step(joint)
     if env.heuristics:
         first = torch.equal(env.heuristic(), env.heuristic(env.heuristics[0]))

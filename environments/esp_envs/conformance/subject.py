@@ -58,7 +58,8 @@ def same_step(a: Step, b: Step, where: tuple[slice | Tensor, ...] = ()) -> bool:
 
 def parts_of(observation: Observation) -> list[Tensor]:
     """Return what an observation consists of."""
-    return [observation.obs, observation.state]
+    mask = observation.action_mask
+    return [observation.obs, observation.state, *([] if mask is None else [mask])]
 
 
 def same_observation(a: Observation, b: Observation, where: tuple[Tensor, ...] = ()) -> bool:

@@ -10,15 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import (
-    OTHER_SIZE,
-    Observation,
-    Painter,
-    Scene,
-    TaskSettings,
-    generator_states,
-    restore_generators,
-)
+from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
 from esp_envs.epuck import steering
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
@@ -28,6 +20,7 @@ from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
 from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness
 from esp_envs.lockstep import LockstepTask, Outcome
+from esp_envs.scene import Painter, Scene
 
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 

@@ -7,9 +7,9 @@ import math
 import mujoco
 from PIL import ImageColor
 
-from esp_envs.base import GRID_SPACING, Body, Scene
 from esp_envs.drawing import BACKGROUND, FRAME, GRID
 from esp_envs.epuck.robot import AXLE_M, BODY_HEIGHT_M, BODY_RADIUS_M, WHEEL_RADIUS_M
+from esp_envs.scene import GRID_SPACING, Body, Scene
 
 WALL_HEIGHT_M = 0.03
 """Lower than a robot, so that the wall nearest to the camera hides none."""

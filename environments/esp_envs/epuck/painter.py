@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from esp_envs.base import Painter
 from esp_envs.epuck.gl import NoGraphicsError, forget_missing_backend
+from esp_envs.scene import Painter
 
 
 @contextmanager

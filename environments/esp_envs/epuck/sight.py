@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from esp_envs.base import Body, Scene
 from esp_envs.epuck.formation_spec import FormationSettings
 from esp_envs.epuck.robot import BODY_RADIUS_M
+from esp_envs.scene import Body, Scene
 
 FADING_M = 0.2
 """Gap over which the sight `nearness` of a body fades to 1/e."""

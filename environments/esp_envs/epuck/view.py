@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from esp_envs.base import Scene
 from esp_envs.drawing import TRAIL_WIDTH, fade, trails
 from esp_envs.epuck import gl
 from esp_envs.epuck.looks import GLOW, TRAIL_LAYER_M, WALL_HEIGHT_M, WALL_WIDTH_M, model_of
+from esp_envs.scene import Scene
 
 _ASPECT = 3 / 4
 _FIELD_OF_VIEW = math.radians(40)

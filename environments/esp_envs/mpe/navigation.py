@@ -9,10 +9,10 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.base import Body, Scene
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
+from esp_envs.scene import Body, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
 AGENT_RADIUS = 0.15

@@ -9,11 +9,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import Body, Scene
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, place, unit_disc
+from esp_envs.scene import Body, Scene
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
 PREDATOR_GAIN, PREY_GAIN = 3.0, 4.0

@@ -10,15 +10,14 @@ from torch import Tensor
 
 from esp_envs.base import (
     OTHER_SIZE,
-    Body,
     Environment,
     Observation,
-    Scene,
     Step,
     generator_states,
     require_shape,
     restore_generators,
 )
+from esp_envs.scene import Body, Scene
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP
 from esp_envs.wildlife.pictures import all_pictures, cell_index
 from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec

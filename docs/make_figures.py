@@ -1,0 +1,119 @@
+"""Draw the dot figures of the measurement pages from the tables of these pages: python docs/make_figures.py."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+DOCS = Path(__file__).parent
+COLOUR = "#0072B2"
+Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One column of one table, drawn as a dot and its standard error (or every seed) for each row.
+
+    Attributes:
+        page: Page in docs/measurements.
+        first: Header of the table's first column.
+        names: Columns whose texts together name a row.
+        value: Column that is drawn.
+        title: What stands above the panel.
+    """
+
+    page: str
+    first: str
+    names: Sequence[str]
+    value: str
+    title: str
+
+
+FIGURES: dict[str, tuple[Panel, ...]] = {
+    "choices": (Panel("choices", "run", ["run"], "return at 500k", "greedy return at 500k steps"),),
+    "wildlife-learners": (
+        Panel("wildlife", "learner", ["learner"], "drawn actions", "return with drawn actions"),
+        Panel("wildlife", "learner", ["learner"], "greedy", "greedy return"),
+    ),
+    "replay": (
+        Panel("replay", "learner and copies", ["learner and copies"], "greedy return", "copies, 500k steps"),
+        Panel("replay", "", [""], "150k", "the horizon, 150k steps"),
+    ),
+    "maddpg-settings": (
+        Panel("maddpg-settings", "learning rates", ["learning rates", "others"], "100k steps", "return at 100k steps"),
+    ),
+    "qmix-settings": (
+        Panel(
+            "qmix-settings",
+            "learning rate",
+            ["learning rate", "mixer sees", "`td_lambda`", "`target_every`"],
+            "100k steps",
+            "navigation, with the prior, 100k steps",
+        ),
+        Panel("qmix-settings", "", [""], "greedy return at 200k", "predator-prey, plain, 200k steps"),
+    ),
+    "speed": (Panel("speed", "layout", ["layout", "seeds"], "seed-steps/s", "seed-steps per second"),),
+}
+"""Figure in docs/measured -> its panels."""
+
+
+def table(panel: Panel) -> list[Row]:
+    """Return the rows of the table that has a panel's columns.
+
+    Raises:
+        ValueError: no table of the page has them.
+    """
+    text = (DOCS / "measurements" / f"{panel.page}.md").read_text(encoding="utf-8")
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        cells = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in block.splitlines()]
+        if cells[0][0] == panel.first and panel.value in cells[0]:
+            return [dict(zip(cells[0], row, strict=True)) for row in cells[2:]]
+    raise ValueError(f"docs/measurements/{panel.page}.md has no table with the column '{panel.value}'")
+
+
+def numbers(cell: str) -> tuple[float, float, list[float]]:
+    """Return mean, standard error and, where a cell lists them, the seeds of a cell such as '-1.5 ± 0.2' or '3, 4'."""
+    text = re.sub(r"\(.*|\*", "", cell).replace("−", "-")
+    found = [float(number.replace(",", "")) for number in re.findall(r"-?\d[\d,]*\.?\d*", text.replace(", ", " "))]
+    if "±" in text:
+        return found[0], found[1], []
+    return sum(found) / len(found), 0.0, found if len(found) > 1 else []
+
+
+def draw(ax: Axes, panel: Panel) -> None:
+    """Draw a panel: the first row of the table on top."""
+    rows = [row for row in table(panel) if row[panel.value]]
+    for place, row in enumerate(reversed(rows)):
+        mean, error, seeds = numbers(row[panel.value])
+        ax.errorbar(mean, place, xerr=error or None, fmt="o", color=COLOUR, capsize=3)
+        ax.plot(seeds, [place] * len(seeds), "|", color=COLOUR)
+    labels = [re.sub(r"[*`]", "", ", ".join(row[name] for name in panel.names if row[name])) for row in rows]
+    ax.set_yticks(range(len(rows)), labels[::-1])
+    ax.set_ylim(-0.6, len(rows) - 0.4)
+    ax.set_title(panel.title, loc="left", fontsize=10)
+    ax.grid(axis="x", alpha=0.4)
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def main() -> None:
+    """Draw every figure."""
+    mpl.rcParams.update({"font.size": 9, "svg.hashsalt": "esp"})
+    for name, panels in FIGURES.items():
+        heights = [len(table(panel)) + 2 for panel in panels]
+        figure = Figure(figsize=(8.0, 0.25 * sum(heights)), layout="constrained")
+        axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for ax, panel in zip(axes, panels, strict=True):
+            draw(ax, panel)
+        if name != "speed":
+            axes[-1].set_xlabel("mean and standard error over seeds")
+        figure.savefig(DOCS / "measured" / f"{name}.png", dpi=150, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    main()

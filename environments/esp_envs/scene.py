@@ -1,0 +1,66 @@
+"""What a task gives to whoever draws it: bodies in a window, and nothing about how they are painted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Body:
+    """One thing to draw.
+
+    Attributes:
+        position: (x, y) in world units.
+        radius: in world units.
+        color: "#rrggbb".
+        shape: "disc", "ring", "cross" or "square".
+        heading: direction of a nose mark in radians, or None.
+        trail: whether a renderer may draw its path.
+        model: what a renderer in space builds of it ("robot", "pillar", "goal"); flat pictures ignore it.
+    """
+
+    position: tuple[float, float]
+    radius: float
+    color: str
+    shape: str = "disc"
+    heading: float | None = None
+    trail: bool = False
+    model: str | None = None
+
+
+GRID_SPACING = 0.5
+"""Distance of the lines behind a scene, unless it says otherwise."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order.
+
+    `grid` is the distance of the lines behind them and where one of them lies, along either axis.
+    """
+
+    bodies: tuple[Body, ...]
+    window: tuple[float, float, float, float]
+    grid: tuple[float, float] = (GRID_SPACING, 0.0)
+
+
+class Painter(Protocol):
+    """What draws scenes.
+
+    Attributes:
+        note: a sentence for the user about how it draws, or None.
+    """
+
+    note: str | None
+
+    def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
+        """Draw one scene with the trails that bodies left in earlier scenes of the same world, oldest first.
+
+        Shape:
+            [H, W, 3] uint8, red, green and blue; the first row is the top.
+        """

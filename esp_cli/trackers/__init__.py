@@ -1,0 +1,52 @@
+"""Trackers: where metrics go beside `metrics.jsonl`, which stays the truth. None of them can stop a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+
+from esp_cli.trackers.sink import Guarded, Sink, TrackedRun
+
+__all__ = ["TRACKERS", "Guarded", "Sink", "TrackedRun", "open_trackers", "require"]
+
+TRACKERS = {
+    "tensorboard": "esp_cli.trackers.tensorboard:TensorBoard",
+    "wandb": "esp_cli.trackers.wandb:WeightsAndBiases",
+    "mlflow": "esp_cli.trackers.mlflow:MlFlow",
+}
+"""The trackers by name: a class that takes a `TrackedRun` and is a `Sink`. Name, extra and package have one name."""
+
+
+def require(names: Sequence[str]) -> None:
+    """Refuse trackers that nobody knows, or whose package is not installed.
+
+    Raises:
+        ValueError: with what to install.
+    """
+    for name in names:
+        if name not in TRACKERS:
+            raise ValueError(f"there is no tracker '{name}'; the trackers are {', '.join(TRACKERS)}")
+        if find_spec(name) is None:
+            raise ValueError(f"{name} is not installed: pip install 'esp-marl[{name}]', or leave out --track {name}")
+
+
+def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:
+    """Open trackers for a run; one that cannot be opened is told and left out.
+
+    Args:
+        names: of `TRACKERS`.
+        run: that is tracked.
+        tell: takes one sentence for the user about a tracker that fails.
+
+    Raises:
+        ValueError: as of `require`.
+    """
+    require(names)
+    return [Guarded(name, partial(_made, name, run), tell) for name in dict.fromkeys(names)]
+
+
+def _made(name: str, run: TrackedRun) -> Sink:
+    module, attribute = TRACKERS[name].split(":")
+    return getattr(import_module(module), attribute)(run)

@@ -1,0 +1,68 @@
+"""A headless Chromium that opens pages of a built site at a width and says what is wrong with them."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+DESKTOP, PHONE = 1300, 390
+AT_ONCE = 12
+
+# One page with a frame for each page of the site: frames have a width of their own, below what a window may have.
+FRAMES = """<!doctype html><meta charset="utf-8"><body>
+{frames}
+<script>
+window.onload = () => {{
+  const found = [];
+  for (const frame of document.querySelectorAll("iframe")) {{
+    const page = frame.contentDocument, root = page.documentElement;
+    const say = text => found.push(frame.title + ": " + text);
+    if (!page.querySelector("h1")) say("has no heading");
+    if (root.scrollWidth > root.clientWidth) say("is " + (root.scrollWidth - root.clientWidth) + " px too wide");
+    for (const picture of page.images) if (!picture.naturalWidth) say("does not show " + picture.getAttribute("src"));
+    for (const table of page.querySelectorAll("article table")) {{
+      const box = table.parentElement.closest(".md-typeset__scrollwrap, .highlighttable, .highlight") || page.body;
+      const cut = table.getBoundingClientRect().right > root.clientWidth + 1;
+      if (cut && !["auto", "scroll"].includes(frame.contentWindow.getComputedStyle(box).overflowX)) say("cuts a table");
+    }}
+  }}
+  document.body.innerHTML = "<pre id=found></pre>";
+  document.getElementById("found").textContent = JSON.stringify(found);
+}};
+</script></body>
+"""
+
+
+def complaints(pages: Sequence[Path], width: int, scratch: Path) -> list[str]:
+    """Return what a browser finds wrong with pages at a width: too wide, cut tables, lost pictures, console messages.
+
+    Args:
+        pages: Files of the site.
+        width: Of the view, in CSS pixels.
+        scratch: An empty folder.
+    """
+    found: list[str] = []
+    for start in range(0, len(pages), AT_ONCE):
+        frames = "\n".join(
+            f'<iframe title="{page.stem}" src="{page.as_uri()}" width="{width}" height="900"></iframe>'
+            for page in pages[start : start + AT_ONCE]
+        )
+        frame_page = scratch / "frames.html"
+        frame_page.write_text(FRAMES.format(frames=frames), encoding="utf-8")
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+        flags += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files", "--dump-dom"]
+        flags += ["--enable-logging=stderr", f"--user-data-dir={scratch / 'profile'}", "--window-size=1500,1000"]
+        command = [str(BROWSER), *flags, frame_page.as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+        found += [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+        answer = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
+        assert answer is not None, "the browser gave no answer"
+        found += json.loads(html.unescape(answer[1]))
+    return found
