@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import inspect
-from typing import Annotated
+import json as json_text
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, register_tasks
 
+CARDS = Path(__file__).with_name("task_cards.json")
+"""What `describe` returns for the built-in tasks: the command imports no torch. docs/make_task_cards.py writes it."""
 EPILOG = """Examples:\n
     esp tasks\n
     esp tasks navigation"""
@@ -20,44 +25,48 @@ def tasks(
     json: JsonOption = None,
 ) -> None:
     """List the tasks with their symmetries, or print the card of one task."""
-    from esp_cli.symmetry import carried_groups
-    from esp_envs.registry import make, task_class, task_names
-    from esp_envs.spec import describe_action
-
-    register_tasks([task] if task else None)
-    found = []
-    for name in (task,) if task else task_names():
-        spec = make(name, 1, [0]).spec
-        cls = task_class(name)
-        found.append(
-            {
-                "task": name,
-                "version": spec.version,
-                "convention": spec.convention,
-                "agents": spec.num_agents,
-                "horizon": spec.horizon,
-                "observation": [
-                    dict(zip(("index", "field", "kind", "unit"), r, strict=True)) for r in spec.observation.table()
-                ],
-                "actions": [" ".join(pair) for pair in describe_action(spec.action)],
-                "symmetries": list(carried_groups(spec)),
-                "heuristics": list(cls.heuristics),
-                "settings": {
-                    key: {"default": field.default, "description": field.description or ""}
-                    for key, field in cls.Settings.model_fields.items()
-                },
-            }
-        )
+    built_in = json_text.loads(CARDS.read_text(encoding="utf-8"))
+    names = [task] if task else list(dict.fromkeys((*built_in, *(e.name for e in entry_points(group="esp.tasks")))))
+    found = [built_in[name] if name in built_in else describe(name) for name in names]
+    shown = [{key: value for key, value in card.items() if key != "card"} for card in found]
     if json != "-":
         if task:
-            _print_card(task_class(task), found[0])
+            _print_card(found[0])
         else:
             _print_list(found)
     if json is not None:
-        console.write_json(json, found[0] if task else found)
+        console.write_json(json, shown[0] if task else shown)
 
 
-def _print_list(found: list[dict]) -> None:  # type: ignore[type-arg]
+def describe(name: str) -> dict[str, Any]:
+    """Return what the command says of a task, which is imported and made."""
+    from esp_cli.symmetry import carried_groups
+    from esp_envs.registry import make, task_class
+    from esp_envs.spec import describe_action
+
+    register_tasks([name])
+    spec, cls = make(name, 1, [0]).spec, task_class(name)
+    return {
+        "task": name,
+        "version": spec.version,
+        "convention": spec.convention,
+        "agents": spec.num_agents,
+        "horizon": spec.horizon,
+        "observation": [
+            dict(zip(("index", "field", "kind", "unit"), r, strict=True)) for r in spec.observation.table()
+        ],
+        "actions": [" ".join(pair) for pair in describe_action(spec.action)],
+        "symmetries": list(carried_groups(spec)),
+        "heuristics": list(cls.heuristics),
+        "settings": {
+            key: {"default": field.default, "description": field.description or ""}
+            for key, field in cls.Settings.model_fields.items()
+        },
+        "card": inspect.cleandoc(cls.__doc__ or ""),
+    }
+
+
+def _print_list(found: list[dict[str, Any]]) -> None:
     rows = [
         (t["task"], t["version"], t["agents"], t["horizon"], ", ".join(t["symmetries"]), t["convention"]) for t in found
     ]
@@ -65,8 +74,8 @@ def _print_list(found: list[dict]) -> None:  # type: ignore[type-arg]
     console.note("esp tasks NAME prints a task's card")
 
 
-def _print_card(cls: type, card: dict) -> None:  # type: ignore[type-arg]
-    console.say(inspect.cleandoc(cls.__doc__ or ""))
+def _print_card(card: dict[str, Any]) -> None:
+    console.say(card["card"])
     console.say("")
     rows = [tuple(row.values()) for row in card["observation"]]
     console.table(("index>", "field", "kind", "unit"), rows, title="Observation of one agent")
