@@ -27,6 +27,15 @@ def prepare() -> None:
     libc.mallopt(_M_TOP_PAD, 64 * _MEBIBYTE)
 
 
+def busy_with() -> float:
+    """Return how many other programs kept each core of this machine busy in the last minute; 0 where that is unknown."""
+    try:
+        load = os.getloadavg()[0]
+    except OSError:
+        return 0.0
+    return load / (os.cpu_count() or 1)
+
+
 def resolve_device(wanted: str) -> str:
     """Return "cpu" or "cuda" for what --device asks for.
 

@@ -56,24 +56,32 @@ def evaluate(
         console.note(text)
     result = evaluate_policy(trained, episodes)
     if json != "-":
-        _print(result)
+        _print(result, trained.source.stem if trained.source.is_file() else str(trained.source))
     if json is not None:
         console.write_json(json, result)
 
 
-def _print(result: FinalEvaluation) -> None:
+def _print(result: FinalEvaluation, policy: str) -> None:
     rows = []
-    for mode, returns in (("greedy", result.greedy), ("stochastic", result.stochastic)):
-        rows.append((mode, console.format_mean(returns.mean, returns.sem), console.format_interval(returns.ci95)))
+    alone = len(result.seeds) == 1
+    for mode in ("greedy", "stochastic"):
+        returns = result.returns(mode)
+        error = result.over_episodes[mode] if alone else returns
+        rows.append((mode, console.format_mean(returns.mean, error.sem), console.format_interval(error.ci95)))
     first = "".join(result.heuristics[:1])
     names = {"random": "random", "heuristic": f"heuristic {first}"}
     names = {key: names.get(key, f"heuristic {key}") for key in result.anchors}
-    rows += [(names[key], f"{value:.2f}", "-") for key, value in result.anchors.items()]
+    for key, value in result.anchors.items():
+        error = result.over_episodes[key]
+        rows.append((names[key], console.format_mean(value, error.sem), console.format_interval(error.ci95)))
     title = (
-        f"{result.task} version {result.task_version} after {console.format_count(result.step)} steps, "
+        f"{policy} on {result.task} version {result.task_version} after {console.format_count(result.step)} steps, "
         f"{len(result.seeds)} seed(s) x {result.episodes} episodes"
     )
-    caption = f"convention {result.convention}; mean ± s.e.m. and 95 % bootstrap interval over seeds"
+    over = (
+        f"over {result.episodes} episodes of one seed" if alone else "over seeds, of reference policies over episodes"
+    )
+    caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
     console.table(("policy", "episode return>", "95 % interval>"), rows, title=title, caption=caption)
     metrics = [
         (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key][metric]:.4f}" for key in names))

@@ -66,8 +66,13 @@ ThresholdOption = Annotated[
 ModeOption = Annotated[
     Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
 ]
-ViewOption = Annotated[
-    tuple[float, float] | None, typer.Option("--view", help="Lowest and highest return in the picture.")
+LimitsOption = Annotated[
+    tuple[float, float] | None,
+    typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
+]
+OldViewOption = Annotated[tuple[float, float] | None, typer.Option("--view", help="Old for --y-limits.", hidden=True)]
+CsvOption = Annotated[
+    Path | None, typer.Option("--csv", help="Write every logged number of every seed as a table.", metavar="FILE")
 ]
 PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")]
 
@@ -82,8 +87,10 @@ def report(
     threshold: ThresholdOption = None,
     reference: ReferenceOption = None,
     mode: ModeOption = None,
-    view: ViewOption = None,
+    y_limits: LimitsOption = None,
+    view: OldViewOption = None,
     plot: PlotOption = None,
+    csv: CsvOption = None,
     task: OwnTaskOption = None,
     algo: OwnAlgoOption = None,
     network: OwnNetworkOption = None,
@@ -91,6 +98,7 @@ def report(
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
     from esp_cli.reporting import collect, curves, loose
+    from esp_cli.reporting.csv_file import write_csv
     from esp_cli.studies.study import StudyFolder
 
     register_tasks(task)
@@ -103,33 +111,46 @@ def report(
         return
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
-    check_finite("--view", *(view or ()))
-    if view is not None and view[0] >= view[1]:
-        raise ValueError(f"--view {view[0]:g} {view[1]:g} is empty; write the lowest return before the highest")
+    y_limits = _limits(y_limits, view)
     is_study = StudyFolder.is_one(Path(runs[0]))
     if is_study:
-        if len(runs) > 1 or at or reference or plot or view:
+        if len(runs) > 1 or at or reference or plot or y_limits:
             raise ValueError(
-                "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --view"
+                "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
             )
         material = collect.collect(StudyFolder.open(Path(runs[0])), mode, limits)
         out = out or Path(runs[0]) / "report"
-        document = material.results.document()
+        document, folders = material.results.document(), material.runs
     else:
         command = _command(runs, at or [], limits, mode, out)
         steps, asked = [parse_count(text) for text in at or []], mode or "greedy"
         places = [_labelled(text) for text in runs]
         found = [curves.read_curve(path, label, asked) for label, path in places]
+        folders = {curve.label: path for curve, (_, path) in zip(found, places, strict=True)}
         material = loose.put_together(found, [path for _, path in places], command, asked, steps, limits)
         document = loose.comparison(material, limits)
     if json != "-":
-        print_tables(material.results)
+        with console.paged():
+            print_tables(material.results)
     if json is not None:
         console.write_json(json, document)
+    if csv is not None:
+        console.note(f"{write_csv(csv, folders)} rows -> {csv}")
     if plot is not None:
-        for file in loose.plot(material, plot, lines, view):
+        for file in loose.plot(material, plot, lines, y_limits):
             console.note(f"curves -> {file}")
     _write(material, out, films, results)
+
+
+def _limits(given: tuple[float, float] | None, old: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the limits of the picture, which had another spelling."""
+    if old is not None:
+        console.note("--view LOW HIGH is now --y-limits LOW HIGH")
+    limits = given or old
+    check_finite("--y-limits", *(limits or ()))
+    if limits is not None and limits[0] >= limits[1]:
+        raise ValueError(f"--y-limits {limits[0]:g} {limits[1]:g} is empty; write the lowest return before the highest")
+    return limits
 
 
 def _command(

@@ -6,12 +6,14 @@ name (`formation-mappo-esp`) or by its task, and then by algorithm and prior.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.deploy import manifest
 from esp_cli.deploy.manifest import Entry, read_bundled
 from esp_cli.files.documents import shortened
+from esp_cli.files.suggesting import did_you_mean
 from esp_cli.training.loading import TrainedPolicy, load_policy
 from esp_envs.registry import task_names
 
@@ -75,11 +77,19 @@ def open_policy(
     if there and not choosy:
         return load_policy(where)
     if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled(folder)):
-        return load_entry(find(str(where), algo, prior, folder), folder)
+        entry = find(str(where), algo, prior, folder)
+        trained = load_entry(entry, folder)
+        if entry.name == str(where):
+            return trained
+        return replace(trained, notes=(*trained.notes, f"{where}: taking the bundled policy {entry.name}"))
     if choosy:
         raise ValueError(
             f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out"
         )
+    if not there:
+        known = [*task_names(), *(entry.name for entry in read_bundled(folder))]
+        if hint := did_you_mean(str(where), known):
+            raise ValueError(f"{where} does not exist{hint}")
     return load_policy(where)
 
 

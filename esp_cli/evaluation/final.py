@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from esp_cli import __version__
-from esp_cli.evaluation.statistics import SeedSummary, summarise
+from esp_cli.evaluation.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import (
@@ -52,6 +52,8 @@ class FinalEvaluation(BaseModel):
         metrics: the task's measures of the greedy policy.
         metrics_per_seed: the same by seed.
         anchor_metrics: the same of each reference policy.
+        over_episodes: error of the mean over episodes, of each reference policy, and of "greedy" and "stochastic" where
+            the run has one seed.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -72,6 +74,7 @@ class FinalEvaluation(BaseModel):
     metrics: Metrics
     metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
     anchor_metrics: dict[str, Metrics] = {}
+    over_episodes: dict[str, EpisodeSpread] = {}
 
     def returns(self, mode: Mode) -> SeedSummary:
         """Return the returns of the policy that acts in this way."""
@@ -89,6 +92,9 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
         anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
+    spread = dict(anchors)
+    if len(seeds) == 1:
+        spread |= {"greedy": greedy, "stochastic": stochastic}
     return FinalEvaluation(
         esp_version=__version__,
         task=trained.config.task,
@@ -106,6 +112,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         metrics=_means(greedy),
         metrics_per_seed={name: tuple(value.mean(1).tolist()) for name, value in greedy.metrics.items()},
         anchor_metrics={name: _means(played) for name, played in anchors.items()},
+        over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
     )
 
 

@@ -13,6 +13,7 @@ from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
 BESIDE = {"esp_version", "source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
+BESIDE |= {"over_episodes"}
 
 
 def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, tmp_path: Path) -> None:
@@ -43,14 +44,43 @@ def test_json_on_standard_output_is_alone_there(finished: Path) -> None:
     assert set(result) == DOCUMENTED | BESIDE
 
 
-def test_one_seed_has_no_error_to_state(tmp_path: Path) -> None:
+def test_one_seed_has_no_error_over_seeds_and_states_that_over_episodes(tmp_path: Path) -> None:
     run = train_tiny(tmp_path / "one", steps=50)
-    result = json.loads(esp("eval", run, "--episodes", 2, "--json", "-").stdout)
+    told = esp("eval", run, "--episodes", 8, "--json", tmp_path / "result.json").stdout
+    result = json.loads((tmp_path / "result.json").read_text())
     assert result["greedy"]["sem"] is None
     assert result["greedy"]["ci95"] is None
-    (row,) = (line for line in esp("eval", run, "--episodes", 2).stdout.splitlines() if "greedy  " in line)
+    spread = result["over_episodes"]
+    assert set(spread) == {"greedy", "stochastic", *result["anchors"]}
+    (row,) = (line for line in told.splitlines() if "greedy  " in line and "heuristic" not in line)
+    low, high = spread["greedy"]["ci95"]
+    assert low < result["greedy"]["mean"] < high
     cells = [cell.strip() for cell in row.strip("│").split("│")]
-    assert cells == ["greedy", f"{result['greedy']['mean']:.2f}", "-"]
+    assert cells == [
+        "greedy",
+        f"{result['greedy']['mean']:.2f} ± {spread['greedy']['sem']:.2f}",
+        f"[{low:.2f}, {high:.2f}]",
+    ]
+    assert "95 % interval over 8 episodes of one seed" in told
+
+
+def test_several_seeds_state_their_error_over_seeds_and_say_so(finished: Path) -> None:
+    told = esp("eval", finished, "--episodes", 4).stdout
+    assert "95 % interval over seeds, of reference policies over episodes" in told
+    spread = json.loads(esp("eval", finished, "--episodes", 4, "--json", "-").stdout)["over_episodes"]
+    assert set(spread) == {"random", "heuristic", "cover"}, "the policy's episodes are those of two seeds"
+
+
+def test_a_policy_that_was_chosen_by_its_task_is_named() -> None:
+    told = esp("eval", "navigation", "--episodes", 2)
+    assert "navigation: taking the bundled policy navigation-mappo-esp" in told.stderr.splitlines()
+    assert "navigation-mappo-esp on navigation version 1" in told.stdout
+    assert "taking" not in esp("eval", "navigation-mappo-esp", "--episodes", 2).stderr
+
+
+def test_a_near_miss_of_a_policy_is_answered_by_the_one_that_is_meant() -> None:
+    assert refused("eval", "formatio") == "formatio does not exist; did you mean 'formation'?"
+    assert "give the folder that esp train --out made" in refused("eval", "zzz")
 
 
 def test_a_policy_file_gives_the_same_numbers_as_its_run_every_time(finished: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shlex
 from pathlib import Path
@@ -11,6 +12,7 @@ from PIL import Image
 
 from esp_cli.evaluation.statistics import mean_and_sem
 from esp_cli.formatting import format_mean
+from esp_cli.training.metrics import read_metrics
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 
@@ -18,6 +20,28 @@ from tests.cli.running import DAMAGE, esp, refused, train_tiny
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the same seeds without the prior."""
     return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seeds", "3,7", "--prior", "none")
+
+
+def test_every_logged_number_is_a_cell_of_the_csv(finished: Path, plain: Path, tmp_path: Path) -> None:
+    file = tmp_path / "new" / "all.csv"
+    esp("report", f"a,b={plain}", finished, "--csv", file, "--json", "-")
+    with file.open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    assert {(row["run"], row["seed"]) for row in rows} == {
+        (name, seed) for name in ("a,b", "finished") for seed in "37"
+    }
+    for run, name in ((plain, "a,b"), (finished, "finished")):
+        for logged in read_metrics(run / "metrics.jsonl"):
+            (row,) = [r for r in rows if (r["run"], r["seed"], r["step"]) == (name, "7", str(logged["step"]))]
+            assert row["eval/return_greedy"] == str(logged.get("eval/return_greedy", [None, ""])[1])
+            assert row["time/elapsed_s"] == str(logged.get("time/elapsed_s", "")), "a number of the whole run"
+
+
+def test_the_old_spelling_of_the_limits_still_works_with_a_note(finished: Path, plain: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "curves.png"
+    told = esp("report", plain, finished, "--view", "-200", "0", "--plot", picture)
+    assert "--view LOW HIGH is now --y-limits LOW HIGH" in told.stderr
+    assert picture.is_file()
 
 
 def cells(line: str) -> list[str]:

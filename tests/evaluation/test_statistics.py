@@ -11,6 +11,8 @@ from scipy import stats
 
 from esp_cli.evaluation.curve_statistics import StepsToThreshold, area_under_curve, curve_band, steps_to_threshold
 from esp_cli.evaluation.statistics import (
+    MOST_RESAMPLED,
+    EpisodeSpread,
     Estimate,
     aggregate,
     bootstrap_interval,
@@ -19,6 +21,7 @@ from esp_cli.evaluation.statistics import (
     mean_and_sem,
     normalise,
     probability_of_improvement,
+    spread_over_episodes,
 )
 
 TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]
@@ -239,3 +242,20 @@ def test_a_stopped_seed_leaves_a_gap(recwarn):
 def test_curve_band_wants_seeds():
     with pytest.raises(ValueError, match=r"\[K, S\], not of shape \[3\]"):
         curve_band([1.0, 2.0, 3.0])
+
+
+def test_the_spread_over_episodes_is_that_of_their_mean() -> None:
+    spread = spread_over_episodes([1.0, 3.0, 5.0, 7.0])
+    assert spread.sem == pytest.approx(math.sqrt(20 / 3) / 2)
+    assert spread.ci95 is not None
+    assert spread.ci95[0] < 4 < spread.ci95[1]
+    assert spread_over_episodes([2.0]) == EpisodeSpread(None, None)
+    assert spread_over_episodes([2.0, 2.0]) == EpisodeSpread(0.0, None)
+
+
+def test_many_episodes_have_the_normal_interval_and_it_is_near_the_bootstraps() -> None:
+    returns = np.random.default_rng(0).normal(-100, 10, MOST_RESAMPLED + 1)
+    many, fewer = spread_over_episodes(returns), spread_over_episodes(returns[:-1])
+    assert many.sem is not None
+    assert many.ci95 == pytest.approx((returns.mean() - 1.959964 * many.sem, returns.mean() + 1.959964 * many.sem))
+    assert fewer.ci95 == pytest.approx(many.ci95, abs=0.1)
