@@ -28,7 +28,7 @@ def prepare() -> None:
 
 
 def busy_with() -> float:
-    """Return how many other programs kept each core of this machine busy in the last minute; 0 where that is unknown."""
+    """Return how many programs wanted each core in the last minute; 0 where that is unknown."""
     try:
         load = os.getloadavg()[0]
     except OSError:

@@ -14,6 +14,7 @@ from esp_cli import console
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
+from esp_cli.machine import busy_with
 
 if TYPE_CHECKING:
     from esp_cli.evaluation.final import Mode
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from esp_cli.studies.study import Study, StudyFolder
 
 _MEBIBYTE = 2**20
+BUSY = 0.5
+"""Load per core from which a forecast is called unreliable."""
 
 
 def run_study(
@@ -116,11 +119,17 @@ def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json
     from esp_cli.studies.forecast import forecast
 
     with console.TrainingProgress(len(folder.study.cells), description="measure") as progress:
+        busy = busy_with()  # before the measurement, which keeps a core busy itself
         found = forecast(folder, others, jobs, progress.update)
     if json is not None:
         console.write_json(json, found)
     if json != "-":
         _print_forecast(found)
+    if busy > BUSY:
+        console.note(
+            f"this machine was busy (load {busy:.1f} per core) while this was measured, so the times are unreliable; "
+            "ask again when it is idle"
+        )
 
 
 def _print_forecast(found: Forecast) -> None:

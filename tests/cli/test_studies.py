@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import console
+from esp_cli.commands import studying
 from esp_cli.commands.study_options import parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.studies.engine_local import LocalEngine
@@ -39,6 +40,16 @@ def test_names_and_steps_are_read_from_lists() -> None:
     )
     with pytest.raises(ValueError, match="'soon' is not a number of steps"):
         parse_study_steps(["formation=soon"])
+
+
+@pytest.mark.parametrize(("load", "unreliable"), [(3.0, True), (0.1, False)])
+def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load: float, unreliable: bool
+) -> None:
+    monkeypatch.setattr(studying, "busy_with", lambda: load)
+    told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "s", "--dry-run", "--jobs", 2)
+    assert ("this machine was busy (load 3.0 per core)" in told.stderr) == unreliable
+    assert ("the times are unreliable" in told.stderr) == unreliable
 
 
 def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> None:
