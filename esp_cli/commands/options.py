@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
+from esp_cli import console
 from esp_cli.files.documents import parse_value
 
 T = TypeVar("T")
 
 _MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
 _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
+_SEED_LIST = re.compile(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?")
 MAX_STEPS = 10**12
 """Steps that one run may take; the fastest machine needs years for them."""
 MAX_SEEDS = 1000
@@ -46,10 +48,10 @@ def parse_count(value: str | int) -> int:
 
 
 def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
-    """Read the seeds of a run: "10" means the ten seeds 0..9, "3,7" the seeds 3 and 7, "7," the seed 7 alone.
+    """Read how many seeds a run has: "10" means the ten seeds 0..9; a list, as 3,7, is taken too, with a note.
 
     Raises:
-        ValueError: not a list of seeds, a seed twice, or too many seeds.
+        ValueError: not a number of seeds, or too many.
     """
     if not isinstance(value, str | int):
         return tuple(value)
@@ -58,15 +60,42 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
         count = int(text)
         if not 1 <= count <= MAX_SEEDS:
             raise ValueError(
-                f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one as '{text},'"
+                f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one by --seed-list {text}"
             )
         return tuple(range(count))
-    if not re.fullmatch(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?", text):
-        raise ValueError(f"'{text}' does not name seeds; write how many, as 10, or a list, as 3,7")
+    if not _SEED_LIST.fullmatch(text):
+        raise ValueError(f"'{text}' does not name seeds; write how many, as --seeds 10, or which, as --seed-list 3,7")
+    seeds = parse_seed_list(text)
+    console.note(f"--seeds {text} is now --seed-list {','.join(map(str, seeds))}")
+    return seeds
+
+
+def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
+    """Read the seeds of a run by their numbers: "3,7" means the seeds 3 and 7, "7" the seed 7 alone.
+
+    Raises:
+        ValueError: not a list of seeds, a seed twice, or too many seeds.
+    """
+    text = str(value).strip() if isinstance(value, str) else ",".join(map(str, value))
+    if not _SEED_LIST.fullmatch(text):
+        raise ValueError(f"'{text}' is not a list of seeds; write their numbers, as 3,7")
     seeds = tuple(int(item) for item in text.split(",") if item.strip())
+    if len(seeds) > MAX_SEEDS:
+        raise ValueError(f"{len(seeds)} seeds cannot be trained at once; name at most {MAX_SEEDS}")
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"the seeds '{text}' name one seed twice; name each once")
     return seeds
+
+
+def chosen_seeds(seeds: tuple[int, ...], named: tuple[int, ...] | None, default: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the seeds that `--seeds` and `--seed-list` ask for.
+
+    Raises:
+        ValueError: both are given.
+    """
+    if named is not None and seeds != default:
+        raise ValueError("--seeds and --seed-list both say which seeds to train; leave one of them out")
+    return seeds if named is None else named
 
 
 def parse_assignments(items: Iterable[str]) -> dict[str, object]:
@@ -199,15 +228,25 @@ StepsOption = Annotated[
 ]
 if TYPE_CHECKING:
     SeedsOption = tuple[int, ...]
+    SeedListOption = tuple[int, ...] | None
 else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
     SeedsOption = Annotated[
         tuple,
         typer.Option(
             "--seeds",
             "-s",
-            help="How many seeds to train at once (10 means 0..9), or which, as 3,7.",
+            help="How many seeds to train at once: 10 means the seeds 0 to 9.",
+            metavar="COUNT",
+            parser=_option_parser(parse_seeds, "COUNT"),
+        ),
+    ]
+    SeedListOption = Annotated[
+        tuple | None,
+        typer.Option(
+            "--seed-list",
+            help="Which seeds to train at once, by number, as 3,7.",
             metavar="SEEDS",
-            parser=_option_parser(parse_seeds, "SEEDS"),
+            parser=_option_parser(parse_seed_list, "SEEDS"),
         ),
     ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,8 +16,10 @@ from esp_cli.commands.options import (
     DeviceOption,
     EpisodesOption,
     JsonOption,
+    SeedListOption,
     SeedsOption,
     SetOption,
+    chosen_seeds,
     parse_assignments,
     parse_count,
     register_learners,
@@ -146,13 +148,13 @@ class StudyChoices:
 
     def _options(self) -> list[str]:
         """Return the options that decide what is run, in the form in which they are written."""
-        from esp_cli.training.config import seeds_text
+        from esp_cli.training.config import seed_words
 
         words: list[str] = []
         for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
             names = parse_names(items)
             words += [flag, ",".join(names)] if names else []
-        words += ["--seeds", seeds_text(self.seeds)] if self.seeds != DEFAULT_SEEDS else []
+        words += seed_words(self.seeds) if self.seeds != DEFAULT_SEEDS else []
         words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
@@ -163,13 +165,16 @@ def study_command(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them."""
     own = dict(inspect.signature(command, eval_str=True).parameters)
     del own["choices"]
-    parameters = [*own.values(), *inspect.signature(StudyChoices, eval_str=True).parameters.values()]
+    shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
+    named = inspect.Parameter("seed_list", shared["seeds"].kind, default=None, annotation=SeedListOption)
+    parameters = [*own.values(), *shared.values(), named]
     parameters.sort(key=lambda parameter: parameter.default is not parameter.empty)
 
     @functools.wraps(command)
-    def with_options(**given: object) -> None:
+    def with_options(**given: Any) -> None:
         arguments = {name: given.pop(name) for name in own}
-        command(choices=StudyChoices(**given), **arguments)  # type: ignore[arg-type]
+        given["seeds"] = chosen_seeds(given["seeds"], given.pop("seed_list"), DEFAULT_SEEDS)
+        command(choices=StudyChoices(**given), **arguments)
 
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

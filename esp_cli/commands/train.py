@@ -15,11 +15,13 @@ from esp_cli.commands.options import (
     AlgoOption,
     DeviceOption,
     PhysicsOption,
+    SeedListOption,
     SeedsOption,
     SetOption,
     StepsOption,
     TaskOption,
     TransformsOption,
+    chosen_seeds,
     parse_assignments,
     register_learners,
     register_tasks,
@@ -39,6 +41,7 @@ EPILOG = """Examples:\n
     esp train --resume runs/cn-mappo"""
 
 DEFAULT_STEPS = 1_000_000
+DEFAULT_SEEDS = (0,)
 
 
 def train(
@@ -69,7 +72,8 @@ def train(
         ),
     ] = None,
     steps: StepsOption = DEFAULT_STEPS,
-    seeds: SeedsOption = (0,),
+    seeds: SeedsOption = DEFAULT_SEEDS,
+    seed_list: SeedListOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.", metavar="PATH")
     ] = None,
@@ -138,7 +142,7 @@ def train(
         "algorithm": algo,
         "preset": preset,
         "steps": steps,
-        "seeds": seeds,
+        "seeds": chosen_seeds(seeds, seed_list, DEFAULT_SEEDS),
         "device": device,
         "init_from": init_from,
     }

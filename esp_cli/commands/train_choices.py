@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import typer
 
-from esp_cli.commands.options import Device, parse_count, parse_seeds
+from esp_cli.commands.options import Device, parse_count, parse_seed_list, parse_seeds
 
 _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""
@@ -31,6 +31,7 @@ def with_file(
 
     file = read_config_file(path)
     said = {name for name in given if _was_given(context, _PARAMETERS.get(name, name))}
+    said |= {"seeds"} if _was_given(context, "seed_list") else set()
     if file.is_complete:
         for name in ("task", "algorithm", "preset"):
             if name in said and given[name] != file.choices[name]:
@@ -55,7 +56,7 @@ def _read(path: Path, name: str, value: Any) -> Any:
         if name == "seeds" and type(value) in (int, str):
             return parse_seeds(value)
         if name == "seeds" and isinstance(value, list):
-            return parse_seeds(",".join(map(str, value)) + ",")
+            return parse_seed_list(value)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     known = get_args(Device) if name == "device" else (value,)

@@ -74,7 +74,7 @@ class RunConfig(BaseModel):
         known, own = plain.model_dump(mode="json"), self.model_dump(mode="json")
         words = ["esp", "train", "--task", self.task, "--algo", self.algorithm]
         words += ["--preset", self.preset] if self.preset != "default" else []
-        words += ["--seeds", seeds_text(self.seeds), "--steps", str(self.steps)]
+        words += [*seed_words(self.seeds), "--steps", str(self.steps)]
         words += ["--device", self.device] if self.device != "cpu" else []
         words += ["--init-from", self.init_from.source] if self.init_from else []
         for section, key in ({self.algorithm: "algorithm_settings"} | SECTIONS).items():
@@ -84,10 +84,10 @@ class RunConfig(BaseModel):
         return shlex.join(words)
 
 
-def seeds_text(seeds: Sequence[int]) -> str:
-    """Return seeds as `--seeds` reads them: (0, 1, 2) -> "3", (3, 7) -> "3,7,"."""
+def seed_words(seeds: Sequence[int]) -> list[str]:
+    """Return seeds as a command line says them: (0, 1, 2) -> --seeds 3, (3, 7) -> --seed-list 3,7."""
     counted = tuple(seeds) == tuple(range(len(seeds)))
-    return str(len(seeds)) if counted else ",".join(map(str, seeds)) + ","
+    return ["--seeds", str(len(seeds))] if counted else ["--seed-list", ",".join(map(str, seeds))]
 
 
 def _assignment(name: str, value: object) -> list[str]:

@@ -13,7 +13,7 @@ from tests.cli.running import train_tiny
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of the seeds 3 and 7 that no test may change."""
-    return train_tiny(tmp_path_factory.mktemp("runs") / "finished", "--seeds", "3,7")
+    return train_tiny(tmp_path_factory.mktemp("runs") / "finished", "--seed-list", "3,7")
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def test_a_run_is_configured_again_from_its_folder_and_from_its_file(finished: P
     "options",
     [
         ["--task", "predator-prey", "--algo", "qmix", "--preset", "paper"],
-        ["--task", "formation", "--algo", "maddpg", "--seeds", "3,7"],
+        ["--task", "formation", "--algo", "maddpg", "--seed-list", "3,7"],
         ["--task", "wildlife", "--network", "empn", "--prior", "none"],
     ],
 )
@@ -77,7 +77,7 @@ hidden = [32]
 @pytest.mark.parametrize(("name", "content"), [("c.json", FLAT), ("c.toml", NESTED)])
 def test_a_small_file_says_only_what_differs(tmp_path: Path, name: str, content: object) -> None:
     found = printed("--config", written(tmp_path / name, content))
-    options = ["--task", "predator-prey", "--steps", "20k", "--seeds", "3,7", "--set", "task.prey=fleeing"]
+    options = ["--task", "predator-prey", "--steps", "20k", "--seed-list", "3,7", "--set", "task.prey=fleeing"]
     assert found == printed(*options, "--set", "mappo.learning_rate=5e-4", "--set", "network.hidden=[32]")
 
 
@@ -168,7 +168,7 @@ def policy_of(run: Path) -> dict[str, torch.Tensor]:
 def test_a_run_starts_from_another_policy(tmp_path: Path, algorithm: str) -> None:
     small = ["--algo", algorithm, "--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", "200"]
     esp("train", *small, "--out", tmp_path / "first", "--set", f"{algorithm}.num_envs=2")
-    rest = ["--seeds", "3,7", "--set", f"{algorithm}.learning_rate=1e-9", "--set", f"{algorithm}.num_envs=2"]
+    rest = ["--seed-list", "3,7", "--set", f"{algorithm}.learning_rate=1e-9", "--set", f"{algorithm}.num_envs=2"]
     rest += ["--set", f"{algorithm}.actor_learning_rate=1e-9"] if algorithm == "maddpg" else []
     esp("train", *small, *rest, "--out", tmp_path / "second", "--init-from", tmp_path / "first")
     first, second = policy_of(tmp_path / "first"), policy_of(tmp_path / "second")
@@ -183,7 +183,7 @@ def test_a_run_starts_from_another_policy(tmp_path: Path, algorithm: str) -> Non
 
 
 def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, copied: Path, tmp_path: Path) -> None:
-    options = [*TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--init-from"]
+    options = [*TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--init-from"]
     esp("train", *options, finished, "--out", tmp_path / "whole")
     esp("train", *options, copied / "policy.safetensors", "--out", tmp_path / "cut")
     for file in [*(tmp_path / "cut" / "checkpoints").iterdir(), copied / "policy.safetensors"]:
@@ -210,7 +210,7 @@ def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finishe
 
 
 def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp_path: Path) -> None:
-    run = train_tiny(tmp_path / "run", "--seeds", "3,7", "--init-from", finished, steps=50)
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", finished, steps=50)
     assert read_config_file(run).choices["init_from"] == str(finished)
     assert printed("--config", run) == json.loads((run / "config.json").read_text())
 

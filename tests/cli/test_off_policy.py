@@ -25,7 +25,7 @@ def options(algorithm: str) -> list[str]:
         "evaluation.every_steps": 100,
     }
     given = [part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}")]
-    return ["--algo", algorithm, *given, "--seeds", "3,7", "--steps", "200"]
+    return ["--algo", algorithm, *given, "--seed-list", "3,7", "--steps", "200"]
 
 
 @pytest.mark.parametrize(

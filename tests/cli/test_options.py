@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from esp_cli.commands.options import MAX_SEEDS, parse_assignments, parse_count, parse_seeds
+from esp_cli.commands.options import (
+    MAX_SEEDS,
+    chosen_seeds,
+    parse_assignments,
+    parse_count,
+    parse_seed_list,
+    parse_seeds,
+)
 from esp_cli.console import format_count
 
 
@@ -46,8 +53,19 @@ def test_a_count_survives_being_written_and_read(number: int, scale: int) -> Non
     ("text", "seeds"),
     [("1", (0,)), ("3", (0, 1, 2)), (2, (0, 1)), ("3,7", (3, 7)), ("7,", (7,)), ("5, 0", (5, 0)), ((4,), (4,))],
 )
-def test_seeds_are_read(text: str | int | tuple[int, ...], seeds: tuple[int, ...]) -> None:
+def test_a_number_of_seeds_is_read_and_the_old_list_too(
+    text: str | int | tuple[int, ...], seeds: tuple[int, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert parse_seeds(text) == seeds
+    note = f"--seeds {text} is now --seed-list {','.join(map(str, seeds))}\n"
+    assert capsys.readouterr().err == (note if isinstance(text, str) and "," in text else "")
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("3,7", (3, 7)), ("7", (7,)), ("7,", (7,)), ("5, 0", (5, 0)), ((4,), (4,))]
+)
+def test_seeds_are_named(text: str | tuple[int, ...], seeds: tuple[int, ...]) -> None:
+    assert parse_seed_list(text) == seeds
 
 
 @pytest.mark.parametrize(
@@ -65,6 +83,28 @@ def test_seeds_are_read(text: str | int | tuple[int, ...], seeds: tuple[int, ...
 def test_what_names_no_seeds_is_refused(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (",".join(map(str, range(MAX_SEEDS + 1))), "name at most"),
+        ("1,1", "twice"),
+        ("a", "is not a list of seeds"),
+        ("-1", "is not a list of seeds"),
+        (",", "is not a list of seeds"),
+    ],
+)
+def test_what_is_no_list_of_seeds_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        parse_seed_list(text)
+
+
+def test_a_count_and_a_list_of_seeds_exclude_each_other() -> None:
+    assert chosen_seeds((0,), (3, 7), default=(0,)) == (3, 7)
+    assert chosen_seeds((0, 1), None, default=(0,)) == (0, 1)
+    with pytest.raises(ValueError, match="leave one of them out"):
+        chosen_seeds((0, 1), (3, 7), default=(0,))
 
 
 def test_assignments_are_json_where_they_can_be() -> None:

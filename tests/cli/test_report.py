@@ -19,7 +19,7 @@ from tests.cli.running import DAMAGE, esp, refused, train_tiny
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the same seeds without the prior."""
-    return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seeds", "3,7", "--prior", "none")
+    return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seed-list", "3,7", "--prior", "none")
 
 
 def test_every_logged_number_is_a_cell_of_the_csv(finished: Path, plain: Path, tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
 def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_default(
     finished: Path, plain: Path, tmp_path: Path
 ) -> None:
-    short = train_tiny(tmp_path / "short", "--seeds", "3,7", steps=100)
+    short = train_tiny(tmp_path / "short", "--seed-list", "3,7", steps=100)
     result = json.loads(esp("report", finished, short, plain, "--json", "-").stdout)
     assert [list(run["returns"]) for run in result["runs"]] == [["100"]] * 3
     assert [run["step"] for run in result["runs"]] == [150, 100, 150]
@@ -98,7 +98,7 @@ def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_
 def test_page_markdown_results_and_terminal_compare_at_the_same_step(
     finished: Path, plain: Path, tmp_path: Path
 ) -> None:
-    short = train_tiny(tmp_path / "a b", "--seeds", "3,7", "--prior", "none", steps=100)
+    short = train_tiny(tmp_path / "a b", "--seed-list", "3,7", "--prior", "none", steps=100)
     out, small = tmp_path / "the page", tmp_path / "results.json"
     told = esp("report", f"short={short}", f"ESP={finished}", "--out", out, "--results", small)
     page, markdown = (out / "report.html").read_text(), (out / "report.md").read_text()
@@ -127,7 +127,7 @@ def test_two_runs_of_one_label_are_refused(finished: Path, tmp_path: Path) -> No
 
 
 def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Path) -> None:
-    one = train_tiny(tmp_path / "one", "--seeds", "3,", steps=50)
+    one = train_tiny(tmp_path / "one", "--seed-list", "3", steps=50)
     told = esp("report", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
     rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│ navigation, ")]
     assert rows[0][:3] == ["navigation, 50", "one", "50"]

@@ -29,7 +29,7 @@ def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
     run = train_tiny(
         tmp_path / "deep" / "run",
         *("--algo", "mappo", "--task", "predator-prey", "--prior", "consistency", "--transforms", "rot90,flip-x"),
-        *("--consistency-coef", "0.25", "--network", "gru", "--seeds", "3,7", "--device", "cpu"),
+        *("--consistency-coef", "0.25", "--network", "gru", "--seed-list", "3,7", "--device", "cpu"),
         *("--set", "mappo.learning_rate=5e-4", "--set", "task.prey=fleeing"),
         steps="0.05k",
     )
@@ -164,7 +164,7 @@ def test_a_signal_stops_after_the_iteration_and_the_run_goes_on_to_the_same_end(
     before = signal.getsignal(number)
     with monkeypatch.context() as patch:
         patch.setattr(console.TrainingProgress, "update", interrupted)
-        stopped = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", run, code=130)
+        stopped = esp("train", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", run, code=130)
     assert signal.getsignal(number) is before
     assert "stopping after this iteration" in stopped.stderr
     assert stopped.stderr.endswith(f"stopped at 50 steps; continue with: esp train --resume {run}\n")
@@ -266,7 +266,7 @@ def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
         return replace(iterate(self, progress), finite=torch.tensor([False, True]))
 
     monkeypatch.setattr(Mappo, "iterate", broken)
-    told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--out", tmp_path / "run")
+    told = esp("train", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", tmp_path / "run")
     assert "seed 3 stopped at step 50" in told.stderr
     value = read_metrics(tmp_path / "run" / "metrics.jsonl")[-1]["eval/return_greedy"]
     assert value[0] is None
@@ -286,9 +286,9 @@ def test_a_run_whose_every_seed_stopped_ends_in_a_sentence(tmp_path: Path, monke
 
 
 def test_two_equal_command_lines_give_equal_runs(finished: Path, tmp_path: Path) -> None:
-    again = train_tiny(tmp_path / "again", "--seeds", "3,7")
+    again = train_tiny(tmp_path / "again", "--seed-list", "3,7")
     assert (again / "policy.safetensors").read_bytes() == (finished / "policy.safetensors").read_bytes()
-    other = train_tiny(tmp_path / "other", "--seeds", "4,7")
+    other = train_tiny(tmp_path / "other", "--seed-list", "4,7")
     assert (other / "policy.safetensors").read_bytes() != (finished / "policy.safetensors").read_bytes()
 
 

@@ -24,7 +24,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def test_a_run_has_the_weights_of_the_command(run: Run, tmp_path: Path) -> None:
-    words = ["train", "--task", "navigation", "--steps", "400", "--seeds", "3,7", "--out", str(tmp_path / "cn")]
+    words = ["train", "--task", "navigation", "--steps", "400", "--seed-list", "3,7", "--out", str(tmp_path / "cn")]
     esp(*words, *OPTIONS)
     obs = np.random.default_rng(0).standard_normal((20, 14))
     for seed in (3, 7):

@@ -8,7 +8,7 @@ import shlex
 import pytest
 
 from esp_cli.studies.catalogue import Request, plan
-from esp_cli.training.config import seeds_text
+from esp_cli.training.config import seed_words
 from tests.cli.running import esp
 from tests.training.runs import tiny_config
 
@@ -44,6 +44,14 @@ def test_what_a_shell_would_take_apart_is_quoted_and_a_text_like_a_number_stays_
     assert "'task.name=a b; $(rm)'" in config.command()
 
 
-@pytest.mark.parametrize(("seeds", "text"), [((0, 1, 2), "3"), ((0,), "1"), ((3, 7), "3,7,"), ((7,), "7,")])
-def test_seeds_are_a_count_or_a_list(seeds, text):
-    assert seeds_text(seeds) == text
+@pytest.mark.parametrize(
+    ("seeds", "words"),
+    [
+        ((0, 1, 2), ["--seeds", "3"]),
+        ((0,), ["--seeds", "1"]),
+        ((3, 7), ["--seed-list", "3,7"]),
+        ((7,), ["--seed-list", "7"]),
+    ],
+)
+def test_seeds_are_a_count_or_a_list(seeds, words):
+    assert seed_words(seeds) == words
