@@ -28,11 +28,14 @@ class Observation:
         obs: [S, E, N, D] float32; a fresh tensor, never a view of the simulator's buffers.
         state: [S, E, state width] float32.
         action_mask: [S, E, N, A] bool, which actions each agent may take; None where `spec.masks` is off.
+        alive: [S, E, N] bool, which agents still act; None where `spec.agents_end` is off. An agent that has ended
+            stays so until the episode is over. Its action is ignored, and its reward is 0 unless the reward is shared.
     """
 
     obs: Tensor
     state: Tensor
     action_mask: Tensor | None = None
+    alive: Tensor | None = None
 
 
 @dataclass(frozen=True)

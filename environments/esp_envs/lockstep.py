@@ -101,8 +101,8 @@ class LockstepTask(Environment):
 class BatchedTask(LockstepTask):
     """A task whose world is one tensor for each field of its state.
 
-    A subclass implements `_describe`, `_start`, `_advance` and `_observe`, and may add `_allow`, `heuristic` and
-    `scene`. All randomness comes from `draw` or from the generator that `_start` is given. Vectors of a continuous
+    A subclass implements `_describe`, `_start`, `_advance` and `_observe`, and may add `_allow`, `_living`, `heuristic`
+    and `scene`. All randomness comes from `draw` or from the generator that `_start` is given. Vectors of a continuous
     action arrive in `_advance` with a length of at most 1, its other numbers in [-1, 1].
     """
 
@@ -129,6 +129,10 @@ class BatchedTask(LockstepTask):
 
     def _allow(self, world: World) -> Tensor | None:
         """Return which actions each agent may take, [S, E, N, A] bool, where `spec.masks` is on."""
+        return None
+
+    def _living(self, world: World) -> Tensor | None:
+        """Return which agents still act, [S, E, N] bool, where `spec.agents_end` is on."""
         return None
 
     def action_mask(self) -> Tensor | None:
@@ -184,7 +188,10 @@ class BatchedTask(LockstepTask):
     def _seen(self) -> Observation:
         obs = self._observe(self.world).flatten(3).float().clone(memory_format=torch.contiguous_format)
         require_shape("observation", obs, (*self.action_shape[:3], self.spec.observation.width))
-        return Observation(obs, self._state(), self.action_mask())
+        alive = self._living(self.world)
+        if (alive is not None) != self.spec.agents_end:
+            raise ValueError(f"{self.spec.name}: implement '_living' and set 'agents_end' in the spec, or do neither")
+        return Observation(obs, self._state(), self.action_mask(), None if alive is None else alive.clone())
 
     def _put(self, state: Tensor) -> None:
         self.world = self._split(state.clone())

@@ -264,6 +264,7 @@ class TaskSpec(Spaces):
         control_period_s: simulated seconds of one step, for rendering in real time.
         totals: names of the metrics that add up over an episode; the others are averaged over its steps.
         terminates: whether an episode can reach an end of its own before the horizon, each world at another time.
+        agents_end: whether an agent can reach an end of its own before its episode, which goes on for the others.
     """
 
     name: str
@@ -274,6 +275,7 @@ class TaskSpec(Spaces):
     control_period_s: float = 0.1
     totals: tuple[str, ...] = ()
     terminates: bool = False
+    agents_end: bool = False
     settings: dict[str, object] = field(default_factory=dict)
 
     @property

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.replay import EpisodeBatch
+from esp_cli.algorithms.rollout import stacked
 from esp_cli.networks.policy import HistoryPolicy
 from esp_envs.base import Environment
 
@@ -39,7 +40,7 @@ class EpisodeCollector:
         observation = env.reset()
         memory = policy.initial_memory(env.num_envs, observation.obs)
         running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-        obs, state, allowed = [observation.obs], [observation.state], [observation.action_mask]
+        seen = [observation]
         actions, rewards, terminated, valid = [], [], [], []
         for t in range(steps):
             outputs, memory = policy.step(observation.obs, memory, observation.action_mask)
@@ -48,9 +49,7 @@ class EpisodeCollector:
             step = env.step(head.to_environment(action))
             observation = step.next
             after = step.next if step.final is None else step.final
-            obs.append(after.obs)
-            state.append(after.state)
-            allowed.append(after.action_mask)
+            seen.append(after)
             actions.append(action)
             rewards.append(step.reward)
             terminated.append(step.terminated)
@@ -60,13 +59,14 @@ class EpisodeCollector:
         returns = torch.where(mask, reward.mean(-1), 0.0).sum(2).mean(1)
         shared = reward[..., :1] if env.spec.shared_reward else reward
         batch = EpisodeBatch(
-            torch.stack(obs, 2),
-            torch.stack(state, 2),
+            torch.stack([x.obs for x in seen], 2),
+            torch.stack([x.state for x in seen], 2),
             torch.stack(actions, 2),
             shared,
             torch.stack(terminated, 2),
             mask,
-            action_mask=torch.stack([x for x in allowed if x is not None], 2) if env.spec.masks else None,
+            action_mask=stacked([x.action_mask for x in seen]),
+            alive=stacked([x.alive for x in seen]),
         )
         return batch, returns
 

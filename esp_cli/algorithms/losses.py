@@ -24,8 +24,8 @@ def gae(
         reward: [S, E, T, C], C = 1 for a shared reward, else N.
         value: [S, E, T, C] V(s_t).
         next_value: [S, E, T, C] V of the state that really followed, the final one where an episode ended.
-        terminated: [S, E, T, 1]; no value lies beyond.
-        ended: [S, E, T, 1] terminated or truncated; the next row belongs to another episode.
+        terminated: [S, E, T, 1], or [S, E, T, N] where agents end; no value lies beyond.
+        ended: likewise, terminated or truncated; the next row belongs to another episode.
         gamma: discount factor.
         gae_lambda: 0 is one-step temporal difference, 1 Monte Carlo.
 
@@ -49,7 +49,7 @@ def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, 
     Args:
         reward: [S, B, T, C].
         next_value: [S, B, T, C] target network's value of the state that really followed.
-        ended: [S, B, T, 1] bool; no value lies beyond.
+        ended: [S, B, T, 1] bool, or [S, B, T, N] where agents end; no value lies beyond.
         gamma: discount factor.
         td_lambda: 0 is the one-step target, 1 the discounted return of what was done.
 
@@ -66,8 +66,20 @@ def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, 
     return target
 
 
-def normalise_per_seed(x: Tensor, epsilon: float = 1e-5) -> Tensor:
-    """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed; x: [S, ...]."""
+def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = None) -> Tensor:
+    """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed.
+
+    Args:
+        x: [S, ...].
+        epsilon: added to the deviation.
+        valid: which numbers count, of the shape of x; all where it is None. The others become 0.
+    """
+    if valid is not None:
+        count = valid.flatten(1).sum(1).clamp_min(1).view(-1, *[1] * (x.dim() - 1))
+        total = torch.where(valid, x, 0.0).flatten(1).sum(1).view_as(count)
+        centred = torch.where(valid, x - total / count, 0.0)
+        variance = centred.square().flatten(1).sum(1).view_as(count) / count
+        return centred / (variance.sqrt() + epsilon)
     axes = tuple(range(1, x.dim()))
     deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)
     return (x - mean) / (deviation + epsilon)

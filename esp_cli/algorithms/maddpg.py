@@ -103,7 +103,7 @@ class Maddpg(OffPolicyLearner):
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return what actor and critic say of rows, for `SymmetryPrior.errors`."""
-        values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self.head.encode(rows.action))
+        values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self._encoded(rows))
         return {"policy": (self.head, self._outputs(rows)), "value": values}
 
     def _outputs(self, rows: EpisodeBatch) -> Tensor:
@@ -112,7 +112,7 @@ class Maddpg(OffPolicyLearner):
 
     def _learn_critic(self, copies: Copies[EpisodeBatch], seen: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q; `seen` is what the critic sees of every row."""
-        values = self.joint.value(self.critic, seen[:, :, :-1], self.head.encode(copies.rows.action))
+        values = self.joint.value(self.critic, seen[:, :, :-1], self._encoded(copies.rows))
         target = self._targets(copies.originals, copies.original(seen))
         loss, metrics = self._td_loss(values, target, copies)
         (norm,) = self.critic_optimiser.step(self.critic_optimiser.gradient(loss))
@@ -126,46 +126,50 @@ class Maddpg(OffPolicyLearner):
         noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]]).to(self.device)
         learned = copies.learned(outputs)
         self.critic.requires_grad_(False)
-        value = self._value_of_policy(copies.learned(seen)[:, :, :-1], learned, copies.repeated(noise), batch.action)
+        value = self._value_of_policy(copies.learned(seen)[:, :, :-1], learned, copies.repeated(noise), batch)
         self.critic.requires_grad_(True)
         # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
         # that Adam's epsilon slows the actor down.
-        policy_loss = -(self.spec.horizon**0.5) * mean_per_seed(value, batch.valid)
-        loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(learned), batch.valid)
+        policy_loss = -(self.spec.horizon**0.5) * mean_per_seed(value, batch.mask)
+        loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(learned), batch.mask)
         loss = loss + copies.penalty(policy=(self.head, outputs))
         (norm,) = self.actor_optimiser.step(self.actor_optimiser.gradient(loss))
         metrics = {"policy_loss": policy_loss, "actor_grad_norm": norm}
-        return metrics | {name: mean_per_seed(x, batch.valid) for name, x in self.head.statistics(learned).items()}
+        return metrics | {name: mean_per_seed(x, batch.mask) for name, x in self.head.statistics(learned).items()}
 
-    def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, stored: Tensor) -> Tensor:
+    def _encoded(self, rows: EpisodeBatch) -> Tensor:
+        """Return what was done as the critic reads it [S, B, T, N, A]; zeros for an agent that has ended."""
+        return rows.of_living(self.head.encode(rows.action))
+
+    def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
         Args:
             seen: [S, B, T(, N), critic width].
             outputs: [S, B, T, N, ...] of the policy.
             noise: of the shape of `outputs`, uniform in [0, 1).
-            stored: [S, B, T, N(, width)] what was done.
+            rows: what was done.
         """
         head, together = self.head, self.config.actor_actions == "all"
         if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):
-            joint = head.relaxed(outputs, noise).detach() if together else head.encode(stored)
+            joint = rows.of_living(head.relaxed(outputs, noise).detach()) if together else self._encoded(rows)
             values = self.joint.exchanged(self.critic, seen, joint, head.choices.expand(*joint.shape, -1))
             return (outputs.exp() * values).sum(-1)
-        own = head.relaxed(outputs, noise)
+        own = rows.of_living(head.relaxed(outputs, noise))
         if together:
             return self.joint.value(self.critic, seen, own)
-        return self.joint.exchanged(self.critic, seen, head.encode(stored), own.unsqueeze(-2)).squeeze(-1)
+        return self.joint.exchanged(self.critic, seen, self._encoded(rows), own.unsqueeze(-2)).squeeze(-1)
 
     def _condition(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Return the share of the critic's hidden units that a whole batch leaves at 0."""
         if self.config.critic_activation != "relu":
             return {}
-        rows = self.joint.inputs(self._critic_rows(batch)[:, :, :-1], self.head.encode(batch.action))
+        rows = self.joint.inputs(self._critic_rows(batch)[:, :, :-1], self._encoded(batch))
         return {"train/critic_idle_units": self.critic.idle_units(rows.flatten(1, -2))}
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
         outputs = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
-        following = self.head.encode(self.head.mode(outputs))
+        following = batch.of_living(self.head.encode(self.head.mode(outputs)), after=True)
         return self._td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))

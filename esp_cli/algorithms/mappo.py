@@ -9,15 +9,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.closed_form import carries, critic_loss, policy_loss, weights_of
-from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
+from esp_cli.algorithms.learner import Iteration, Learner
 from esp_cli.algorithms.losses import (
     clipped_surrogate,
     explained_variance,
@@ -25,47 +23,16 @@ from esp_cli.algorithms.losses import (
     normalise_per_seed,
     value_loss,
 )
+from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic
 from esp_cli.networks.heads import Categorical
-from esp_cli.networks.io_spec import Reads
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.spec import TaskSpec
-
-
-class MappoConfig(LearnerConfig):
-    """Hyperparameters; every default stands here and nowhere else."""
-
-    num_envs: int = Field(32, ge=1, description="worlds per seed; MAPPO paper on MPE: 128")
-    num_steps: int = Field(25, ge=1, description="steps per world and update")
-    num_epochs: int = Field(10, ge=1, le=1000, description="passes over a rollout")
-    num_minibatches: int = Field(4, ge=1, le=10_000, description="gradient steps per pass; paper: 1")
-    learning_rate: float = Field(1e-3, gt=0, description="of Adam, for actor and critic; paper: 7e-4")
-    anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run")
-    adam_epsilon: float = Field(1e-5, gt=0, description="Adam's epsilon")
-    max_grad_norm: float = Field(10.0, gt=0, description="per seed; actor and critic apart")
-    gamma: float = Field(0.99, ge=0, le=1, description="discount")
-    gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of generalised advantage estimation")
-    clip_epsilon: float = Field(0.2, gt=0, description="range of the ratio's clip, and of the value's")
-    clip_value: bool = Field(False, description="MAPPO paper: on; ours off, it slows learning badly")
-    huber_delta: float = Field(10.0, gt=0, description="where the value loss becomes linear, in normalised units")
-    value_coef: float = Field(1.0, gt=0, description="weight of the value loss")
-    entropy_coef: float = Field(0.01, ge=0, description="weight of the entropy bonus")
-    anneal_entropy: bool = Field(True, description="linearly to 0 over the run")
-    bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
-    value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
-    critic_input: Reads = Field(
-        "observations",
-        description="the task's global state, all agents' observations in a row, or each agent's own observation",
-    )
-    critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
-    truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
-    chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
-
 
 PROBE_STEPS = 100
 """Environment steps per seed on which the symmetry errors are measured after every update."""
@@ -121,7 +88,8 @@ class Mappo(Learner):
         self.collector = Collector(env, self.policy, self.generators["learner"])
         self._old: tuple[StochasticPolicy, Critic] | None = None
         reevaluates = config.clip_value or self.prior.recomputes
-        self._closed_form = isinstance(self.policy.head, Categorical) and not reevaluates and not env.spec.masks
+        partial = spec.masks or spec.agents_end
+        self._closed_form = isinstance(self.policy.head, Categorical) and not reevaluates and not partial
 
     @classmethod
     def build_policy(
@@ -171,10 +139,17 @@ class Mappo(Learner):
         value, next_value = self.normaliser.denormalise(raw_value), self.normaliser.denormalise(raw_next)
         ended = rollout.ended.unsqueeze(-1)
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
+        valid = None
+        if rollout.alive is not None and rollout.gone is not None and self.num_values > 1:
+            terminated, ended = (
+                terminated | rollout.gone,
+                ended | rollout.gone,
+            )  # what follows an agent's end is not its
+            valid = rollout.alive
         advantage = gae(reward, value, next_value, terminated, ended, config.gamma, config.gae_lambda)
         target = advantage + value
-        self.normaliser.update(target)
-        per_agent = normalise_per_seed(advantage).expand(rollout.log_prob.shape)
+        self.normaliser.update(target, valid)
+        per_agent = normalise_per_seed(advantage, valid=valid).expand(rollout.log_prob.shape)
         fields = (
             rollout.obs,
             rollout.state,
@@ -184,8 +159,11 @@ class Mappo(Learner):
             self.normaliser.normalise(target),
             raw_value,
         )
-        allowed = None if rollout.action_mask is None else self._as_sequences(rollout.action_mask)
-        batch = Batch(*(self._as_sequences(x) for x in fields), action_mask=allowed)
+        flags = {"action_mask": rollout.action_mask, "alive": rollout.alive}
+        known = {name: self._as_sequences(flag) for name, flag in flags.items() if flag is not None}
+        batch = Batch(*(self._as_sequences(x) for x in fields), **known)
+        if valid is not None:
+            value, target = torch.where(valid, value, 0.0), torch.where(valid, target, 0.0)
         return batch, {"train/explained_variance": explained_variance(value, target)}
 
     def _as_sequences(self, x: Tensor) -> Tensor:
@@ -229,6 +207,8 @@ class Mappo(Learner):
         copies = self.prior.copies(minibatch, self.generators["prior"], self.reevaluated)
         num_seeds, total, length = minibatch.obs.shape[:3]
         size = max(1, self.config.chunk_steps // (num_seeds * length))
+        if minibatch.alive is not None:
+            size = total  # a mean over the living of the whole minibatch
         gradients = []
         for chunk in copies.chunks(size):
             weight = chunk.originals.count / total
@@ -269,8 +249,8 @@ class Mappo(Learner):
         value_error = value_loss(
             copies.learned(values), batch.target, config.huber_delta, old_value, config.clip_epsilon
         )
-        loss = config.value_coef * mean_per_seed(value_error) - mean_per_seed(objective)
-        loss = loss - entropy_coef * mean_per_seed(entropy)
+        loss = config.value_coef * mean_per_seed(value_error, batch.mask) - mean_per_seed(objective, batch.mask)
+        loss = loss - entropy_coef * mean_per_seed(entropy, batch.mask)
         if sums is not None:
             originals = (copies.original(outputs.detach()), copies.original(values.detach()))
             self._watch(copies.originals, *originals, weight, sums)
@@ -290,7 +270,7 @@ class Mappo(Learner):
             "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon),
             "value_loss": value_loss(values, batch.target, config.huber_delta, old_value, config.clip_epsilon),
         }
-        _add(sums, weight, **{name: mean_per_seed(part) for name, part in parts.items()})
+        _add(sums, weight, **{name: mean_per_seed(part, batch.mask) for name, part in parts.items()})
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""

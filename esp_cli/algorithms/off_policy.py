@@ -140,6 +140,8 @@ class OffPolicyLearner(Learner):
     def _store(self, episodes: EpisodeBatch) -> None:
         """Remember episodes and, where the prior says so, their copies; originals alone enter the statistics."""
         valid = episodes.valid.unsqueeze(-1).expand(episodes.reward.shape)
+        if episodes.reward.shape[-1] > 1:
+            valid = episodes.of_living(valid)
         self.reward_scale.update(episodes.reward.flatten(2), valid.flatten(2))
         self.replay.add(episodes)
         for copies in self.prior.stored(episodes, self.generators["prior"]):
@@ -169,7 +171,10 @@ class OffPolicyLearner(Learner):
         if not config.bootstrap_truncated:
             ended[:, :, -1] = True
         reward = self.reward_scale.normalise(reward) * self.spec.horizon**-0.5
-        return td_targets(reward, next_value, ended.unsqueeze(-1), config.gamma, config.td_lambda)
+        over = ended.unsqueeze(-1)
+        if batch.alive is not None and next_value.shape[-1] > 1:
+            over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own
+        return td_targets(reward, next_value, over, config.gamma, config.td_lambda)
 
     def _td_loss(
         self, values: Tensor, target: Tensor, copies: Copies[EpisodeBatch]
@@ -182,8 +187,8 @@ class OffPolicyLearner(Learner):
             copies: the batch.
         """
         error = huber(copies.learned(values) - copies.inherited(target), self.config.huber_delta)
-        loss = mean_per_seed(error, copies.batch.valid) + copies.penalty(value=values)
-        valid = copies.originals.valid
+        loss = mean_per_seed(error, copies.batch.mask) + copies.penalty(value=values)
+        valid = copies.originals.mask
         return loss, {
             "td_loss": mean_per_seed(copies.original(error), valid),
             "value": mean_per_seed(copies.original(values), valid),

@@ -3,6 +3,8 @@
 Every agent has action values of its own, from one network that all share; a mixer that is monotonic in them makes the
 team's value Q_tot, so that each agent's best action is its part of the team's. Temporal differences on Q_tot, with
 the consistency loss of supplement eq. 19 added to them.
+
+An agent that has ended adds nothing: its value enters the mixer as 0. (PyMARL feeds the value of a dead agent's no-op.)
 """
 
 from __future__ import annotations
@@ -109,7 +111,7 @@ class Qmix(OffPolicyLearner):
     def _total(self, utilities: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A]."""
         chosen = utilities[:, :, :-1].gather(-1, rows.action.unsqueeze(-1)).squeeze(-1)
-        return self.mixer(chosen, self._critic_rows(rows)[:, :, :-1]).unsqueeze(-1)
+        return self.mixer(rows.of_living(chosen), self._critic_rows(rows)[:, :, :-1]).unsqueeze(-1)
 
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, utilities: Tensor) -> Tensor:
@@ -117,5 +119,6 @@ class Qmix(OffPolicyLearner):
         following = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
         chooser = utilities[:, :, 1:] if self.config.double_q else following
         chosen = following.gather(-1, best(chooser).unsqueeze(-1)).squeeze(-1)
+        chosen = batch.of_living(chosen, after=True)
         next_value = self.target_mixer(chosen, self._critic_rows(batch)[:, :, 1:]).unsqueeze(-1)
         return self._td_targets(batch, batch.reward.mean(-1, keepdim=True), next_value)

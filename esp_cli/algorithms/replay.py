@@ -18,7 +18,8 @@ class EpisodeBatch(SeedBatch):
     Shape:
         obs [S, B, T + 1, N, D] and state [S, B, T + 1, Ds], the last row being the final one,
         action [S, B, T, N(, width)], reward [S, B, T, C] with C = 1 if shared, else N,
-        terminated and valid [S, B, T] bool, action_mask [S, B, T + 1, N, A] bool or None.
+        terminated and valid [S, B, T] bool, action_mask [S, B, T + 1, N, A] and alive [S, B, T + 1, N]
+        bool or None.
     """
 
     per_agent = ("reward",)
@@ -29,8 +30,20 @@ class EpisodeBatch(SeedBatch):
 
     @property
     def mask(self) -> Tensor:
-        """[S, B, T] which rows count."""
-        return self.valid
+        """[S, B, T] which rows count, or [S, B, T, N] where agents end."""
+        return self.valid if self.alive is None else self.valid.unsqueeze(-1) & self.alive[:, :, :-1]
+
+    def of_living(self, x: Tensor, after: bool = False) -> Tensor:
+        """Return numbers per agent [S, B, T, N] or [S, B, T, N, width], 0 where the agent has ended.
+
+        Args:
+            x: of the T steps.
+            after: whether x belongs to the states after the steps.
+        """
+        if self.alive is None:
+            return x
+        alive = self.alive[:, :, 1:] if after else self.alive[:, :, :-1]
+        return x.masked_fill(~alive if x.dim() == alive.dim() else ~alive.unsqueeze(-1), 0)
 
 
 class EpisodeReplay:
@@ -66,6 +79,7 @@ class EpisodeReplay:
             terminated=room(steps, dtype=torch.bool),
             valid=room(steps, dtype=torch.bool),
             action_mask=allowed,
+            alive=room(steps + 1, agents, dtype=torch.bool) if spec.agents_end else None,
         )
 
     @property

@@ -20,7 +20,8 @@ class Rollout:
 
     Shape:
         obs [S, E, T, N, D], state [S, E, T, state width], action [S, E, T, N(, width)] (latent, as the head drew it),
-        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool, action_mask [S, E, T, N, A] bool or None.
+        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool, action_mask [S, E, T, N, A] bool or None;
+        where agents end, alive and gone [S, E, T, N] bool: before the step, and no more after it.
 
     `last` is the observation after the final step; `finals[t]` the final observation of episodes that ended at t.
     """
@@ -35,6 +36,8 @@ class Rollout:
     last: Observation
     finals: dict[int, Observation] = field(default_factory=dict)
     action_mask: Tensor | None = None
+    alive: Tensor | None = None
+    gone: Tensor | None = None
 
 
 @dataclass
@@ -83,11 +86,12 @@ class Collector:
         reward = torch.empty(*lead, spec.num_agents, device=device)
         terminated = torch.empty(lead, dtype=torch.bool, device=device)
         ended = torch.empty_like(terminated)
-        outputs, actions, masks, finals = [], [], [], {}
+        outputs, actions, masks, alive, gone, finals = [], [], [], [], [], {}
         for t in range(num_steps):
             obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
             output, self.memory = self.policy.step(self.observation.obs, self.memory, self.observation.action_mask)
             masks.append(self.observation.action_mask)
+            alive.append(self.observation.alive)
             action = self.policy.head.sample(output, noise[:, t])
             step = self.env.step(self.policy.head.to_environment(action))
             outputs.append(output)
@@ -96,11 +100,12 @@ class Collector:
             ended[:, :, t] = step.terminated | step.truncated
             if step.final is not None:
                 finals[t] = step.final
+            after = (step.final or step.next).alive
+            gone.append(None if after is None else ~after)
             self._finish(step.reward, ended[:, :, t], step.final is not None)
             self.observation = step.next
         action_rows = torch.stack(actions, 2)
         log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
-        allowed = [mask for mask in masks if mask is not None]
         return Rollout(
             obs,
             state,
@@ -111,7 +116,7 @@ class Collector:
             ended,
             self.observation,
             finals,
-            torch.stack(allowed, 2) if allowed else None,
+            *(stacked(flags) for flags in (masks, alive, gone)),
         )
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
@@ -141,8 +146,8 @@ class Collector:
             "memory": self.memory,
             "episode_return": self.episode_return,
         }
-        if self.observation.action_mask is not None:
-            own["action_mask"] = self.observation.action_mask
+        flags = {"action_mask": self.observation.action_mask, "alive": self.observation.alive}
+        own |= {name: tensor for name, tensor in flags.items() if tensor is not None}
         return own | {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -151,9 +156,16 @@ class Collector:
         if own["obs"].shape != self.observation.obs.shape:
             raise ValueError("the saved worlds have other seeds, worlds or observations than these; use their settings")
         mask = tensors["action_mask"].to(self.env.device) if self.env.spec.masks else None
-        self.observation = Observation(own["obs"], own["state"], mask)
+        alive = tensors["alive"].to(self.env.device) if self.env.spec.agents_end else None
+        self.observation = Observation(own["obs"], own["state"], mask, alive)
         self.memory, self.episode_return = own["memory"], own["episode_return"]
         self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
+
+
+def stacked(flags: Sequence[Tensor | None]) -> Tensor | None:
+    """Stack the flags of all steps [S, E, ...] along the time axis; None where the task has none."""
+    known = [flag for flag in flags if flag is not None]
+    return torch.stack(known, 2) if known else None
 
 
 def values_along(critic: Critic, rollout: Rollout, episode: int | None) -> tuple[Tensor, Tensor]:

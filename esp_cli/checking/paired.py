@@ -167,6 +167,9 @@ def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) 
             if seen.action_mask is not None:
                 mask = seen.action_mask if transform is None else transform.push_outputs(seen.action_mask)
                 parts.setdefault(f"{prefix}action mask", []).append(mask.float().flatten(0, 1).flatten(1))
+            if seen.alive is not None:
+                alive = seen.alive if transform is None else transform.per_agent(seen.alive)
+                parts.setdefault(f"{prefix}alive", []).append(alive.float().flatten(0, 1))
         reward = step.reward if transform is None else transform.per_agent(step.reward)
         parts.setdefault("reward", []).append(reward.flatten(0, 1))
         parts.setdefault("end", []).append(step.terminated.float().flatten(0, 1).unsqueeze(-1))

@@ -23,6 +23,7 @@ class SeedBatch:
         state: [S, B, ..., Ds].
         action: [S, B, ..., N(, width)].
         action_mask: [S, B, ..., N, A] bool, the allowed actions; None allows all.
+        alive: [S, B, ..., N] bool, the agents that have not ended; None where none ever ends.
         per_agent: names of fields [S, B, ..., N] that move with their agents; those with one number per world stay.
     """
 
@@ -32,6 +33,7 @@ class SeedBatch:
     state: Tensor
     action: Tensor
     action_mask: Tensor | None = field(default=None, kw_only=True)
+    alive: Tensor | None = field(default=None, kw_only=True)
 
     @property
     def tensors(self) -> dict[str, Tensor]:
@@ -45,8 +47,8 @@ class SeedBatch:
 
     @property
     def mask(self) -> Tensor | None:
-        """[S, B, T] which rows count; None where all do."""
-        return None
+        """[S, B, T] which rows count, or [S, B, T, N] of which agents; None where all do."""
+        return self.alive
 
     def map(self: Rows, function: Callable[[Tensor], Tensor]) -> Rows:
         """Return the batch with every tensor put through a function."""
@@ -71,6 +73,8 @@ class SeedBatch:
         moved = {name: g.per_agent(getattr(self, name)) for name in self.per_agent}
         if self.action_mask is not None:
             moved["action_mask"] = g.push_outputs(self.action_mask)
+        if self.alive is not None:
+            moved["alive"] = g.per_agent(self.alive)
         return replace(self, obs=g.obs(self.obs), state=g.state(self.state), action=g.action(self.action), **moved)
 
     @classmethod
@@ -86,12 +90,16 @@ def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
 
     Args:
         x: [S, B, T, ...]; without a mask [S, ...].
-        mask: [S, B, T] which rows count; all where it is None.
+        mask: [S, B, T] which rows count, or [S, B, T, N] of which agents; all where it is None. A number per world,
+            x [S, B, T, 1], counts while an agent of the world does.
 
     Returns:
         [S]; 0 where nothing counts.
     """
     if mask is None:
         return x.flatten(1).mean(1)
+    if mask.dim() > 3:
+        mask = mask if x.shape[-1] == mask.shape[-1] else mask.any(-1, keepdim=True)
+        return torch.where(mask, x, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
     rows = x.flatten(3).mean(3) if x.dim() > 3 else x
     return torch.where(mask, rows, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)

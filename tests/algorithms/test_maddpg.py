@@ -1,6 +1,7 @@
 """MADDPG's own arithmetic: targets, the actor's gradient, target networks, and the policy's consistency."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -55,7 +56,9 @@ def test_whose_actions_are_the_policys(rule, expected):
     diagonal = math.atanh(0.25 * 2**0.5) / 2**0.5  # squashed along its length to (0.25, 0.25)
     own = torch.full((2, 2, 25, 2, 2), diagonal)
     stored = torch.full((2, 2, 25, 2, 2), -0.25)
-    value = trained._value_of_policy(trained._critic_rows(episodes)[:, :, :-1], own, own, stored)
+    value = trained._value_of_policy(
+        trained._critic_rows(episodes)[:, :, :-1], own, own, replace(episodes, action=stored)
+    )
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
 
 
@@ -81,7 +84,7 @@ def test_each_agent_is_told_its_own_value_of_what_its_policy_does(gradient, rule
     outputs = torch.full((2, 2, 25, 3, 5), -70.0)
     outputs[..., 4] = 0.0
     seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full(outputs.shape, 0.5)
-    value = trained._value_of_policy(seen, outputs, noise, done)
+    value = trained._value_of_policy(seen, outputs, noise, replace(episodes, action=done))
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, 3))
 
 
@@ -107,7 +110,7 @@ def test_the_expected_value_by_hand():
     probabilities = torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0, 0.0]])
     outputs = probabilities.clamp_min(1e-30).log().expand(2, 2, 25, 2, 5).clone().requires_grad_()
     seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
-    value = trained._value_of_policy(seen, outputs, noise, torch.full((2, 2, 25, 2), 3))
+    value = trained._value_of_policy(seen, outputs, noise, replace(episodes, action=torch.full((2, 2, 25, 2), 3)))
     torch.testing.assert_close(value, torch.tensor([30.0 + 3.0, 3.0 + 10.0]).expand(2, 2, 25, 2))
     (gradient,) = torch.autograd.grad(value.sum(), outputs)  # of exp(log p) Q: p Q
     torch.testing.assert_close(gradient[0, 0, 0, 0], torch.tensor([0.0, 0.0, 0.5 * 32.0, 0.0, 0.5 * 34.0]))
@@ -121,7 +124,7 @@ def test_with_all_actions_the_policys_the_partners_are_drawn_from_it():
     outputs = torch.full((2, 2, 25, 2, 5), 1e-30)
     outputs[..., 1] = 1.0  # both always choose 1
     seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
-    value = trained._value_of_policy(seen, outputs.log(), noise, torch.full((2, 2, 25, 2), 3))
+    value = trained._value_of_policy(seen, outputs.log(), noise, replace(episodes, action=torch.full((2, 2, 25, 2), 3)))
     torch.testing.assert_close(value, torch.ones(2, 2, 25, 2))
 
 

@@ -122,7 +122,7 @@ def test_what_follows_the_end_of_an_episode_is_not_valid(monkeypatch):
     counted = torch.where(batch.valid, batch.reward.squeeze(-1), 0.0).sum(2).mean(1)
     torch.testing.assert_close(returns, counted)
     # and nothing that is not valid enters a gradient step
-    spoilt = EpisodeBatch(**{name: tensor.clone() for name, tensor in vars(batch).items()})
+    spoilt = EpisodeBatch(**{name: tensor.clone() for name, tensor in batch.tensors.items()})
     spoilt.obs[:, 1, 4:], spoilt.state[:, 1, 4:], spoilt.reward[:, 1, 3:] = 9.0, 9.0, -9.0
     for algorithm in ("qmix", "maddpg"):
         weights = []

@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from esp_envs.base import Environment
+from esp_envs.base import Environment, Step
 from esp_envs.conformance.subject import (
     WORLDS,
     Broken,
@@ -31,6 +31,7 @@ def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
         require_equal("state", tuple(observation.state.shape), (*lead, spec.state.width))
         _require_mask(env, observation.action_mask)
         step = env.step(env.random_action())
+        _require_ends(env, observation.alive, step)
         observation = step.next
         require_equal("reward", tuple(step.reward.shape), (*lead, spec.num_agents))
         for name, flags in (("terminated", step.terminated), ("truncated", step.truncated)):
@@ -56,6 +57,19 @@ def _require_mask(env: Environment, mask: Tensor | None) -> None:
     require_equal("action mask", (tuple(mask.shape), mask.dtype), ((*env.action_shape, spec.action.count), torch.bool))
     require(bool(mask.any(-1).all()), "an action mask allows an agent nothing")
     require(torch.equal(mask, now), "the observation's action mask differs from that of 'action_mask()'")
+
+
+def _require_ends(env: Environment, alive: Tensor | None, step: Step) -> None:
+    after = (step.final or step.next).alive
+    if alive is None or after is None:
+        require(alive is None and after is None, "'alive' is given in some observations only")
+        require(not env.spec.agents_end, "the spec says 'agents_end', but observations have no 'alive'")
+        return
+    require(env.spec.agents_end, "'alive' is given, but the spec does not say 'agents_end'")
+    require_equal("alive", (tuple(after.shape), after.dtype), (env.action_shape[:3], torch.bool))
+    require(not bool((after & ~alive).any()), "an agent that has ended acts again in the same episode")
+    paid = not env.spec.shared_reward and bool(step.reward[~alive].any())
+    require(not paid, "an agent that has ended gets a reward of its own")
 
 
 def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -> None:

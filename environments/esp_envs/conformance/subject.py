@@ -58,8 +58,8 @@ def same_step(a: Step, b: Step, where: tuple[slice | Tensor, ...] = ()) -> bool:
 
 def parts_of(observation: Observation) -> list[Tensor]:
     """Return what an observation consists of."""
-    mask = observation.action_mask
-    return [observation.obs, observation.state, *([] if mask is None else [mask])]
+    parts = (observation.obs, observation.state, observation.action_mask, observation.alive)
+    return [part for part in parts if part is not None]
 
 
 def same_observation(a: Observation, b: Observation, where: tuple[Tensor, ...] = ()) -> bool:

@@ -1,0 +1,209 @@
+"""Agents that end one by one: no loss, no value and no statistics behind an agent's own end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from esp_cli.algorithms.losses import gae, normalise_per_seed, td_targets
+from esp_cli.checking import check_symmetry
+from esp_cli.prior import mean_per_seed
+from esp_cli.symmetry import transform_set
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_envs import make, register
+from esp_envs.conformance import Subject, check
+from esp_envs.registry import TASKS
+from tests.algorithms.off_policy import SMALL
+from tests.cli.running import esp
+from tests.leaving import Leaving, Returning
+
+TASK = "tests.leaving:Leaving"
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    """Register the tasks of this file, for this file alone."""
+    monkeypatch.setattr(TASKS, "_registered", {})
+    assert register(Leaving) == TASK
+
+
+def learner(algorithm, **overrides):
+    small = {"num_envs": 4, "num_steps": 6} if algorithm == "mappo" else SMALL
+    settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": [8, 8]}
+    settings["prior.transforms"] = "flip-x"
+    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
+    return build_learner(resolve_config(TASK, algorithm, steps=1000, seeds=(0, 1), overrides=settings))
+
+
+def test_the_mean_over_the_living_by_hand():
+    """Of (1, 2 | 3, 40) with the last agent ended, (1 + 2 + 3) / 3; a number per world counts while anybody lives."""
+    x = torch.tensor([[[[1.0, 2.0], [3.0, 40.0]]]])
+    alive = torch.tensor([[[[True, True], [True, False]]]])
+    assert mean_per_seed(x, alive).tolist() == [2.0]
+    assert mean_per_seed(x).tolist() == [11.5], "the control"
+    assert mean_per_seed(x[..., :1], alive).tolist() == [2.0]
+    nobody = torch.tensor([[[[True, True], [False, False]]]])
+    assert mean_per_seed(x[..., :1], nobody).tolist() == [1.0]
+
+
+def test_standardised_advantages_of_the_living_by_hand():
+    """Of (1, 3, 50) with the last ended: mean 2, deviation 1."""
+    x, alive = torch.tensor([[1.0, 3.0, 50.0]]), torch.tensor([[True, True, False]])
+    torch.testing.assert_close(normalise_per_seed(x, 0.0, alive), torch.tensor([[-1.0, 1.0, 0.0]]))
+    both = torch.ones_like(alive)
+    torch.testing.assert_close(normalise_per_seed(x, 1e-5, both), normalise_per_seed(x))
+
+
+def test_advantages_end_with_the_agent_by_hand():
+    """Agent 1 ends with the first step, agent 2 goes on; gamma = lambda = 1/2, all values 4.
+
+    A_2 = 1 + 2 - 4 = -1 at the last step, -1 + (1 + 2 - 4) / 4 = -1.25 before; agent 1 has 1 - 4 = -3, nothing beyond.
+    """
+    reward, value = torch.ones(1, 1, 2, 2), torch.full((1, 1, 2, 2), 4.0)
+    gone = torch.tensor([[[[True, False], [True, False]]]])
+    advantage = gae(reward, value, value, gone, gone, 0.5, 0.5)
+    assert advantage[0, 0].tolist() == [[-3.0, -1.25], [-3.0, -1.0]]
+
+
+def test_targets_end_with_the_agent_by_hand():
+    """Agent 1 ends with the first step: its target is its reward, 1; agent 2's has gamma times 4 added."""
+    over = torch.tensor([[[[True, False]]]])
+    target = td_targets(torch.ones(1, 1, 1, 2), torch.full((1, 1, 1, 2), 4.0), over, 0.5, 0.0)
+    assert target.flatten().tolist() == [1.0, 3.0]
+
+
+def collected(**overrides):
+    trained = learner("mappo", **overrides)
+    rollout = trained.collector.collect(6)
+    assert bool(rollout.alive.any())
+    assert not bool(rollout.alive.all())
+    return trained, rollout
+
+
+def test_a_rollout_says_who_has_ended():
+    _, rollout = collected()
+    arrived = rollout.reward > 0.5
+    assert torch.equal(rollout.gone & rollout.alive, arrived), "an agent goes in the step in which it arrives"
+    assert not bool(rollout.reward[~rollout.alive].any())
+
+
+def test_what_an_ended_agent_did_and_was_worth_moves_no_weight():
+    """Other actions and log-probabilities of ended agents give the same update bit for bit; of living ones not."""
+    results = {}
+    for who in ("nobody", "ended", "living"):
+        trained, rollout = collected(prior__kind="none", mappo__num_minibatches=1, mappo__critic_input="own")
+        mask = {"nobody": torch.zeros_like(rollout.alive), "ended": ~rollout.alive, "living": rollout.alive}[who]
+        rollout = replace(
+            rollout,
+            action=torch.where(mask, 1 - rollout.action, rollout.action),
+            log_prob=torch.where(mask, rollout.log_prob - 0.3, rollout.log_prob),
+            reward=torch.where(mask, 7.0, rollout.reward) if who != "ended" else rollout.reward,
+        )
+        trained.update(rollout, 0.0)
+        results[who] = torch.cat([p.flatten() for p in [*trained.policy.parameters(), *trained.critic.parameters()]])
+    assert torch.equal(results["nobody"], results["ended"])
+    assert not torch.equal(results["nobody"], results["living"]), "the control"
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
+def test_what_an_ended_agent_did_moves_no_weight_of_an_off_policy_learner(algorithm):
+    results = {}
+    for who in ("nobody", "ended", "living"):
+        trained = learner(algorithm, prior__kind="none")
+        batch, _ = trained.collector.collect()
+        trained._store(batch)
+        alive = batch.alive[:, :, :-1]
+        assert bool(alive.any())
+        assert not bool(alive.all())
+        mask = {"nobody": torch.zeros_like(alive), "ended": ~alive, "living": alive}[who]
+        trained.update(replace(batch, action=torch.where(mask, 1 - batch.action, batch.action)))
+        results[who] = torch.cat([p.flatten() for module in trained.modules.values() for p in module.parameters()])
+    assert torch.equal(results["nobody"], results["ended"])
+    assert not torch.equal(results["nobody"], results["living"]), "the control"
+
+
+def test_an_ended_agents_value_enters_qmixs_mixer_as_0():
+    trained = learner("qmix", prior__kind="none")
+    batch, _ = trained.collector.collect()
+    seen = []
+    trained.mixer.forward = lambda chosen, state: seen.append(chosen) or chosen.sum(-1)
+    trained.target_mixer.forward = trained.mixer.forward
+    utilities = torch.full((2, 2, 7, 3, 2), 5.0)
+    trained._total(utilities, batch)
+    assert torch.equal(seen[0] == 0, ~batch.alive[:, :, :-1])
+    trained.target_policy.unroll = lambda *rows: utilities
+    trained._targets(batch, utilities)
+    assert torch.equal(seen[1] == 0, ~batch.alive[:, :, 1:])
+
+
+def test_statistics_of_rewards_leave_ended_agents_out():
+    """Of the agents with rewards of their own: -0.1 for each step and 1 for arriving, over living agents alone."""
+    trained = learner("maddpg", prior__kind="none")
+    batch, _ = trained.collector.collect()
+    trained._store(batch)
+    alive = batch.alive[:, :, :-1]
+    expected = torch.where(alive, batch.reward, 0.0).flatten(1).sum(1) / alive.flatten(1).sum(1)
+    mean = trained.reward_scale.mean / trained.reward_scale.weight
+    torch.testing.assert_close(mean, expected)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "choice"),
+    [
+        ("mappo", {}),
+        ("mappo", {"task.shared": True, "mappo.chunk_steps": 1}),
+        ("mappo", {"network.name": "gru", "mappo.num_minibatches": 1, "mappo.critic_input": "own"}),
+        ("maddpg", {"prior.replay": "stored"}),
+        ("maddpg", {"task.shared": True, "maddpg.actor_actions": "own"}),
+        ("maddpg", {"maddpg.actor_gradient": "expected"}),
+        ("qmix", {}),
+        ("qmix", {"network.name": "gru", "task.shared": True}),
+    ],
+)
+def test_every_learner_trains_with_the_prior_and_goes_on_bit_for_bit(algorithm, choice):
+    trained, other = learner(algorithm, **choice), learner(algorithm, **choice)
+    for _ in range(3):
+        assert bool(trained.iterate(0.0).finite.all())
+    other.load_state_dict({name: tensor.clone() for name, tensor in trained.state_dict().items()})
+    one, two = trained.iterate(0.5), other.iterate(0.5)
+    assert all(torch.equal(value, two.metrics[name]) for name, value in one.metrics.items())
+
+
+def test_chunks_of_a_minibatch_change_nothing():
+    """A mean over the living is one of the whole minibatch, however it is computed."""
+    weights = []
+    for size in (1, 10_000):
+        trained, rollout = collected(prior__kind="none", mappo__chunk_steps=size)
+        trained.update(rollout, 0.0)
+        weights.append(torch.cat([p.flatten() for p in trained.policy.parameters()]))
+    assert torch.equal(*weights)
+
+
+def test_who_has_ended_moves_with_the_agents():
+    trained, rollout = collected()
+    batch, _ = trained.prepare(rollout)
+    (swap,) = transform_set("agents-1-0-2", trained.spec).each()
+    moved = batch.transformed(swap)
+    assert torch.equal(moved.alive, batch.alive[..., [1, 0, 2]])
+    assert not torch.equal(moved.alive, batch.alive), "the control"
+
+
+def test_the_conformance_battery_asks_for_ends():
+    findings = list(check(Subject(lambda count, seeds: make(TASK, count, seeds))))
+    assert [f.broken for f in findings if f.broken] == []
+    name = register(Returning)
+    findings = list(check(Subject(lambda count, seeds: make(name, count, seeds))))
+    assert any("acts again" in (f.broken or "") for f in findings)
+
+
+def test_the_task_is_checked_evaluated_and_its_return_is_the_agents_own(tmp_path):
+    report = check_symmetry(lambda count, seeds: make(TASK, count, seeds), "flip-x")
+    assert report.holds
+    assert "alive" in {field.field for element in report.elements for field in element.fields}
+    run = tmp_path / "run"
+    esp("train", "--task", TASK, "--steps", 500, "--set", "mappo.num_envs=8", "--set", "evaluation.episodes=4",
+        "--set", "prior.transforms=flip-x", "--set", "mappo.num_minibatches=1", "--out", run)  # fmt: skip
+    assert "arrived" in esp("eval", run, "--episodes", 4).stdout
