@@ -212,8 +212,7 @@ class Mappo(Learner):
         gradients = []
         for chunk in copies.chunks(size):
             weight = chunk.originals.count / total
-            closed = self._closed_form and chunk.originals.action_mask is None and carries(chunk.transforms)
-            loss_of = self._loss if closed else self.reference_loss
+            loss_of = self._loss if self._closed_form and carries(chunk.transforms) else self.reference_loss
             gradients.append(self.optimiser.gradient(loss_of(chunk, entropy_coef, weight, sums)).mul_(weight))
         actor_norm, critic_norm = self.optimiser.step(sum(gradients[1:], start=gradients[0]))
         if sums is not None:
