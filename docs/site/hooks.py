@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import site_notebook
 import site_reference
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
@@ -29,6 +30,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for page in [*DOCS.rglob("*.md"), *(ROOT / name for name in AT_THE_ROOT)]:
         for target in _targets(page.read_text(encoding="utf-8"), page.parent):
             pages[source_page(target)] = _source(target)
+    pages["tutorial.md"], pictures = site_notebook.page(DOCS / "tutorial.ipynb")
+    for name, picture in pictures.items():
+        files.append(File.generated(config, name, content=picture))
     for path, content in pages.items():
         shown = InclusionLevel.NOT_IN_NAV if path.startswith("source/") else InclusionLevel.INCLUDED
         files.append(File.generated(config, path, content=content, inclusion=shown))
