@@ -220,7 +220,7 @@ class Failing(Walking):
     ("how", "sentence"),
     [
         ("raise", "of Raise raises in 'step': KeyError: 'lost'"),
-        ("apart", "walker_1 of Apart ends before the others; its agents must end together"),
+        ("apart", "walker_1 of Apart ends before the others; set 'agents_end = True' in the class"),
         ("early", "an episode of Early ends before its horizon; set 'terminates = True' in the class"),
         ("cut", "an episode of Cut ends before its horizon; give both the same number of steps"),
         ("die", "a worker process that steps environments died (exit code -9)"),

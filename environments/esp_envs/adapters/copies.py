@@ -39,6 +39,8 @@ class Sizes:
     metrics: int
     action: int | None
     """Width of a continuous action; None for a discrete one."""
+    choices: int = 0
+    """Discrete actions that a mask speaks of; 0 without masks."""
 
 
 class Board:
@@ -54,6 +56,8 @@ class Board:
         obs, final_obs: [C, N, D] float32, before and after the automatic reset the same unless the episode ended.
         state, final_state: [C, state width] float32.
         metrics: [C, M] float32.
+        mask, final_mask: [C, N, A] uint8, the allowed actions; A = 0 without masks.
+        alive, final_alive: [C, N] uint8, the agents that have not ended.
     """
 
     active: NDArray[np.uint8]
@@ -67,6 +71,10 @@ class Board:
     state: NDArray[np.float32]
     final_state: NDArray[np.float32]
     metrics: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    final_mask: NDArray[np.uint8]
+    alive: NDArray[np.uint8]
+    final_alive: NDArray[np.uint8]
 
     def __init__(self, sizes: Sizes) -> None:
         copies, agents = sizes.copies, sizes.agents
@@ -83,6 +91,8 @@ class Board:
             "active": ((copies,), np.uint8),
             "cut": ((copies,), np.uint8),
             "ended": ((copies,), np.uint8),
+            **dict.fromkeys(("mask", "final_mask"), ((copies, agents, sizes.choices), np.uint8)),
+            **dict.fromkeys(("alive", "final_alive"), ((copies, agents), np.uint8)),
         }
         # the widest numbers first, so that each array begins at a multiple of its number's width
         order = sorted(parts, key=lambda name: -np.dtype(parts[name][1]).itemsize)

@@ -77,6 +77,8 @@ class ParallelTask(CopyHooks, Environment):
             symmetry=self.symmetry,
             shared_reward=self.shared_reward,
             terminates=self.terminates,
+            agents_end=self.agents_end,
+            masks=self.masks,
             settings=settings.model_dump(),
         )
         one.require_spaces()
@@ -109,9 +111,9 @@ class ParallelTask(CopyHooks, Environment):
         ended = torch.from_numpy(board.ended.copy()).view_as(self._base)
         final = None
         if self.terminates or bool((ended > 0).any()):
-            final = self._observation(board.final_obs, board.final_state)
+            final = self._final()
         return Step(
-            next=self._observation(board.obs, board.state),
+            next=self._seen(),
             reward=self._per_world(board.reward),
             terminated=(ended == TERMINATED).to(self.device),
             truncated=(ended == TRUNCATED).to(self.device),
@@ -170,6 +172,7 @@ class ParallelTask(CopyHooks, Environment):
                 spec.state.width,
                 len(self.metrics),
                 None if discrete else self.action_shape[-1],
+                self.action.count if isinstance(self.action, Discrete) and self.masks else 0,
             )
             if workers and can_fork():
                 self._copies = WorkerCopies(sizes, self._stepper, min(workers, count))
@@ -189,7 +192,7 @@ class ParallelTask(CopyHooks, Environment):
         copies.reset()
         self._begun += 1
         copies.board.seed[:] = self._seeds(copies.board.active)
-        return self._observation(copies.board.obs, copies.board.state)
+        return self._seen()
 
     def _advance(self, active: Tensor, action: Tensor) -> None:
         copies = self._started()
@@ -212,8 +215,25 @@ class ParallelTask(CopyHooks, Environment):
         pairs = zip(base.tolist(), episode.tolist(), strict=True)
         return [int(np.random.SeedSequence(pair).generate_state(1)[0] >> 1) for pair in pairs]
 
-    def _observation(self, obs: Array, state: Array) -> Observation:
-        return Observation(self._per_world(obs), self._per_world(state))
+    def action_mask(self) -> Tensor | None:
+        """Return which actions each agent may take now; None without `masks`."""
+        return self._per_world(self._started().board.mask).bool() if self.masks else None
+
+    def _seen(self) -> Observation:
+        board = self._started().board
+        return self._observation(board.obs, board.state, board.mask, board.alive)
+
+    def _final(self) -> Observation:
+        board = self._started().board
+        return self._observation(board.final_obs, board.final_state, board.final_mask, board.final_alive)
+
+    def _observation(self, obs: Array, state: Array, mask: Array, alive: Array) -> Observation:
+        return Observation(
+            self._per_world(obs),
+            self._per_world(state),
+            self._per_world(mask).bool() if self.masks else None,
+            self._per_world(alive).bool() if self.agents_end else None,
+        )
 
     def _per_world(self, values: Array) -> Tensor:
         """Return [S, E, ...] on the task's device, as memory of its own."""

@@ -18,7 +18,8 @@ Array = NDArray[Any]
 class CopyHooks(ABC):
     """What a task says about one copy of its environment. The hooks run in worker processes; they use settings alone.
 
-    All learning agents of a copy must end together. Where they may end before the horizon, set `terminates`.
+    All learning agents of a copy must end together, unless `agents_end` says otherwise. Where an episode may be over
+    before the horizon, set `terminates`.
     """
 
     observation: Layout
@@ -32,6 +33,10 @@ class CopyHooks(ABC):
     learners: str = ""
     """What the names of the agents that learn begin with; the others act by `opponent`."""
     terminates: bool = False
+    agents_end: bool = False
+    """Whether agents may end one by one, by leaving `env.agents`, while the episode goes on for the others."""
+    masks: bool = False
+    """Whether the environment says which discrete actions are allowed; see `allowed`."""
     shared_reward: bool = False
     metrics: tuple[str, ...] = ()
     """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
@@ -42,7 +47,18 @@ class CopyHooks(ABC):
 
     def reading(self, agent: str, observation: Any) -> Array:
         """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
-        return np.asarray(observation)
+        return np.asarray(observation["observation"] if _has(observation, "action_mask") else observation)
+
+    def allowed(self, agent: str, observation: Any, info: Mapping[str, Any]) -> Array:
+        """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info.
+
+        Raises:
+            ValueError: neither has one.
+        """
+        for place in (observation, info):
+            if _has(place, "action_mask"):
+                return np.asarray(place["action_mask"])
+        raise ValueError(f"{agent} gets no 'action_mask', neither in its observation nor in its info")
 
     def opponent(self, agent: str, observation: Any, generator: np.random.Generator) -> Any:
         """Return the action of an agent that does not learn, as its environment takes it.
@@ -81,11 +97,16 @@ class Copy:
         Raises:
             ValueError: names the agent, its numbers and those of the layout.
         """
-        task, first = self._task, self.env.reset(seed=0)[0]
+        task = self._task
+        first, infos = self.env.reset(seed=0)
         for name in self.learners:
             width = task.reading(name, first[name]).size
             if width != task.observation.width:
                 raise ValueError(f"{name} sees {width} numbers, but the layout has {task.observation.width}")
+            if task.masks and isinstance(task.action, Discrete):
+                size = task.allowed(name, first[name], infos.get(name, {})).size
+                if size != task.action.count:
+                    raise ValueError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
             space = self.env.action_space(name)
             if isinstance(task.action, Discrete):
                 if getattr(space, "n", None) != task.action.count:
@@ -116,6 +137,8 @@ class CopyStepper:
         self._task, self._board = task, board
         self._copies = {k: Copy(task) for k in copies}
         self._seen: dict[int, Mapping[str, Any]] = {}
+        self._infos: dict[int, Mapping[str, Any]] = {}
+        self._gone: dict[int, set[str]] = {}
         self._dice: dict[int, np.random.Generator] = {}
 
     def reset(self) -> None:
@@ -134,32 +157,46 @@ class CopyStepper:
         seed = int(self._board.seed[k])
         self._dice[k] = np.random.default_rng(seed)
         try:
-            self._seen[k] = self._copies[k].env.reset(seed=seed)[0]
+            self._seen[k], self._infos[k] = self._copies[k].env.reset(seed=seed)
         except Exception as error:
             raise ValueError(self._sentence(k, "reset", error)) from error
-        self._write(k, self._board.obs, self._board.state)
+        self._gone[k] = set()
+        board = self._board
+        self._write(k, board.obs, board.state, board.mask, board.alive)
 
     def _step(self, k: int, copy: Copy) -> None:
         task, board, seen = self._task, self._board, self._seen[k]
-        chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners)}
+        gone = self._gone[k]
+        chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name not in gone}
         chosen |= {name: task.opponent(name, seen[name], self._dice[k]) for name in copy.rest if name in seen}
         try:
-            self._seen[k], reward, terminated, truncated, infos = copy.env.step(chosen)
-            found = task.measure(copy.env, infos)
+            self._seen[k], reward, terminated, truncated, self._infos[k] = copy.env.step(chosen)
+            found = task.measure(copy.env, self._infos[k])
         except Exception as error:
             raise ValueError(self._sentence(k, "step", error)) from error
-        board.reward[k] = [reward[name] for name in copy.learners]
+        acting = [name for name in copy.learners if name not in gone]
+        board.reward[k] = [
+            reward.get(name, 0.0) if name in acting else self._passive_reward(reward) for name in copy.learners
+        ]
         board.metrics[k] = [found[name] for name in task.metrics]
-        over = {name: terminated[name] or truncated[name] for name in copy.learners}
-        if any(over.values()) and not all(over.values()):
-            early = next(name for name, is_over in over.items() if is_over)
-            raise ValueError(f"{early} of {type(task).__name__} ends before the others; its agents must end together")
-        board.ended[k] = self._how(k, all(over.values()), any(terminated[name] for name in copy.learners))
-        self._write(k, board.final_obs, board.final_state)
+        ended = {name: terminated.get(name, True) for name in acting}  # an agent of whom nothing is said has left
+        over = [name for name in acting if ended[name] or truncated.get(name, False)]
+        if over and len(over) < len(acting) and not task.agents_end:
+            raise ValueError(
+                f"{over[0]} of {type(task).__name__} ends before the others; set 'agents_end = True' in the class"
+            )
+        board.ended[k] = self._how(k, len(over) == len(acting), any(ended.values()))
+        gone.update(name for name in over if ended[name] or not board.cut[k])
+        self._write(k, board.final_obs, board.final_state, board.final_mask, board.final_alive)
         if board.ended[k]:
             self._start(k)
         else:
             board.obs[k], board.state[k] = board.final_obs[k], board.final_state[k]
+            board.mask[k], board.alive[k] = board.final_mask[k], board.final_alive[k]
+
+    def _passive_reward(self, reward: Mapping[str, float]) -> float:
+        """Return the reward of an agent that has ended: 0, or what the others get where it is shared."""
+        return next(iter(reward.values()), 0.0) if self._task.shared_reward else 0.0
 
     def _how(self, k: int, over: bool, terminated: bool) -> int:
         """Return how the episode of a copy ended, 0 where it goes on; the horizon counts as a cut in any case."""
@@ -171,15 +208,24 @@ class CopyStepper:
             raise ValueError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
         return TRUNCATED if self._board.cut[k] else 0
 
-    def _write(self, k: int, obs: Array, state: Array) -> None:
-        copy, seen = self._copies[k], self._seen[k]
+    def _write(self, k: int, obs: Array, state: Array, mask: Array, alive: Array) -> None:
+        """Write what the agents of a copy see; zeros, and everything allowed, for one that is there no more."""
+        copy, seen, infos, gone = self._copies[k], self._seen[k], self._infos[k], self._gone[k]
         for i, name in enumerate(copy.learners):
-            obs[k, i] = self._task.reading(name, seen[name]).reshape(-1)
+            there = name in seen
+            obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if there else 0
+            alive[k, i] = name not in gone
+            if self._task.masks:
+                mask[k, i] = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[k, i] else 1
         state[k] = obs[k].reshape(-1) if self._task.state is None else np.asarray(copy.env.state()).reshape(-1)
 
     def _sentence(self, k: int, what: str, error: Exception) -> str:
         lines = str(error).strip().splitlines() or [""]
         return f"copy {k} of {type(self._task).__name__} raises in '{what}': {type(error).__name__}: {lines[-1]}"
+
+
+def _has(place: Any, name: str) -> bool:
+    return isinstance(place, Mapping) and name in place
 
 
 def _bounds(space: Any) -> tuple[Array, Array] | None:

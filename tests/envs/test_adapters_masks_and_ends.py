@@ -1,0 +1,168 @@
+"""Action masks and agents that end one by one, read from PettingZoo and Gymnasium environments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_envs import Discrete, Environment, Field, Kind, generators_for, layout, register
+from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
+from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
+from esp_envs.conformance import Subject, check
+from esp_envs.registry import TASKS
+
+gymnasium = pytest.importorskip("gymnasium", reason="spaces come from the extra 'pettingzoo'")
+STEPS = 5
+
+
+class Corridor:
+    """Two walkers leave at the end of a corridor; nobody may walk through its walls."""
+
+    possible_agents = ("walker_0", "walker_1")
+
+    def action_space(self, agent):
+        return gymnasium.spaces.Discrete(3)
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.time = list(self.possible_agents), 0
+        places = np.random.default_rng(seed).integers(0, 3, 2)
+        self.places = dict(zip(self.agents, places.tolist(), strict=True))
+        return self._seen(), {name: {} for name in self.agents}
+
+    def step(self, actions):
+        assert set(actions) == set(self.agents), "an agent that has left gets no action"
+        self.time += 1
+        for name, action in actions.items():
+            assert self._allowed(name)[action], "a forbidden action is taken"
+            self.places[name] += (0, 1, -1)[action]
+        acted = list(self.agents)
+        out = {name: self.places[name] == 4 for name in acted}
+        cut = dict.fromkeys(acted, self.time == STEPS)
+        seen, reward = self._seen(), {name: float(self.places[name]) for name in acted}
+        self.agents = [name for name in acted if not (out[name] or cut[name])]
+        return seen, reward, out, cut, {name: {} for name in acted}
+
+    def _allowed(self, name):
+        return np.array([1, self.places[name] < 4, self.places[name] > 0], np.int8)
+
+    def _seen(self):
+        return {n: {"observation": [self.places[n], self.time], "action_mask": self._allowed(n)} for n in self.agents}
+
+
+class CorridorSettings(ParallelSettings):
+    horizon: int = STEPS
+
+
+class Walkers(ParallelTask):
+    Settings = CorridorSettings
+    observation = layout(Field("place", Kind.SCALAR), Field("time", Kind.SCALAR))
+    action = Discrete(Kind.SCALAR, ((0.0,), (1.0,), (2.0,)), ("stay", "on", "back"))
+    symmetry, convention = "c1", "place"
+    terminates, agents_end, masks = True, True, True
+
+    def make_one(self):
+        return Corridor()
+
+
+def worlds(cls: type[Environment], num_envs=5, seeds=(3, 7), **settings) -> Environment:
+    return cls(cls.Settings(**settings), num_envs, generators_for(seeds))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_the_corridor_keeps_every_promise(workers):
+    subject = Subject(lambda count, seeds: worlds(Walkers, count, seeds, workers=workers))
+    assert [finding.broken for finding in check(subject) if finding.broken] == []
+
+
+def test_who_leaves_is_paid_once_and_the_other_goes_on():
+    env = worlds(Walkers, 40, (0,), workers=0)
+    seen = env.reset()
+    left_alone = False
+    for _ in range(STEPS):
+        on = torch.where(torch.arange(2) == 0, 1, 0).expand(1, 40, 2)  # the first walks on, the second stays
+        step = env.step(torch.where(seen.alive, on, 2))
+        after = (step.final or step.next).alive
+        assert torch.equal(step.reward[~seen.alive], torch.zeros(int((~seen.alive).sum())))
+        gone = seen.alive & ~after
+        assert bool((step.reward[gone] == 4).all())
+        left_alone |= bool((~after[..., 0] & after[..., 1]).any())
+        seen = step.next
+    assert left_alone
+    assert bool(step.truncated.all()), "the horizon cuts the episode; whoever is still there has not ended"
+    assert bool(step.final.alive[..., 1].all())
+
+
+def test_masks_come_from_observations():
+    env = worlds(Walkers, 20, (0,), workers=0)
+    seen = env.reset()
+    places = seen.obs[..., 0]
+    assert torch.equal(seen.action_mask[..., 2], places > 0)
+    assert not bool(seen.action_mask[..., 2].all())
+
+
+def test_without_the_attribute_an_early_end_is_refused_and_masks_are_left_alone():
+    env = worlds(type("Plain", (Walkers,), {"agents_end": False, "masks": False}), 40, (0,), workers=0)
+    seen = env.reset()
+    assert (seen.alive, seen.action_mask) == (None, None)
+    stay_or_walk = torch.where(torch.arange(2) == 0, 1, 0).expand(1, 40, 2)
+    env.step(stay_or_walk)
+    with pytest.raises(ValueError, match="of Plain ends before the others; set 'agents_end = True' in the class"):
+        env.step(stay_or_walk)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        ({"action_mask": np.ones(4)}, "walker_0 has a mask of 4 actions, but the task has 3"),
+        ({}, "walker_0 gets no 'action_mask', neither in its observation nor in its info"),
+    ],
+)
+def test_a_mask_that_is_missing_or_of_another_size_is_refused(given, sentence):
+    class Odd(Corridor):
+        def _seen(self):
+            return {name: {**seen, **given} if given else seen["observation"] for name, seen in super()._seen().items()}
+
+    with pytest.raises(ValueError, match="mask") as caught:
+        worlds(type("Misfit", (Walkers,), {"make_one": lambda self: Odd()}))
+    assert str(caught.value) == sentence
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_learners_train_in_the_corridor(algorithm, monkeypatch):
+    monkeypatch.setattr(TASKS, "_registered", {})
+    small = {"num_envs": 4, **({"num_steps": STEPS} if algorithm == "mappo" else {"warmup_episodes": 0})}
+    overrides = {f"{algorithm}.{name}": value for name, value in small.items()}
+    overrides |= {"prior.kind": "none", "task.workers": 0, "network.hidden": [8]}
+    trained = build_learner(resolve_config(register(Walkers), algorithm, steps=100, overrides=overrides))
+    assert all(bool(trained.iterate(0.0).finite.all()) for _ in range(2))
+
+
+TaxiEnv = pytest.importorskip("gymnasium.envs.toy_text.taxi").TaxiEnv
+
+
+class TaxiSettings(SingleAgentSettings):
+    horizon: int = 20
+
+
+class Taxi(SingleAgentTask):
+    Settings = TaxiSettings
+    observation = layout(Field("place", Kind.SCALAR))
+    action = Discrete(Kind.SCALAR, tuple((float(k),) for k in range(6)), ("s", "n", "e", "w", "take", "drop"))
+    symmetry, convention = "c1", "gymnasium Taxi"
+    terminates, masks = True, True
+
+    def make_single(self):
+        return TaxiEnv()
+
+
+def test_gymnasiums_masks_come_from_infos():
+    env = worlds(Taxi, 6, (0,), workers=0)
+    seen = env.reset()
+    first = TaxiEnv()
+    for _ in range(3):
+        expected = [first.action_mask(int(place)) for place in seen.obs.flatten()]
+        assert torch.equal(seen.action_mask[0, :, 0], torch.tensor(np.array(expected)).bool())
+        seen = env.step(env.random_action()).next
