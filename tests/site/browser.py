@@ -40,6 +40,15 @@ window.onload = () => {{
 """
 
 
+def opened(address: str, scratch: Path) -> subprocess.CompletedProcess[str]:
+    """Open a page without a screen, a network or a past; return what it became and, on standard error, what it said."""
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+    flags += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files", "--dump-dom"]
+    flags += ["--enable-logging=stderr", f"--user-data-dir={scratch / 'profile'}", "--window-size=1500,1000"]
+    command = [str(BROWSER), *flags, "--virtual-time-budget=15000", address]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+
+
 def complaints(pages: Sequence[Path], width: int, scratch: Path) -> list[str]:
     """Return what a browser finds wrong with pages at a width: too wide, cut tables, lost pictures, console messages.
 
@@ -56,11 +65,7 @@ def complaints(pages: Sequence[Path], width: int, scratch: Path) -> list[str]:
         )
         frame_page = scratch / "frames.html"
         frame_page.write_text(FRAMES.format(frames=frames), encoding="utf-8")
-        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-        flags += ["--disable-component-update", "--disable-sync", "--allow-file-access-from-files", "--dump-dom"]
-        flags += ["--enable-logging=stderr", f"--user-data-dir={scratch / 'profile'}", "--window-size=1500,1000"]
-        command = [str(BROWSER), *flags, frame_page.as_uri()]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+        done = opened(frame_page.as_uri(), scratch)
         found += [line for line in done.stderr.splitlines() if "CONSOLE" in line]
         answer = re.search(r'<pre id="found">(.*?)</pre>', done.stdout, re.DOTALL)
         assert answer is not None, "the browser gave no answer"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.site.browser import BROWSER, DESKTOP, PHONE, complaints
+from tests.site.browser import BROWSER, DESKTOP, PHONE, complaints, opened
 from tests.site.built import faults
 
 ROOT = Path(__file__).parents[2]
@@ -51,6 +52,13 @@ def test_the_search_finds_pages_without_a_server(site: Path) -> None:
     assert index.startswith("var __index = ")
     assert '"location":"own-tasks.html"' in index
     assert "source/esp_cli" not in index, "the search finds pages, not sources"
+
+
+@needs_browser
+def test_a_browser_searches_pages_that_are_opened_from_the_disk(site: Path, tmp_path: Path) -> None:
+    found = opened(f"{(site / 'index.html').as_uri()}?q=risky", tmp_path)
+    assert re.search(r"<mark[^>]*>Risky</mark> state", found.stdout)
+    assert "CONSOLE" not in found.stderr
 
 
 def test_the_reference_pages_name_every_command_setting_and_task(site: Path) -> None:
