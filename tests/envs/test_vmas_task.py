@@ -40,6 +40,15 @@ def test_a_scenario_keeps_every_promise(name: str, settings) -> None:
     assert [f.not_asked for f in findings if f.not_asked] == ["each world ends for itself"]
 
 
+def test_arguments_that_a_scenario_does_not_know_are_refused() -> None:
+    class Careless(vmas_scenarios.Transport):
+        def arguments(self):
+            return super().arguments() | {"wind": 3}
+
+    with pytest.raises(ValueError, match=r"the VMAS scenario 'transport' has no arguments \{'wind': 3\}"):
+        Careless(Careless.Settings(), 2, generators_for((0,)))
+
+
 @cases
 def test_a_task_gives_the_numbers_of_vmas_itself(name: str, settings) -> None:
     task = worlds(name, settings, 6, (5,))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -40,7 +41,14 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
 
     def make() -> Any:
         try:
-            return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
+            with warnings.catch_warnings():
+                warnings.filterwarnings("error", message="Scenario kwargs")  # VMAS warns of what it does not know
+                return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
+        except UserWarning as unknown:
+            told = str(unknown).partition(" passed")[0].removeprefix("Scenario kwargs: ")
+            raise ValueError(
+                f"the VMAS scenario '{scenario}' has no arguments {told}; leave them out of what 'arguments' returns"
+            ) from unknown
         except (AssertionError, TypeError) as error:
             raise ValueError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {error}") from error
 
