@@ -48,7 +48,8 @@ CONTRACT_ONLY_UP_TO = RANKS["algorithms"]
 """Up to this rank, tasks are known by their contract alone; those above make environments by name."""
 CONTRACT = ("esp_envs.spec.", "esp_envs.base.", "esp_envs.installed.", "esp_envs.scene.")
 PRINTING = {"app", "commands", "console"}
-ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING}
+STUDIES = {"studies", "reporting"}
+ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING, "ray": STUDIES, "optuna": STUDIES}
 SIMULATORS = {"mujoco", "pymunk"}
 CODE_IN_DATA = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "torch.load", "torch.save"}
 _TARGET = re.compile(r"(esp_(?:cli|envs)[\w.]*):\w+")

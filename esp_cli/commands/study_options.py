@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -63,6 +63,21 @@ JobsOption = Annotated[
     int | None,
     typer.Option("--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."),
 ]
+EngineOption = Annotated[
+    Literal["local", "ray"],
+    typer.Option("--engine", help="What runs the study: this machine, or the nodes of a Ray cluster."),
+]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(
+        "--address",
+        help="Of the Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a cluster of this machine.",
+        metavar="ADDRESS",
+    ),
+]
+GpuShareOption = Annotated[
+    float, typer.Option("--gpu-share", min=0.01, max=1.0, help="Share of a GPU that a run takes on a Ray cluster.")
+]
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
 ]
@@ -110,6 +125,9 @@ class StudyChoices:
     device: DeviceOption = "cpu"
     episodes: EpisodesOption = DEFAULT_EPISODES
     jobs: JobsOption = None
+    engine: EngineOption = "local"
+    address: AddressOption = None
+    gpu_share: GpuShareOption = 1.0
     dry_run: DryRunOption = False
     reuse: ReuseOption = None
     json: JsonOption = None
@@ -117,6 +135,23 @@ class StudyChoices:
     def folder(self, kind: str) -> Path:
         """Return the study folder of a kind of study."""
         return self.out or Path("runs") / kind
+
+    def engine_words(self) -> str:
+        """Return the options that say what runs the study, as the end of a command line."""
+        words = [] if self.engine == "local" else ["--engine", self.engine]
+        words += ["--address", self.address] if self.address is not None else []
+        words += ["--gpu-share", f"{self.gpu_share:g}"] if self.gpu_share != 1.0 else []
+        return "".join(f" {word}" for word in map(shlex.quote, words))
+
+    def device_of_runs(self) -> str:
+        """Return the device on which the runs train; that of a cluster need not be here.
+
+        Raises:
+            ValueError: a GPU is asked for, and this machine, which is to use it, has none.
+        """
+        from esp_cli.machine import resolve_device
+
+        return "cuda" if (self.engine, self.device) == ("ray", "cuda") else resolve_device(self.device)
 
     def request(self, kind: str, *words: str) -> Request:
         """Return what a study is asked for.
@@ -128,7 +163,6 @@ class StudyChoices:
         Raises:
             ValueError: a name, number or setting that cannot be read.
         """
-        from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
         overrides = parse_assignments(self.settings or [])
@@ -141,7 +175,7 @@ class StudyChoices:
             seeds=self.seeds,
             preset=self.preset,
             overrides=overrides,
-            device=resolve_device(self.device),
+            device=self.device_of_runs(),
             episodes=self.episodes,
             command=shlex.join(["esp", *words, *self._options(), "--out", str(self.folder(kind))]),
         )

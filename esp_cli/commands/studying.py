@@ -5,7 +5,9 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -19,8 +21,9 @@ from esp_cli.machine import busy_with
 if TYPE_CHECKING:
     from esp_cli.evaluation.final import Mode
     from esp_cli.studies.catalogue import Request
+    from esp_cli.studies.engine import Engine
     from esp_cli.studies.forecast import Forecast
-    from esp_cli.studies.scheduler import Snapshot
+    from esp_cli.studies.scheduler import Scheduler, Snapshot
     from esp_cli.studies.study import Study, StudyFolder
 
 _MEBIBYTE = 2**20
@@ -44,27 +47,27 @@ def run_study(
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
     from esp_cli.studies.catalogue import plan
-    from esp_cli.studies.scheduler import available_cores
     from esp_cli.studies.study import StudyFolder
     from esp_cli.training.build import build_learner
 
     out, study = choices.folder(kind), plan(kind, request)
     others = [StudyFolder.open(path) for path in choices.reuse or ()]
-    jobs = choices.jobs or (1 if study.cells[0].config.device == "cuda" else available_cores())
-    if choices.dry_run:
-        _dry_run(StudyFolder(out, study), others, jobs, choices.json)
-        return
-    for cell in study.cells:  # refuses what does not go together while there is no folder yet
-        build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1]}))
-    folder = StudyFolder.create(out, study)
-    begun = time.monotonic()
-    with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
-        complete, failed = _run(folder, study, others, jobs, requests)
+    for cell in () if choices.dry_run else study.cells:  # refuses what does not go together before there is a folder
+        build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1], "device": "cpu"}))
+    with open_engine(choices, out) as engine:
+        jobs = choices.jobs or engine.places(study.cells[0].config.device)
+        if choices.dry_run:
+            _dry_run(StudyFolder(out, study), others, jobs, choices.json)
+            return
+        folder = StudyFolder.create(out, study)
+        begun = time.monotonic()
+        with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
+            complete, failed = run_cells(folder, study, others, jobs, engine, requests)
     if not complete:
-        console.note(f"stopped; go on with: {study.command}")
+        console.note(f"stopped; go on with: {study.command}{choices.engine_words()}")
         raise typer.Exit(130)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
-    _report(folder, choices.json, mode, thresholds)
+    report_study(folder, choices.json, mode, thresholds)
     if failed:
         raise ValueError(
             f"{len(failed)} of {len(study.cells)} runs failed ({', '.join(failed)}); see log.txt in their folders "
@@ -72,11 +75,50 @@ def run_study(
         )
 
 
-def _run(
-    folder: StudyFolder, study: Study, others: Sequence[StudyFolder], jobs: int, requests: Sequence[int]
-) -> tuple[bool, list[str]]:
-    """Run the cells of a study with live progress; return whether it came to its end, and which runs failed."""
+@contextmanager
+def open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
+    """Yield the engine that a study asks for.
+
+    Args:
+        choices: how the study is run.
+        out: its folder.
+
+    Raises:
+        ValueError: Ray is not installed, or its cluster cannot be used.
+    """
     from esp_cli.studies.engine_local import LocalEngine
+
+    if choices.engine == "local":
+        if choices.address is not None:
+            raise ValueError("--address is that of a Ray cluster; add --engine ray, or leave it out")
+        yield LocalEngine()
+        return
+    try:
+        from esp_cli.studies.engine_ray import RayEngine
+    except ImportError:
+        raise ValueError("Ray is not installed: pip install 'esp-marl[cluster]', or use --engine local") from None
+    with RayEngine(out, choices.address, choices.gpu_share) as engine:
+        yield engine
+
+
+def run_cells(
+    folder: StudyFolder,
+    study: Study,
+    others: Sequence[StudyFolder],
+    jobs: int,
+    engine: Engine,
+    requests: Sequence[int],
+) -> tuple[bool, list[str]]:
+    """Run the cells of a study; return whether it came to its end, and which runs failed.
+
+    Args:
+        folder: of the study, held by the caller's lock.
+        study: the cells that are wanted.
+        others: studies whose finished runs are taken over.
+        jobs: at once.
+        engine: starts them.
+        requests: not empty once the user asks to stop.
+    """
     from esp_cli.studies.scheduler import Scheduler
 
     names = {cell.name for cell in study.cells}
@@ -86,10 +128,15 @@ def _run(
         if twin is not None:
             folder.adopt(cell, twin)
             console.note(f"taking over {twin} as {cell.name}")
-    scheduler = Scheduler(folder, cells, min(jobs, len(cells)), LocalEngine())
+    return follow(Scheduler(folder, cells, min(jobs, len(cells)), engine), study.title, requests)
+
+
+def follow(scheduler: Scheduler, title: str, requests: Sequence[int]) -> tuple[bool, list[str]]:
+    """Run a scheduler with live progress; return whether it came to its end, and which runs failed."""
     finished = sum(run.status == "finished" for run in scheduler.runs)
     console.note(
-        f"{study.title}: {len(cells)} runs, {finished} of them finished, {scheduler.jobs} side by side -> {folder.path}"
+        f"{title}: {len(scheduler.runs)} runs, {finished} of them finished, {scheduler.jobs} side by side -> "
+        f"{scheduler.folder.path}"
     )
     with StudyProgress() as progress:
 
@@ -101,7 +148,7 @@ def _run(
     return complete, [run.cell.name for run in scheduler.runs if run.status == "failed"]
 
 
-def _report(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
+def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
     """Print the table of a study and say what to do next."""
     from esp_cli.commands.report import print_tables
     from esp_cli.reporting.collect import collect

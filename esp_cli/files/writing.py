@@ -7,9 +7,11 @@ program chose inside a folder is its own: whatever link stands there is replaced
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import secrets
 import stat
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from esp_cli.files.faults import reach
@@ -40,14 +42,31 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace a file as a whole.
+    """Replace a file as a whole; see `replacing`.
+
+    Args:
+        path: file to write; its folder exists.
+        content: every byte of the file.
+
+    Raises:
+        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
+    """
+    with replacing(path) as write:
+        write(content)
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]:
+    """Replace a file as a whole by content that comes in parts.
 
     The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
     the folder's own entry is flushed. A link at ``path`` is replaced, not followed.
 
     Args:
         path: file to write; its folder exists.
-        content: every byte of the file.
+
+    Yields:
+        A function that takes the next part. After an exception the file is as it was before.
 
     Raises:
         OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
@@ -58,7 +77,7 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
         # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
-            _write_all(descriptor, content)
+            yield functools.partial(_write_all, descriptor)
             reach("fsync")
             os.fsync(descriptor)
         finally:

@@ -24,7 +24,17 @@ class Job(Protocol):
 
 
 class Engine(Protocol):
-    """Starts jobs. The scheduler reads their progress from the run folders, which every job must be able to write."""
+    """Starts jobs. The scheduler reads their progress from the run folders.
+
+    A job that runs on another machine therefore brings back what it writes; the folder here is the truth.
+    """
+
+    def places(self, device: str) -> int:
+        """Return how many jobs run side by side by default.
+
+        Args:
+            device: on which they train, "cpu" or "cuda".
+        """
 
     def start(self, arguments: Sequence[str], log: Path) -> Job:
         """Start the application with these arguments.

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import esp_envs
 from esp_cli.files.opening import open_own
+from esp_cli.machine import available_cores
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
@@ -33,6 +34,10 @@ class LocalEngine:
 
     def __init__(self, program: Sequence[str] = APPLICATION, threads: int = 1) -> None:
         self.program, self.threads = tuple(program), threads
+
+    def places(self, device: str) -> int:
+        """Return how many jobs this machine runs side by side by default: one a core, or one on its GPU."""
+        return 1 if device == "cuda" else available_cores()
 
     def start(self, arguments: Sequence[str], log: Path) -> LocalJob:
         """Start the application with these arguments; what it prints is appended to the log."""

@@ -6,7 +6,6 @@ the next scheduler goes on with what is there.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -252,8 +251,3 @@ def likeness(a: Cell, b: Cell) -> int:
         first.prior.copies == second.prior.copies and first.prior.transforms == second.prior.transforms,
     )
     return sum(2 ** (len(same) - k) for k, equal in enumerate(same) if equal)
-
-
-def available_cores() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

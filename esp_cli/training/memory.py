@@ -7,12 +7,16 @@ import os
 import torch
 
 from esp_cli.algorithms.learner import LearnerConfig
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
+from esp_envs.registry import make
 from esp_envs.spec import TaskSpec
 
 _FLOAT_BYTES = 4
 _COPIES_OF_WEIGHTS = 4
 """Weights, gradients, and the two moments of Adam."""
+_PROCESS_BYTES = 500 * 2**20
+"""Of a process with torch and its libraries, before it trains."""
 
 
 def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> None:
@@ -51,6 +55,17 @@ def least_bytes(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> d
     weights = config.network.least_parameters(spec.observation.width) * _FLOAT_BYTES * _COPIES_OF_WEIGHTS
     sizes = {name: count * row_bytes for name, count in rows.items()} | {"network.hidden": weights}
     return {name: size * len(config.seeds) for name, size in sizes.items()}
+
+
+def process_bytes(config: RunConfig) -> int:
+    """Return the memory that a process which trains a run is given on a cluster: twice what it has to hold, and torch.
+
+    Raises:
+        ValueError: parts of the configuration do not go together.
+    """
+    settings = ALGORITHMS[config.algorithm].config_class(**config.algorithm_settings)
+    spec = make(config.task, 1, config.seeds[:1], config.task_settings).spec
+    return _PROCESS_BYTES + 2 * sum(least_bytes(config, settings, spec).values())
 
 
 def machine_bytes(device: str) -> int:

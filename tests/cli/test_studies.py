@@ -14,7 +14,7 @@ import pytest
 
 from esp_cli import console
 from esp_cli.commands import studying
-from esp_cli.commands.study_options import parse_names, parse_study_steps
+from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.scheduler import Scheduler, Snapshot
@@ -135,6 +135,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),
         (["reproduce", "table1", "--jobs", "0"], "--jobs"),
         (["ablate", "modules", "--reuse", "none"], "none is no study"),
+        (["ablate", "modules", "--address", "auto"], "--address is that of a Ray cluster; add --engine ray"),
         (["report"], "there is nothing to report"),
     ],
 )
@@ -142,6 +143,21 @@ def test_what_is_wrong_is_told_before_there_is_a_folder(tmp_path: Path, argument
     out = [] if arguments == ["report"] else ["--out", tmp_path / "s"]
     assert sentence in refused(*arguments, *out)
     assert not (tmp_path / "s").exists()
+
+
+def test_without_ray_a_cluster_is_refused_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.delitem(sys.modules, "esp_cli.studies.engine_ray", raising=False)
+    told = refused(*TINY, "--steps", 200, *TINY_OPTIONS, "--out", tmp_path / "s", "--engine", "ray")
+    assert told == "Ray is not installed: pip install 'esp-marl[cluster]', or use --engine local"
+    assert not (tmp_path / "s").exists()
+
+
+def test_the_command_that_goes_on_names_the_engine_and_a_gpu_may_be_elsewhere() -> None:
+    assert StudyChoices().engine_words() == ""
+    chosen = StudyChoices(engine="ray", address="10.0.0.1:6379", gpu_share=0.5, device="cuda")
+    assert chosen.engine_words() == " --engine ray --address 10.0.0.1:6379 --gpu-share 0.5"
+    assert chosen.device_of_runs() == "cuda"
 
 
 def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, finished: Path) -> None:

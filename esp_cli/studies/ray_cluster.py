@@ -1,0 +1,96 @@
+"""The connection to a Ray cluster: refused where nobody answers, or where a node has other versions."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from esp_cli.machine import available_cores
+from esp_cli.studies.versions import refuse_difference, versions
+
+NAMESPACE = "esp"
+CONNECT_S = 10.0
+"""Seconds in which a cluster has to answer."""
+_OBJECT_STORE_BYTES = 256 * 2**20
+
+
+class ClusterError(ValueError):
+    """The cluster cannot be used; the text is one sentence for the user."""
+
+
+def connect(address: str | None) -> None:
+    """Connect to a cluster, or start one of this machine alone.
+
+    Args:
+        address: of the cluster; by default that of RAY_ADDRESS.
+
+    Raises:
+        ClusterError: none answers, it is of another version of Ray or Python, or a node cannot run esp.
+        ValueError: a node has other versions of esp or its libraries than this machine.
+    """
+    ray._private.worker._worker_logs_enabled = False  # Ray prints the loss of a node to standard output
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    quiet: dict[str, Any] = {"namespace": NAMESPACE, "log_to_driver": False, "logging_level": "ERROR"}
+    if address is None and not os.environ.get("RAY_ADDRESS"):
+        quiet |= {"address": "local", "num_cpus": available_cores(), "include_dashboard": False}
+        quiet |= {"object_store_memory": _OBJECT_STORE_BYTES}
+    else:
+        quiet["address"] = address
+    try:
+        _knock(address or os.environ.get("RAY_ADDRESS", ""))
+        ray.init(**quiet)
+    except (OSError, RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ClusterError(
+            f"cannot use the Ray cluster at {address or 'RAY_ADDRESS'} ({reason}); check --address, and that the "
+            "nodes have the same versions of Ray and Python"
+        ) from None
+    try:
+        _refuse_other_versions()
+    except BaseException:
+        ray.shutdown()
+        raise
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nobody answers, for which Ray would wait for minutes.
+
+    Raises:
+        OSError: nobody answers.
+    """
+    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+
+
+def _refuse_other_versions() -> None:
+    """Refuse a cluster of which a node that is there now has other versions, or no esp.
+
+    Raises:
+        ValueError: there is such a node.
+    """
+    nodes = [node for node in ray.nodes() if node["Alive"]]
+    ask = ray.remote(_node_versions)
+    answers = [
+        ask.options(num_cpus=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], False)).remote()
+        for node in nodes
+    ]
+    for node, answer in zip(nodes, answers, strict=True):
+        name = node["NodeManagerHostname"]
+        try:
+            theirs = ray.get(answer, timeout=60)
+        except RayError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ClusterError(f"the node {name} cannot run esp ({reason}); install esp-marl[cluster] there") from None
+        refuse_difference(name, theirs)
+
+
+def _node_versions() -> Mapping[str, str]:
+    return dict(versions())

@@ -1,0 +1,58 @@
+"""What decides whether two machines compute the same: versions of the program and of the libraries under it."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import esp_cli
+import esp_envs
+
+_LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Return versions by name; that of esp itself holds a digest of its source files."""
+    found = {"esp": f"{esp_cli.__version__} ({_source_digest()})", "Python": platform.python_version()}
+    return found | {name: _version(name) for name in _LIBRARIES}
+
+
+def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, str] | None = None) -> None:
+    """Refuse a node whose versions are not those of this machine.
+
+    Args:
+        node: its name.
+        theirs: versions of the node.
+        ours: versions of this machine; for tests.
+
+    Raises:
+        ValueError: they differ; the message names all that do.
+    """
+    ours = versions() if ours is None else ours
+    unlike = [name for name in ours if theirs.get(name) != ours[name]]
+    if unlike:
+        there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)
+        here = ", ".join(ours[name] for name in unlike)
+        raise ValueError(f"the node {node} has {there}, but this machine has {here}; install the same versions on both")
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def _source_digest() -> str:
+    """Return a digest of all source files, so that two checkouts of one version are told apart."""
+    digest = hashlib.sha256()
+    for package in (esp_cli, esp_envs):
+        root = Path(package.__path__[0])
+        for file in sorted(root.rglob("*.py")):
+            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()[:10]
