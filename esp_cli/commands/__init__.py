@@ -17,6 +17,7 @@ COMMANDS: dict[str, str] = {
     "policies": "esp_cli.commands.policies:policies",
     "report": "esp_cli.commands.report:report",
     "compare-homomorphic": "esp_cli.commands.compare_homomorphic:compare_homomorphic",
+    "tune": "esp_cli.commands.tune:tune",
     "check": "esp_cli.commands.check:check",
     "tasks": "esp_cli.commands.tasks:tasks",
     "settings": "esp_cli.commands.settings:settings",

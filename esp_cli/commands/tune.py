@@ -1,0 +1,183 @@
+"""`esp tune`: search the settings of a learner, with the prior and without it, on equal budgets."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.stopping import stop_requests
+from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
+from esp_cli.commands.studying import follow, open_engine, report_study, run_cells
+
+if TYPE_CHECKING:
+    from esp_cli.studies.catalogue import Request
+    from esp_cli.studies.engine import Engine
+    from esp_cli.studies.tuner import Outcome, Trials
+    from esp_cli.studies.tuning import Tuning
+
+EPILOG = """Examples:\n
+    esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
+    esp tune --task predator-prey --algo qmix --budget 30 --prior esp,none --steps 500k --out runs/tune-qmix\n
+    esp tune --task mine:Task --algo mappo --space space.toml --for steps --reach -120\n
+    esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
+
+FIRST_TRIAL_SEED = 1000
+"""Trials have seeds from here on; what they choose is judged on others."""
+
+
+@study_command
+def tune(
+    choices: StudyChoices,
+    budget: Annotated[int, typer.Option("--budget", min=1, help="Trials, for each prior.")] = 30,
+    space: Annotated[
+        Path | None,
+        typer.Option(
+            "--space", help="What to try, as JSON or TOML; by default a space for each algorithm.", metavar="FILE"
+        ),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option("--prior", help="Kinds of prior, as esp,none; one search each, equal budgets.", metavar="PRIOR"),
+    ] = None,
+    goal: Annotated[
+        Literal["return", "steps", "seconds"],
+        typer.Option("--for", help="The highest return at the end, or fewest steps or seconds to the return --reach."),
+    ] = "return",
+    reach: Annotated[float | None, typer.Option("--reach", help="The return to come to.", metavar="RETURN")] = None,
+    trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
+) -> None:
+    """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
+    priors = parse_names(prior) or ("esp",)
+    words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
+    words += ["--for", goal, *(("--reach", f"{reach:g}") if reach is not None else ())]
+    words += ["--trial-seeds", str(trial_seeds)]
+    request = choices.request("tune", "tune", *words)
+    tuning = _tuning(request, priors, budget, space, goal, reach, trial_seeds)
+    out = choices.folder("tune")
+    with open_engine(choices, out) as engine:
+        jobs = choices.jobs or engine.places(tuning.device)
+        if choices.dry_run:
+            _dry_run(tuning, request.seeds, request.episodes, jobs)
+            return
+        _tune(tuning, request, choices, engine, jobs)
+
+
+def _tuning(
+    request: Request,
+    priors: Sequence[str],
+    budget: int,
+    space: Path | None,
+    goal: Literal["return", "steps", "seconds"],
+    reach: float | None,
+    trial_seeds: int,
+) -> Tuning:
+    """Return what is asked for.
+
+    Raises:
+        ValueError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
+    """
+    from esp_cli.studies.tuning import NAMES, Tuning
+    from esp_cli.studies.tuning_space import default_space, read_space
+
+    for flag, names in (("--task", request.tasks), ("--algo", request.algorithms), ("--steps", request.steps)):
+        if names is not None and len(names) != 1:
+            raise ValueError(f"esp tune takes one {flag}, not {len(names)}; run it once for each")
+    for name in priors:
+        if name not in NAMES or priors.count(name) > 1:
+            raise ValueError(f"--prior names each kind once; they are {', '.join(NAMES)}")
+    task, algorithm = (request.tasks or ("navigation",))[0], (request.algorithms or ("mappo",))[0]
+    tuning = Tuning(
+        task=task,
+        algorithm=algorithm,
+        preset=request.preset,
+        priors=tuple(priors),
+        budget=budget,
+        goal=goal,
+        reach=reach,
+        steps=request.steps[0][1] if request.steps else 500_000,
+        trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
+        overrides=dict(request.overrides),
+        space=dict(read_space(space) if space else default_space(algorithm)),
+        device=request.device,
+        command=request.command,
+    )
+    tuning.check()
+    return tuning
+
+
+def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engine, jobs: int) -> None:
+    """Search, then judge the best settings; report both.
+
+    Raises:
+        ValueError: the folder holds something else or is in use, Optuna is not installed, or runs failed.
+    """
+    try:
+        from esp_cli.studies.tuner import Trials, Tuner, write_presets
+    except ImportError:
+        raise ValueError("Optuna is not installed: pip install 'esp-marl[tune]'") from None
+    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.tuning import TuningFolder, fresh_study
+
+    fresh_study(tuning, {}, request.seeds, request.episodes)  # refuses seeds of the trials while there is no folder
+    others = [StudyFolder.open(path) for path in choices.reuse or ()]
+    folder, fresh = TuningFolder.begin(choices.folder("tune"), tuning), None
+    with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
+        trials = Trials(folder)
+        complete, failed = follow(Tuner(trials, jobs, engine), folder.study.title, requests)
+        outcomes = [trials.outcome(prior) for prior in tuning.priors]
+        best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
+        if complete and not failed and best:
+            study = fresh_study(tuning, best, request.seeds, request.episodes)
+            fresh = StudyFolder.create(folder.path / "fresh", study)
+            complete, failed = run_cells(fresh, study, others, jobs, engine, requests)
+        _report(trials, outcomes, write_presets(folder, outcomes))
+    if fresh is not None and complete:
+        report_study(fresh, choices.json, None, ())
+    if not complete:
+        console.note(f"stopped; go on with: {tuning.command}{choices.engine_words()}")
+        raise typer.Exit(130)
+    if failed:
+        raise ValueError(f"{len(failed)} runs failed ({', '.join(failed)}); the same command tries them again")
+
+
+def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path]) -> None:
+    """Print what the search found, write its page, and say what to do next."""
+    from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
+
+    headings, rows = budget_table(outcomes)
+    console.table(headings, rows, title=trials.folder.study.title, caption=budget_sentence(trials.tuning))
+    if any(found.settings for found in outcomes):
+        console.table(*settings_table(outcomes), title="Best settings")
+    else:
+        console.note("no trial has a score yet; with --reach, a lower return is easier to come to")
+    console.note(f"report -> {write_page(trials, outcomes, trials.folder.path / 'report')}")
+    for path in presets:
+        console.note(f"next: {shlex.join(['esp', 'train', '--config', str(path)])}")
+
+
+def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int) -> None:
+    """Print what the search costs at most, and what it costs where successive halving ends two of three trials."""
+    from esp_cli.studies.cost import probe
+    from esp_cli.studies.tuning import REDUCTION, RUNGS
+    from esp_cli.studies.tuning_space import space_of
+
+    rows, most, likely = [], 0.0, 0.0
+    share = sum(REDUCTION ** (k - RUNGS) * (1 - 1 / REDUCTION) / REDUCTION**k for k in range(RUNGS)) + REDUCTION**-RUNGS
+    for prior in tuning.priors:
+        trial = probe(tuning.config(prior, {}), episodes)
+        final = probe(tuning.config(prior, {}, seeds), episodes)
+        judged = 2 * (final.training_s + final.evaluation_s)
+        whole = tuning.budget * trial.training_s
+        most, likely = most + whole + judged, likely + share * whole + judged
+        names = ", ".join(space_of(tuning.space, prior))
+        rows.append((prior, str(tuning.budget), console.format_duration(trial.training_s), names))
+    console.table(("prior", "trials>", "each at most>", "settings"), rows, title=tuning.command)
+    console.say(
+        f"on one core at most {console.format_duration(most)}, and about {console.format_duration(likely)} with "
+        f"pruning, the evaluation of the best on fresh seeds included; {jobs} runs side by side"
+    )

@@ -1,0 +1,134 @@
+"""The report of a tuning: budgets, best settings, and Optuna's figures, as tables and as a Markdown page."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import optuna.visualization.matplotlib as figures
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+
+from esp_cli.files.writing import replace_file
+from esp_cli.formatting import format_count, format_duration
+from esp_cli.studies.tuner import Outcome, Trials
+from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
+
+Rows = list[tuple[str, ...]]
+_MEANING = {
+    "return": "mean of the last three greedy evaluations",
+    "steps": "environment steps to the return, as a negative number",
+    "seconds": "seconds of training to the return, as a negative number",
+}
+
+
+def budget_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
+    """Return headings and rows: what each prior was given, and what its best trial scored on the trials' seeds."""
+    headings = ("prior", "trials>", "complete>", "pruned>", "steps>", "time>", "default>", "best>", "trial>")
+    rows: Rows = [
+        (
+            NAMES[found.prior],
+            str(found.trials),
+            str(found.completed),
+            str(found.pruned),
+            format_count(found.env_steps),
+            format_duration(found.seconds),
+            _number(found.default_score),
+            _number(found.best_score),
+            "-" if found.best is None else str(found.best),
+        )
+        for found in outcomes
+    ]
+    return headings, rows
+
+
+def settings_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
+    """Return headings and rows: the best settings of each prior."""
+    names = list(dict.fromkeys(name for found in outcomes for name in found.settings))
+    headings = ("setting", *(f"{NAMES[found.prior]}>" for found in outcomes))
+    rows: Rows = [(name, *(_setting(found.settings.get(name)) for found in outcomes)) for name in names]
+    return headings, rows
+
+
+def budget_sentence(tuning: Tuning) -> str:
+    """Say what budget each prior has, and what a score is."""
+    each = " each" if len(tuning.priors) > 1 else ""
+    reach = "" if tuning.reach is None else f" {tuning.reach:g}"
+    return (
+        f"Budget: {tuning.budget} trials{each} of {len(tuning.trial_seeds)} seeds and at most "
+        f"{format_count(tuning.steps)} steps per seed; successive halving looks {RUNGS} times before the end, and "
+        f"one of {REDUCTION} trials goes on. Trial 0 has the default settings. Score: {_MEANING[tuning.goal]}{reach}."
+    )
+
+
+def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
+    """Write `tuning.md` and Optuna's figures.
+
+    Args:
+        trials: the record.
+        outcomes: of each prior.
+        out: folder, made if missing.
+
+    Returns:
+        The page.
+    """
+    tuning = trials.tuning
+    out.mkdir(parents=True, exist_ok=True)
+    lines = [f"# {trials.folder.study.title}", "", budget_sentence(tuning), "", f"`{tuning.command}`", ""]
+    lines += ["## Budgets and scores", "", *_markdown(*budget_table(outcomes))]
+    lines += ["", "## Best settings", "", *_markdown(*settings_table(outcomes))]
+    lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` judges them on others."]
+    for prior, study in trials.studies.items():
+        for name, title in _draw(study, out, prior):
+            lines += ["", f"## {NAMES[prior]}: {title}", "", f"![{title}]({name})"]
+    page = out / "tuning.md"
+    replace_file(page, ("\n".join(lines) + "\n").encode())
+    return page
+
+
+def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
+    """Draw the figures that the trials allow; yield file names and titles."""
+    done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
+    drawings = {"intermediate values": figures.plot_intermediate_values}
+    if done:
+        drawings["optimization history"] = figures.plot_optimization_history
+        drawings["slices"] = figures.plot_slice
+    if len(done) > 3:
+        drawings["parallel coordinates"] = figures.plot_parallel_coordinate
+        drawings["importances"] = _importances
+    for title, draw in drawings.items():
+        name = f"{prior}-{title.replace(' ', '-')}.png"
+        with warnings.catch_warnings(), plt.rc_context():
+            warnings.simplefilter("ignore")
+            draw(study)
+            figure = plt.gcf()
+            figure.savefig(out / name, dpi=110, bbox_inches="tight")
+            plt.close(figure)
+        yield name, title
+
+
+def _importances(study: Any) -> None:
+    found = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+    _, axes = plt.subplots()
+    axes.barh(list(found), list(found.values()))
+    axes.invert_yaxis()
+    axes.set_xlabel("importance (PED-ANOVA)")
+
+
+def _markdown(headings: Sequence[str], rows: Rows) -> list[str]:
+    names = [heading.removesuffix(">") for heading in headings]
+    rule = ["---:" if heading.endswith(">") else "---" for heading in headings]
+    return [f"| {' | '.join(cells)} |" for cells in (names, rule, *rows)]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _setting(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}" if isinstance(value, float) else json.dumps(value)

@@ -1,0 +1,247 @@
+"""Tuning: what is asked for, what a trial runs, how its curve is scored, and the study that judges the best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
+
+from esp_cli.files.documents import DocumentFormat
+from esp_cli.formatting import file_name, format_count
+from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
+from esp_cli.studies.tuning_space import Dimension, space_of
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.metrics import MetricsError, column, read_metrics
+
+Goal = Literal["return", "steps", "seconds"]
+SMOOTHED = 3
+"""Evaluations, up to the newest, whose mean is the score of a curve."""
+RUNGS = 2
+"""Times that successive halving looks at a trial before its end."""
+REDUCTION = 3
+"""One of so many trials goes on at each rung, and trains so many times as long."""
+_TUNING, _TRIALS = "tuning.json", "trials"
+NAMES = {"none": "plain", "esp": "ESP", "augment": "augmentation", "consistency": "loss"}
+
+
+class Tuning(BaseModel):
+    """What is asked for.
+
+    Attributes:
+        task: its name.
+        algorithm: its name.
+        preset: of every run.
+        priors: kinds of prior; each has a search of its own with the same budget.
+        budget: trials for each prior.
+        goal: "return" at the end, or the fewest steps or seconds to the return `reach`.
+        reach: that return.
+        steps: environment steps per seed of a trial that is not pruned.
+        trial_seeds: of every trial.
+        overrides: settings of all runs, as `--set` takes them.
+        space: what is tried.
+        device: of every run.
+        command: the command line behind it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str
+    algorithm: str
+    preset: str = "default"
+    priors: tuple[str, ...]
+    budget: int = Field(ge=1)
+    goal: Goal = "return"
+    reach: float | None = None
+    steps: int = Field(ge=1)
+    trial_seeds: tuple[int, ...]
+    overrides: dict[str, JsonValue] = {}
+    space: dict[str, Dimension]
+    device: str = "cpu"
+    command: str = ""
+
+    def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int] | None = None) -> RunConfig:
+        """Resolve the run of a prior with these settings over those of all runs.
+
+        Raises:
+            ValueError: a setting is unknown or out of range.
+        """
+        chosen = {**self.overrides, "prior.kind": prior, **settings}
+        run_seeds = self.trial_seeds if seeds is None else seeds
+        config = resolve_config(self.task, self.algorithm, self.preset, self.steps, run_seeds, self.device, chosen)
+        config = config.model_copy(update={"prior": config.prior.effective()})
+        return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
+
+    def check(self) -> None:
+        """Refuse what cannot be run.
+
+        Raises:
+            ValueError: a setting of the space is unknown or refuses a value, or the goal lacks its return.
+        """
+        if (self.goal == "return") != (self.reach is None):
+            what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
+            raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
+        for prior in self.priors:
+            for name, dimension in space_of(self.space, prior).items():
+                if name in self.overrides:
+                    raise ValueError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
+                for value in dimension.corners():
+                    self.config(prior, {name: value})
+
+
+TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyError)
+
+
+class TuningFolder(StudyFolder):
+    """The folder of a tuning; a cell is a trial.
+
+    Layout::
+
+        tuning.json         what is asked for
+        journal.jsonl       Optuna's record of all trials
+        trials/PRIOR-NUMBER/    a run folder per trial
+        preset-PRIOR.json   the best settings, for esp train --config
+        fresh/              the study that judges them on seeds that no trial had
+        report/             table and figures
+        study.lock          held by the process that works on it
+    """
+
+    def __init__(self, path: Path, tuning: Tuning) -> None:
+        title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
+        super().__init__(
+            path, Study(kind="tuning", title=title, command=tuning.command, episodes=1, rows="variants", cells=())
+        )
+        self.tuning = tuning
+
+    @classmethod
+    def begin(cls, path: Path, tuning: Tuning) -> TuningFolder:
+        """Make the folder, or go on with the one that is there, whose budget may grow.
+
+        Raises:
+            StudyError: the folder holds another tuning, or something foreign.
+        """
+        file = path / _TUNING
+        if file.is_file():
+            there = TUNING_FORMAT.parse(file, Tuning)
+            same = {"budget": there.budget, "command": there.command}
+            if tuning.model_copy(update=same) != there or tuning.budget < there.budget:
+                raise StudyError(
+                    f"{path} holds another tuning; go on with it by '{there.command}', or choose another --out"
+                )
+        elif path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise StudyError(f"{path} is not empty and no tuning; choose another --out")
+        path.mkdir(parents=True, exist_ok=True)
+        TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))
+        return cls(path, tuning)
+
+    @classmethod
+    def is_tuning(cls, path: Path) -> bool:
+        """Return whether a folder holds a tuning."""
+        return (path / _TUNING).is_file()
+
+    @classmethod
+    def reopen(cls, path: Path) -> TuningFolder:
+        """Open the folder of an existing tuning.
+
+        Raises:
+            StudyError: it is missing, damaged or foreign.
+        """
+        return cls(path, TUNING_FORMAT.parse(path / _TUNING, Tuning))
+
+    def cell(self, prior: str, number: int, settings: Mapping[str, object]) -> Cell:
+        """Return the run of a trial."""
+        name = f"{prior}-{number:03d}"
+        return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
+
+    def run_path(self, cell: Cell) -> Path:
+        """Return the run folder of a trial."""
+        return self.path / _TRIALS / cell.name
+
+    def is_finished(self, cell: Cell) -> bool:
+        """Return whether a trial is trained to its end; it has no evaluation beside its curve."""
+        return self.is_trained(cell)
+
+    def curve(self, cell: Cell) -> list[Point]:
+        """Return the evaluations of a trial; none before it has begun."""
+        try:
+            rows = [row for row in read_metrics(self.run_path(cell) / "metrics.jsonl") if "eval/return_greedy" in row]
+            steps, returns = column(rows, "eval/return_greedy")
+        except MetricsError:
+            return []
+        means = returns.mean(1).tolist()
+        seconds = [float(row.get("time/elapsed_s") or 0.0) for row in rows]
+        return [
+            Point(
+                int(step), seconds[k], mean, math.fsum(means[max(0, k + 1 - SMOOTHED) : k + 1]) / min(k + 1, SMOOTHED)
+            )
+            for k, (step, mean) in enumerate(zip(steps, means, strict=True))
+        ]
+
+
+@dataclass(frozen=True)
+class Point:
+    """An evaluation of a trial.
+
+    Attributes:
+        step: environment steps per seed.
+        seconds: of training.
+        mean: greedy return, mean over the seeds; NaN where a seed stopped.
+        value: mean of the newest evaluations up to this one.
+    """
+
+    step: int
+    seconds: float
+    mean: float
+    value: float
+
+
+def score(curve: Sequence[Point], tuning: Tuning) -> float | None:
+    """Return the score of a curve, the larger the better; None where it has none: it did not reach the return.
+
+    Steps and seconds count as negative numbers.
+    """
+    if tuning.goal == "return":
+        return curve[-1].value if curve and math.isfinite(curve[-1].value) else None
+    first = next((p for p in curve if tuning.reach is not None and p.mean >= tuning.reach), None)
+    if first is None:
+        return None
+    return -float(first.step) if tuning.goal == "steps" else -first.seconds
+
+
+def fresh_study(
+    tuning: Tuning, best: Mapping[str, tuple[int, Mapping[str, object]]], seeds: Sequence[int], episodes: int
+) -> Study:
+    """Plan the study that judges the best settings of each prior, beside the default ones, on seeds of its own.
+
+    Args:
+        tuning: what was asked for.
+        best: by prior, the number of the best trial and its settings.
+        seeds: of every run.
+        episodes: per seed, of the final evaluations.
+
+    Raises:
+        ValueError: a trial had one of the seeds.
+    """
+    shared = set(seeds) & set(tuning.trial_seeds)
+    if shared:
+        raise ValueError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
+    panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
+    cells: list[Cell] = []
+    for prior, (number, settings) in best.items():
+        variants = {f"{NAMES[prior]}, tuned (trial {number})": settings, f"{NAMES[prior]}, default": {}}
+        for variant, own in variants.items():
+            config, reference = tuning.config(prior, own, seeds), cells[0].name if cells else None
+            if all(cell.config != config for cell in cells):  # unless the default settings were the best
+                name = file_name(variant)
+                cells.append(Cell(name=name, panel=panel, variant=variant, config=config, reference=reference))
+    return Study(
+        kind="tuned",
+        title=f"Tuned settings of {tuning.algorithm.upper()} on {tuning.task}, judged on fresh seeds",
+        command=tuning.command,
+        episodes=episodes,
+        rows="variants",
+        cells=tuple(cells),
+    )

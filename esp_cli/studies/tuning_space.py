@@ -1,0 +1,148 @@
+"""What tuning searches: a range or a list of values for each setting, by default one space for each algorithm."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, JsonValue, model_validator
+
+from esp_cli.files.documents import parse_value
+from esp_cli.files.tables import flat, read_table
+from esp_cli.training.config import validated
+
+
+class Dimension(BaseModel):
+    """What is tried of one setting: a range from `low` to `high`, or `choices`.
+
+    Attributes:
+        low: smallest value; whole numbers where both ends are whole.
+        high: largest value.
+        log: whether to draw orders of magnitude evenly.
+        choices: the values, where it is no range.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    low: int | float | None = None
+    high: int | float | None = None
+    log: bool = False
+    choices: tuple[JsonValue, ...] | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Dimension:
+        ends = (self.low, self.high)
+        if self.choices is not None:
+            if not self.choices or ends != (None, None) or self.log:
+                raise ValueError("write a list of values, or low and high")
+        elif self.low is None or self.high is None or not self.low < self.high:
+            raise ValueError("write low and high, the smaller one first")
+        elif self.log and self.low <= 0:
+            raise ValueError("log needs a low above 0")
+        return self
+
+    def corners(self) -> tuple[JsonValue, ...]:
+        """Return the values that show whether the setting takes all of them: both ends, or all choices."""
+        return self.choices if self.choices is not None else (self.low, self.high)
+
+    def suggest(self, trial: Any, name: str) -> JsonValue:
+        """Return the value that a trial of Optuna tries."""
+        if self.choices is not None:
+            return parse_value(trial.suggest_categorical(name, [json.dumps(value) for value in self.choices]))
+        if isinstance(self.low, int) and isinstance(self.high, int):
+            return int(trial.suggest_int(name, self.low, self.high, log=self.log))
+        return float(trial.suggest_float(name, self.low, self.high, log=self.log))
+
+    def encoded(self, value: JsonValue) -> object:
+        """Return a value as a trial of Optuna holds it; None where it is outside of the space."""
+        if self.choices is not None:
+            return json.dumps(value) if value in self.choices else None
+        inside = isinstance(value, int | float) and self.low is not None and self.high is not None
+        return value if inside and self.low <= value <= self.high else None  # type: ignore[operator] # inside
+
+
+Space = Mapping[str, Dimension]
+"""Dotted names of settings -> what is tried of each."""
+
+
+def _range(low: float, high: float, log: bool = True) -> Dimension:
+    return Dimension(low=low, high=high, log=log)
+
+
+def _choices(*values: JsonValue) -> Dimension:
+    return Dimension(choices=values)
+
+
+_HIDDEN = {"network.hidden": _choices([64, 64], [128, 128])}
+_PRIOR = {"prior.consistency_coef": _range(0.01, 1.0)}
+_OFF_POLICY = {
+    "learning_rate": _range(5e-4, 1e-2),
+    "td_lambda": _range(0.0, 0.95, log=False),
+    "updates_per_episode": _choices(1, 2),
+    "epsilon_steps": _range(10_000, 200_000),
+}
+SPACES: Mapping[str, Space] = {
+    "mappo": {
+        "mappo.learning_rate": _range(1e-4, 3e-3),
+        "mappo.entropy_coef": _range(1e-3, 0.1),
+        "mappo.gae_lambda": _range(0.9, 0.99, log=False),
+        "mappo.clip_epsilon": _range(0.1, 0.3, log=False),
+        "mappo.num_epochs": _range(3, 15, log=False),
+        "mappo.num_minibatches": _choices(1, 2, 4, 8),
+        **_HIDDEN,
+    },
+    "maddpg": {
+        **{f"maddpg.{name}": dimension for name, dimension in _OFF_POLICY.items()},
+        "maddpg.actor_learning_rate": _range(5e-4, 1e-2),
+        "maddpg.tau": _range(1e-3, 5e-2),
+        "maddpg.output_penalty": _range(1e-4, 0.1),
+        **_HIDDEN,
+    },
+    "qmix": {
+        **{f"qmix.{name}": dimension for name, dimension in _OFF_POLICY.items()},
+        "qmix.target_every": _range(25, 400),
+        "qmix.replay_episodes": _choices(500, 1000, 5000),
+        **_HIDDEN,
+    },
+}
+"""Unless the user names another one. The prior adds the weight of its loss."""
+
+
+def default_space(algorithm: str) -> Space:
+    """Return the space of an algorithm; settings of the prior concern runs with the prior alone.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if algorithm not in SPACES:
+        raise ValueError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
+    return {**SPACES[algorithm], **_PRIOR}
+
+
+def read_space(path: Path) -> Space:
+    """Read a space from a file, JSON or TOML: {"mappo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": true}}.
+
+    A list stands for choices: {"network.hidden": [[64, 64], [128, 128]]}.
+
+    Raises:
+        ValueError: it is damaged, or says nothing.
+    """
+    fields: dict[str, dict[str, object]] = {}
+    for dotted, value in flat(read_table(path)):
+        name, _, last = dotted.rpartition(".")
+        if last in Dimension.model_fields and name:
+            fields.setdefault(name, {})[last] = value
+        elif isinstance(value, list):
+            fields[dotted] = {"choices": tuple(value)}
+        else:
+            raise ValueError(f"{path} gives '{dotted}' one value; write a list, or low and high, or use --set for it")
+    if not fields:
+        raise ValueError(f"{path} names no setting; write what to try, as 'mappo.num_epochs': [5, 10]")
+    return {name: validated(Dimension, values, name) for name, values in fields.items()}
+
+
+def space_of(space: Space, prior: str) -> Space:
+    """Return what concerns runs with this kind of prior: without it, nothing of the prior."""
+    return {name: d for name, d in space.items() if prior != "none" or not name.startswith("prior.")}
