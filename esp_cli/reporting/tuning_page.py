@@ -91,7 +91,7 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
 
 def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
     """Draw the figures that the trials allow; yield file names and titles."""
-    done = [trial for trial in study.get_trials(deepcopy=False) if trial.value is not None]
+    done = [trial for trial in study.get_trials(deepcopy=False) if trial.state.name == "COMPLETE"]
     drawings = {"intermediate values": figures.plot_intermediate_values}
     if done:
         drawings["optimization history"] = figures.plot_optimization_history

@@ -208,7 +208,7 @@ def score(curve: Sequence[Point], tuning: Tuning) -> float | None:
     first = next((p for p in curve if tuning.reach is not None and p.mean >= tuning.reach), None)
     if first is None:
         return None
-    return -float(first.step) if tuning.goal == "steps" else -first.seconds
+    return float(-first.step) if tuning.goal == "steps" else -first.seconds
 
 
 def fresh_study(

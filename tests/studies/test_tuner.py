@@ -1,0 +1,205 @@
+"""The search of settings with Optuna, over an engine without processes whose curves follow from the learning rate."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("optuna", reason="needs Optuna: pip install 'esp-marl[tune]'")
+
+from optuna.trial import TrialState
+
+from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
+from esp_cli.studies.tuner import Trials, Tuner, write_presets
+from esp_cli.studies.tuning import Tuning, TuningFolder
+from esp_cli.training.config import resolve_config
+from esp_cli.training.config_file import read_config_file
+from tests.studies.test_tuning import tuning
+
+
+class CurveEngine:
+    """Trains by formula: the return is the better the nearer the learning rate is to 1e-2, and rises with the steps."""
+
+    def __init__(self, fails: str = "", breaks: str = "") -> None:
+        self.fails, self.breaks, self.started, self.running, self.most = fails, breaks, [], 0, 0
+
+    def places(self, device):
+        return 2
+
+    def start(self, arguments, log):
+        job = CurveJob(self, Path(arguments[-1]))
+        self.started.append(job.path.name)
+        self.running += 1
+        self.most = max(self.most, self.running)
+        return job
+
+
+class CurveJob:
+    def __init__(self, engine: CurveEngine, path: Path) -> None:
+        self.engine, self.path, self.code, self.stopped = engine, path, None, False
+        self.config = json.loads((path / "config.json").read_text())
+        self.distance = abs(math.log10(self.config["algorithm_settings"]["learning_rate"]) + 2)
+        rows = (path / "metrics.jsonl").read_text().splitlines()
+        self.step = json.loads(rows[-1])["step"] if rows else -100
+
+    def poll(self):
+        if self.code is not None:
+            return self.code
+        if self.stopped:
+            return self._end(130)
+        if self.path.name == self.engine.fails:
+            return self._end(2)
+        self.step += 100
+        value = None if self.path.name == self.engine.breaks else -100 * self.distance + self.step / 100
+        row = {"step": self.step, "eval/return_greedy": [value] * 2, "time/elapsed_s": self.step / 10}
+        with (self.path / "metrics.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+        (self.path / "checkpoints" / f"step-{self.step:012d}.safetensors").touch()
+        if self.step >= self.config["steps"]:
+            (self.path / "policy.safetensors").write_bytes(b"weights")
+            return self._end(0)
+        return None
+
+    def _end(self, code: int) -> int:
+        self.code = code
+        self.engine.running -= 1
+        return code
+
+    def ask_to_stop(self):
+        self.stopped = True
+
+    def kill(self):
+        if self.code is None:
+            self._end(-9)
+
+    def last_words(self):
+        return "the disk is on fire"
+
+
+def search(path: Path, plan: Tuning, engine: CurveEngine | None = None, listener=lambda snapshot: True) -> Tuner:
+    tuner = Tuner(Trials(TuningFolder.begin(path, plan)), 2, engine or CurveEngine())
+    tuner.complete = tuner.run(listener, 0.0)
+    return tuner
+
+
+def states(trials: Trials, prior: str) -> list[TrialState]:
+    return [trial.state for trial in trials.studies[prior].get_trials(deepcopy=False)]
+
+
+def last_step(path: Path) -> int:
+    return json.loads((path / "metrics.jsonl").read_text().splitlines()[-1])["step"]
+
+
+def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early(tmp_path):
+    engine = CurveEngine()
+    tuner = search(tmp_path / "t", tuning(budget=12), engine)
+    assert tuner.complete
+    assert engine.most == 2
+    assert sorted(engine.started) == sorted(f"{prior}-{k:03d}" for prior in ("esp", "none") for k in range(12))
+    for prior in ("esp", "none"):
+        found = tuner.trials.outcome(prior)
+        assert (found.trials, found.completed + found.pruned) == (12, 12)
+        assert found.pruned > 0
+        assert set(states(tuner.trials, prior)) == {TrialState.COMPLETE, TrialState.PRUNED}
+        paths = [tmp_path / "t" / "trials" / f"{prior}-{k:03d}" for k in range(12)]
+        pruned = [state == TrialState.PRUNED for state in states(tuner.trials, prior)]
+        assert [last_step(path) < 900 for path in paths] == pruned
+        assert found.env_steps == 2 * sum(map(last_step, paths))
+        assert not any(list((path / "checkpoints").iterdir()) for path in paths)
+        # the first trial has the default settings; the best is the best of all that were trained to the end
+        first = json.loads((paths[0] / "config.json").read_text())
+        assert (
+            first["algorithm_settings"]["learning_rate"]
+            == tuning().config(prior, {}).algorithm_settings["learning_rate"]
+        )
+        assert found.default_score is not None
+        trials = tuner.trials.studies[prior].get_trials(deepcopy=False)
+        assert found.best_score == max(trial.value for trial in trials if trial.state == TrialState.COMPLETE)
+    assert "prior.consistency_coef" in tuner.trials.outcome("esp").settings
+    assert "prior.consistency_coef" not in tuner.trials.outcome("none").settings
+
+
+def test_a_search_that_is_killed_at_any_moment_loses_no_trial_and_changes_no_settings(tmp_path):
+    looks, settings = [0], {}
+
+    def kill(snapshot):
+        looks[0] += 1
+        if looks[0] % 7 == 0:
+            raise KeyboardInterrupt
+        return True
+
+    for _ in range(40):
+        try:
+            tuner = search(tmp_path / "t", tuning(), listener=kill)
+            break
+        except KeyboardInterrupt:
+            for file in (tmp_path / "t" / "trials").glob("*/config.json"):
+                assert settings.setdefault(file.parent.name, file.read_text()) == file.read_text()
+            with (tmp_path / "t" / "journal.jsonl").open("ab") as journal:
+                journal.write(b'{"op_code":5,"trial')  # a kill in the middle of a line
+    assert looks[0] > 14
+    assert len(settings) > 2
+    for prior in ("esp", "none"):
+        assert len(states(tuner.trials, prior)) == 4
+        assert all(state.is_finished() for state in states(tuner.trials, prior))
+    engine = CurveEngine()
+    search(tmp_path / "t", tuning(budget=5), engine)
+    assert engine.started == ["esp-004", "none-004"]
+
+
+def test_a_stopped_search_goes_on_with_the_trials_that_it_began(tmp_path):
+    first = search(tmp_path / "t", tuning(), listener=lambda snapshot: snapshot.runs[0].step < 200)
+    assert not first.complete
+    assert states(first.trials, "esp") == [TrialState.RUNNING]
+    again = CurveEngine()
+    assert search(tmp_path / "t", tuning(), again).complete
+    assert again.started[:2] == ["esp-000", "none-000"]
+
+
+def test_a_trial_ends_when_it_reaches_the_return(tmp_path):
+    plan = tuning(goal="steps", reach=-40.0, priors=("none",), budget=8)
+    found = search(tmp_path / "t", plan).trials.outcome("none")
+    last = last_step(tmp_path / "t" / "trials" / f"none-{found.best:03d}")
+    assert 0 <= -found.best_score <= last <= 200 - found.best_score < 900
+    assert search(tmp_path / "u", plan.model_copy(update={"reach": 1e6})).trials.outcome("none").best is None
+
+
+def test_a_broken_trial_is_never_the_best_and_a_failed_one_is_tried_again_with_its_settings(tmp_path):
+    plan = tuning(priors=("none",), budget=3)
+    tuner = search(tmp_path / "t", plan, CurveEngine(fails="none-001", breaks="none-002"))
+    assert states(tuner.trials, "none") == [TrialState.COMPLETE, TrialState.RUNNING, TrialState.PRUNED]
+    assert [(run.status, run.message) for run in tuner.runs] == [
+        ("finished", ""),
+        ("failed", "the disk is on fire"),
+        ("finished", ""),
+    ]
+    config = (tmp_path / "t" / "trials" / "none-001" / "config.json").read_text()
+    engine = CurveEngine()
+    again = search(tmp_path / "t", plan, engine)
+    assert engine.started == ["none-001"]
+    assert all(state.is_finished() for state in states(again.trials, "none"))
+    assert (tmp_path / "t" / "trials" / "none-001" / "config.json").read_text() == config
+
+
+def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budgets(tmp_path):
+    tuner = search(tmp_path / "t", tuning(budget=16))
+    trials = tuner.trials
+    outcomes = [trials.outcome(prior) for prior in ("esp", "none")]
+    for path, found in zip(write_presets(trials.folder, outcomes), outcomes, strict=True):
+        file = read_config_file(path)
+        own = resolve_config(file.choices["task"], file.choices["algorithm"], overrides=file.settings)
+        best = trials.folder.tuning.config(found.prior, found.settings)
+        assert own.algorithm_settings == best.algorithm_settings
+        assert own.prior.effective() == best.prior
+    page = write_page(trials, outcomes, tmp_path / "t" / "report").read_text()
+    assert budget_sentence(trials.tuning) in page
+    assert "Budget: 16 trials each of 2 seeds and at most 900 steps per seed" in page
+    _, rows = budget_table(outcomes)
+    assert [row[1] for row in rows] == ["16", "16"]
+    assert all(f"| {' | '.join(row)} |" in page for row in (*rows, *settings_table(outcomes)[1]))
+    pictures = {line.split("(")[1].rstrip(")") for line in page.splitlines() if line.startswith("![")}
+    assert {"esp-optimization-history.png", "none-importances.png"} <= pictures
+    assert all((tmp_path / "t" / "report" / name).stat().st_size > 1000 for name in pictures)

@@ -1,0 +1,141 @@
+"""What tuning tries and how it scores: spaces, curves, budgets, and the study that judges the best settings."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.studies.study import StudyError
+from esp_cli.studies.tuning import Point, Tuning, TuningFolder, fresh_study, score
+from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
+from tests.training.runs import TINY
+
+SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
+
+
+def tuning(**changes) -> Tuning:
+    plain = {
+        "task": "navigation",
+        "algorithm": "mappo",
+        "priors": ("esp", "none"),
+        "budget": 4,
+        "steps": 900,
+        "trial_seeds": (1000, 1001),
+        "overrides": dict(TINY),
+        "space": SPACE | {"prior.consistency_coef": Dimension(low=0.1, high=1.0)},
+        "command": "esp tune",
+    }
+    return Tuning(**(plain | changes))
+
+
+def points(*means: float) -> list[Point]:
+    return [Point(100 * k, 10.0 * k, mean, mean) for k, mean in enumerate(means)]
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_every_algorithm_has_a_space_whose_corners_are_settings_that_it_takes(algorithm):
+    assert algorithm in ALGORITHMS
+    for task in ("navigation", "predator-prey"):
+        tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm)).check()
+    without = space_of(default_space(algorithm), "none")
+    assert set(default_space(algorithm)) - set(without) == {"prior.consistency_coef"}
+
+
+def test_an_algorithm_without_a_space_asks_for_one():
+    with pytest.raises(ValueError, match="mine has no default space; name the settings to tune with --space FILE"):
+        default_space("mine")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"),
+    [
+        (".json", '{"mappo.learning_rate": {"low": 1e-4, "high": 1e-1, "log": true}, "mappo.gamma": [0.9, 0.99]}'),
+        (".toml", "[mappo]\ngamma = [0.9, 0.99]\nlearning_rate = {low = 1e-4, high = 1e-1, log = true}\n"),
+    ],
+)
+def test_a_space_is_read_flat_or_nested_as_json_or_toml(tmp_path, suffix, text):
+    file = tmp_path / f"space{suffix}"
+    file.write_text(text)
+    assert read_space(file) == SPACE
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ('{"mappo.gamma": 0.9}', "gives 'mappo.gamma' one value; write a list"),
+        ("{}", "names no setting"),
+        ('{"mappo.gamma": {"low": 1, "high": 0}}', "the smaller one first"),
+        ('{"mappo.gamma": {"low": 0, "high": 1, "log": true}}', "log needs a low above 0"),
+        ('{"mappo.gamma": []}', "write a list of values, or low and high"),
+    ],
+)
+def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
+    (tmp_path / "space.json").write_text(text)
+    with pytest.raises(ValueError, match=sentence):
+        read_space(tmp_path / "space.json")
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"space": {"mappo.colour": Dimension(choices=(1, 2))}}, "mappo.colour"),
+        ({"space": {"mappo.gamma": Dimension(low=0.5, high=2.0)}}, "mappo.gamma"),
+        ({"overrides": {"mappo.gamma": 0.9}}, "--set mappo.gamma fixes what the space varies"),
+        ({"goal": "steps"}, "--for steps needs --reach RETURN"),
+        ({"reach": -100.0}, "--for return takes no --reach"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        tuning(**changes).check()
+
+
+def test_a_curve_is_scored_by_its_end_or_by_when_it_reaches_a_return():
+    curve = points(-30.0, -20.0, -10.0, -12.0)
+    assert score(curve, tuning()) == -12.0
+    assert score(curve, tuning(goal="steps", reach=-15.0)) == -200.0
+    assert score(curve, tuning(goal="seconds", reach=-15.0)) == -20.0
+    assert score(curve, tuning(goal="steps", reach=-5.0)) is None
+    assert score(points(-30.0, math.nan), tuning()) is None
+    assert score([], tuning()) is None
+
+
+def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
+    folder = TuningFolder.begin(tmp_path / "t", tuning())
+    cell = folder.cell("esp", 3, {})
+    path = folder.run_path(cell)
+    path.mkdir(parents=True)
+    rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0], "time/elapsed_s": k} for k in range(5)]
+    rows.insert(1, {"step": 50})
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = folder.curve(cell)
+    assert [point.step for point in found] == [0, 100, 200, 300, 400]
+    assert [point.mean for point in found] == [0.0, -4.0, -8.0, -12.0, -16.0]
+    assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
+    assert folder.curve(folder.cell("esp", 4, {})) == []
+
+
+def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
+    TuningFolder.begin(tmp_path / "t", tuning())
+    assert TuningFolder.begin(tmp_path / "t", tuning(budget=8)).tuning.budget == 8
+    for other in (tuning(budget=2), tuning(budget=8, steps=100), tuning(budget=8, priors=("esp",))):
+        with pytest.raises(StudyError, match="holds another tuning"):
+            TuningFolder.begin(tmp_path / "t", other)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    with pytest.raises(StudyError, match="is not empty and no tuning"):
+        TuningFolder.begin(tmp_path / "mine", tuning())
+
+
+def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
+    best = {"esp": (3, {"mappo.learning_rate": 0.002}), "none": (0, {})}
+    study = fresh_study(tuning(), best, (0, 1), 4)
+    assert [cell.variant for cell in study.cells] == ["ESP, tuned (trial 3)", "ESP, default", "plain, tuned (trial 0)"]
+    assert {cell.config.seeds for cell in study.cells} == {(0, 1)}
+    assert study.cells[0].config.algorithm_settings["learning_rate"] == 0.002
+    assert [cell.reference for cell in study.cells] == [None, study.cells[0].name, study.cells[0].name]
+    with pytest.raises(ValueError, match="seed 1001 belongs to the trials"):
+        fresh_study(tuning(), best, (0, 1001), 4)
