@@ -35,6 +35,8 @@ BEAT_S = 0.5
 """Seconds between two looks at a worker."""
 END_S = 5.0
 """Seconds that a worker is given to remove its files; one without a node has none."""
+START_S = 60.0
+"""Seconds in which workers may fail to start, one after the other."""
 MAX_LOSSES = 3
 """Workers that a job may lose without a new checkpoint."""
 _FORWARDED = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")
@@ -165,33 +167,37 @@ class RayJob:
         """Run the job to its end, on as many workers as it takes."""
         losses, before = 0, -1
         while True:
-            mirror, lease = Mirror(self._folder.path), None
+            lease, mirror = self._leased(), Mirror(self._folder.path)
             losses, before = 0 if mirror.newest_step > before else losses, mirror.newest_step
             try:
-                lease = self._leased()
                 return self._follow(mirror, lease)
             except LeaseLostError:  # another driver goes on with it; wait for that one
                 self._actor = None
             except RayActorError:
                 self._actor = None
                 losses += 1
-                if lease is not None:
-                    mirror.say(f"lost the worker on {lease['node']}; going on from step {max(0, mirror.newest_step)}")
-                if self._stopping.is_set():
-                    raise _StoppedError from None
+                mirror.say(f"lost the worker on {lease['node']}; going on from step {max(0, mirror.newest_step)}")
                 if losses == MAX_LOSSES:
                     self._words = f"it lost {losses} workers one after the other without a new checkpoint"
                     return 1
-                time.sleep(BEAT_S)  # until the name of the lost worker is free
+            if self._stopping.is_set():
+                raise _StoppedError
 
     def _leased(self) -> Lease:
         """Lease the worker of the job; wait for a free node, or for another driver that holds it."""
+        patience = time.monotonic() + START_S
         while True:
-            self._actor = self._find()
-            lease: Lease = self._ask(self._actor.attach.remote(self._owner), waiting=True)
-            if not lease["holder"]:
-                refuse_difference(lease["node"], lease["versions"])
-                return lease
+            try:
+                self._actor = self._find()
+                lease: Lease = self._ask(self._actor.attach.remote(self._owner), waiting=True)
+            except RayActorError:  # its name is still that of the worker that was lost
+                if time.monotonic() > patience:
+                    raise
+            else:
+                if not lease["holder"]:
+                    refuse_difference(lease["node"], lease["versions"])
+                    return lease
+                patience = time.monotonic() + START_S
             self._actor = None
             if self._stopping.wait(BEAT_S):
                 raise _StoppedError

@@ -24,18 +24,19 @@ from esp_cli.studies.engine_ray import RayEngine
 from esp_cli.studies.mirror import Mirror
 from esp_cli.studies.ray_cluster import ClusterError
 from esp_cli.studies.scheduler import Scheduler, Snapshot
-from esp_cli.studies.study import Cell, StudyFolder
+from esp_cli.studies.study import Cell, Study, StudyFolder
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
 from tests.studies.test_worker import wait_for
+from tests.training.runs import TINY
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 STORE = 80 * 2**20
-STEPS = 10_000
-"""Two hundred iterations: time enough to lose something in the middle."""
+STEPS = 6000
+"""120 iterations: time enough to lose something in the middle."""
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +51,14 @@ def cluster() -> Iterator[Cluster]:
     made.shutdown()
 
 
+def study() -> Study:
+    return small_study(steps=((None, STEPS),), seeds=(0, 1), overrides=TINY)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StudyFolder:
     monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
-    return StudyFolder.create(tmp_path / "s", small_study(steps=((None, STEPS),), seeds=(0, 1)))
+    return StudyFolder.create(tmp_path / "s", study())
 
 
 @pytest.fixture
@@ -65,9 +70,8 @@ def engine(cluster: Cluster, folder: StudyFolder) -> Iterator[RayEngine]:
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The same runs, trained in this process."""
-    study = small_study(steps=((None, STEPS),), seeds=(0, 1))
     found = {}
-    for cell in study.cells:
+    for cell in study().cells:
         path = tmp_path_factory.mktemp("alone") / cell.name
         run = RunFolder.create(path, cell.config.model_dump(mode="json"))
         Run(run.path).train()
