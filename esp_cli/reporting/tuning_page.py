@@ -56,11 +56,13 @@ def settings_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
 def budget_sentence(tuning: Tuning) -> str:
     """Say what budget each prior has, and what a score is."""
     each = " each" if len(tuning.priors) > 1 else ""
+    seeds = f"{len(tuning.trial_seeds)} seed{'s' if len(tuning.trial_seeds) > 1 else ''}"
     reach = "" if tuning.reach is None else f" {tuning.reach:g}"
     return (
-        f"Budget: {tuning.budget} trials{each} of {len(tuning.trial_seeds)} seeds and at most "
+        f"Budget: {tuning.budget} trials{each} of {seeds} and at most "
         f"{format_count(tuning.steps)} steps per seed; successive halving looks {RUNGS} times before the end, and "
-        f"one of {REDUCTION} trials goes on. Trial 0 has the default settings. Score: {_MEANING[tuning.goal]}{reach}."
+        f"one of {REDUCTION} trials goes on. Trial 0 has the default settings, as far as the space holds "
+        f"them. Score: {_MEANING[tuning.goal]}{reach}."
     )
 
 

@@ -185,19 +185,20 @@ class RayJob:
 
     def _leased(self) -> Lease:
         """Lease the worker of the job; wait for a free node, or for another driver that holds it."""
-        patience = time.monotonic() + START_S
+        failing_since: float | None = None
         while True:
             try:
                 self._actor = self._find()
                 lease: Lease = self._ask(self._actor.attach.remote(self._owner), waiting=True)
             except RayActorError:  # its name is still that of the worker that was lost
-                if time.monotonic() > patience:
+                failing_since = failing_since or time.monotonic()
+                if time.monotonic() - failing_since > START_S:
                     raise
             else:
                 if not lease["holder"]:
                     refuse_difference(lease["node"], lease["versions"])
                     return lease
-                patience = time.monotonic() + START_S
+                failing_since = None
             self._actor = None
             if self._stopping.wait(BEAT_S):
                 raise _StoppedError
