@@ -9,8 +9,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import esp_cli
 import esp_envs
+from esp_cli import __version__
 
 _LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
 
@@ -18,7 +18,7 @@ _LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
 @cache
 def versions() -> Mapping[str, str]:
     """Return versions by name; that of esp itself holds a digest of its source files."""
-    found = {"esp": f"{esp_cli.__version__} ({_source_digest()})", "Python": platform.python_version()}
+    found = {"esp": f"{__version__} ({_source_digest()})", "Python": platform.python_version()}
     return found | {name: _version(name) for name in _LIBRARIES}
 
 
@@ -51,8 +51,7 @@ def _version(name: str) -> str:
 def _source_digest() -> str:
     """Return a digest of all source files, so that two checkouts of one version are told apart."""
     digest = hashlib.sha256()
-    for package in (esp_cli, esp_envs):
-        root = Path(package.__path__[0])
+    for root in (Path(__file__).parents[1], Path(esp_envs.__path__[0])):
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()[:10]
