@@ -38,7 +38,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--for", "steps"], "--for steps needs --reach RETURN"),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
-        (["--seeds", "1001,"], "seed 1001 belongs to the trials"),
+        (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
     ],
 )
 def test_what_is_wrong_is_told_before_there_is_a_folder(
