@@ -8,30 +8,19 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_cli.training.build import build_learner
-from esp_cli.training.config import resolve_config
 from esp_cli.training.trainer import Trainer
+from tests.benchmarks import exactness
+from tests.benchmarks.exactness import LEARNERS
 from tests.training.runs import tiny_config, tiny_folder
 
 ROUNDING = 1e-4
 """Largest difference of a weight after one iteration; two seeds differ by a thousand times as much."""
-LEARNERS = [(algorithm, network) for algorithm in ("mappo", "maddpg", "qmix") for network in ("mlp", "gru")]
 
 
 def weights(algorithm, network, seeds, threads=1):
     """Return the policy's weights [S, ...] after an iteration that learns."""
-    settings = {"network.name": network, "network.hidden": [16], f"{algorithm}.num_envs": 4}
-    if algorithm != "mappo":
-        settings |= {f"{algorithm}.warmup_episodes": 0, f"{algorithm}.batch_episodes": 4}
-        settings |= {f"{algorithm}.replay_episodes": 64}
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        learner = build_learner(resolve_config("navigation", algorithm, steps=1000, seeds=seeds, overrides=settings))
-        learner.iterate(0.0)
-    finally:
-        torch.set_num_threads(before)
-    return torch.cat([t.flatten(1).double() for t in learner.policy.state_dict().values() if t.dim() > 1], 1)
+    (found,) = exactness.weights("navigation", (algorithm, network), seeds, threads)
+    return found
 
 
 @pytest.mark.parametrize(("algorithm", "network"), LEARNERS)
