@@ -247,7 +247,8 @@ class Symmetry:
 
         data = source if isinstance(source, Transitions) else collect(source)
         if not self.spaces.num_agents > 1 and data.reward.dim() == 2:
-            data = Transitions(*(getattr(data, field.name).unsqueeze(2) for field in fields(data)))
+            held = {field.name: getattr(data, field.name) for field in fields(data)}
+            data = Transitions(**{name: value.unsqueeze(2) for name, value in held.items() if value is not None})
         lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))
         spaces = replace(self.spaces, symmetry=self.group)
         return check_transitions(spaces, data, candidates(spaces, transforms or self.group))
