@@ -64,7 +64,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import what makes worlds when it is asked for; a spec alone needs the standard library alone."""
     if name in __all__:
-        for module in map(import_module, ("esp_envs.base", "esp_envs.registry", "esp_envs.lockstep")):
+        for module in map(import_module, ("esp_envs.base", "esp_envs.scene", "esp_envs.registry", "esp_envs.lockstep")):
             if hasattr(module, name):
                 return getattr(module, name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
