@@ -19,12 +19,14 @@ from typer.core import TyperGroup
 
 from esp_cli import __version__, console, machine
 from esp_cli.commands import COMMANDS
+from esp_cli.commands.help import arrange
 from esp_cli.files import failures
 from esp_cli.files.suggesting import did_you_mean
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
+_HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 EXIT_MACHINE, EXIT_USER, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -84,11 +86,13 @@ def build_command(name: str, target: str) -> Any:
     """Import "module:function" and make it a typer command, with the module's `EPILOG` below its help."""
     module_name, function_name = target.split(":")
     module = import_module(module_name)
-    single = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
+    single = typer.Typer(
+        add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False, context_settings=_HELP_NAMES
+    )
     single.command(name, epilog=getattr(module, "EPILOG", None))(getattr(module, function_name))
     command = typer.main.get_command(single)
     command.name = name
-    return command
+    return arrange(command)
 
 
 def report(failure: Exception) -> int | None:
@@ -138,7 +142,7 @@ app = typer.Typer(
     name="esp",
     cls=LazyGroup,
     no_args_is_help=True,
-    add_completion=False,
+    context_settings=_HELP_NAMES,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     epilog="Start with: esp train --algo mappo --task navigation",

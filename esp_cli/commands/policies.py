@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption
+
+if TYPE_CHECKING:
+    from esp_cli.deploy.manifest import Entry
 
 EPILOG = """Examples:\n
     esp policies\n
@@ -25,24 +29,31 @@ def policies(
     if not found:
         raise ValueError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
     if json != "-":
-        rows = [
-            (
-                e.name,
-                e.task_version,
-                console.format_count(e.step),
-                f"{e.seed} of {e.chosen_from}",
-                f"{e.score.mean:.2f}",
-                console.format_interval(e.score.ci95),
-                e.score.episodes,
-                e.convention,
-            )
-            for e in found
-        ]
-        numbers = ("version>", "steps>", "seed>", "return>", "95 % interval>", "episodes>")
-        caption = "greedy, interval over episodes; the seed is the best of its run on other episodes"
-        console.table(("policy", *numbers, "reward convention"), rows, caption=caption)
+        with console.paged():
+            _print(found)
         for entry in found if task else ():
             console.say(f"{entry.name}: {entry.command}")
         console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
     if json is not None:
         console.write_json(json, [entry.model_dump(mode="json") for entry in found])
+
+
+def _print(entries: Sequence[Entry]) -> None:
+    """Print a table for each convention of returns, within which alone they compare."""
+    groups: dict[tuple[str, int, str, int], list[Entry]] = {}
+    for entry in entries:
+        groups.setdefault((entry.task, entry.task_version, entry.convention, entry.score.episodes), []).append(entry)
+    for (task, version, convention, episodes), group in groups.items():
+        rows = [
+            (
+                e.name,
+                console.format_count(e.step),
+                f"{e.seed} of {e.chosen_from}",
+                f"{e.score.mean:.2f}",
+                console.format_interval(e.score.ci95),
+            )
+            for e in group
+        ]
+        title = f"{task} version {version}, {episodes} episodes; convention {convention}"
+        console.table(("policy", "steps>", "seed>", "return>", "95 % interval>"), rows, title=title)
+    console.text("Greedy, interval over episodes; the seed is the best of its run on other episodes.")

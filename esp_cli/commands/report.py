@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
+from esp_cli.commands.counts import parse_count
 from esp_cli.commands.options import (
     JsonOption,
     OwnAlgoOption,
     OwnNetworkOption,
     OwnTaskOption,
     check_finite,
-    parse_count,
     register_learners,
     register_tasks,
 )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from esp_cli.commands.counts import chosen_seeds, parse_count
 from esp_cli.commands.options import (
     DeviceOption,
     EpisodesOption,
@@ -19,9 +20,7 @@ from esp_cli.commands.options import (
     SeedListOption,
     SeedsOption,
     SetOption,
-    chosen_seeds,
     parse_assignments,
-    parse_count,
     register_learners,
     register_tasks,
 )

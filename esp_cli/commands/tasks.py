@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json as json_text
 from importlib.metadata import entry_points
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,10 +76,22 @@ def _print_list(found: list[dict[str, Any]]) -> None:
 
 
 def _print_card(card: dict[str, Any]) -> None:
-    console.say(card["card"])
-    console.say("")
-    rows = [tuple(row.values()) for row in card["observation"]]
-    console.table(("index>", "field", "kind", "unit"), rows, title="Observation of one agent")
-    settings = [(name, s["default"], s["description"]) for name, s in card["settings"].items()]
-    console.table(("setting", "default", "meaning"), settings, title="Settings (--set task.NAME=VALUE)")
-    console.say(f"Symmetries: {', '.join(card['symmetries'])}")
+    with console.paged():
+        _print_text(card["card"], {row["field"]: row["kind"] for row in card["observation"]})
+        if "| index" not in card["card"]:  # a card of others may lack the table
+            rows = [tuple(row.values()) for row in card["observation"]]
+            console.table(("index>", "field", "kind", "unit"), rows, title="Observation of one agent")
+        settings = [(name, s["default"], s["description"]) for name, s in card["settings"].items()]
+        console.table(("setting", "default", "meaning"), settings, title="Settings (--set task.NAME=VALUE)")
+        console.text(f"Symmetries: {', '.join(card['symmetries'])}")
+
+
+def _print_text(card: str, kinds: dict[str, str]) -> None:
+    """Print the text of a card; its table of the observation gets the kind of each field, and fits the terminal."""
+    for is_table, lines in groupby(card.splitlines(), lambda line: line.lstrip().startswith("|")):
+        if not is_table:
+            console.text("\n".join(lines))
+            continue
+        heading, _, *rows = ([cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines)
+        told = [(row[0], row[1], kinds.get(row[1], ""), *row[2:]) for row in rows]
+        console.table((f"{heading[0]}>", heading[1], "kind", *heading[2:]), told)

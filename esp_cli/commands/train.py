@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from esp_cli import console
+from esp_cli.commands.counts import chosen_seeds
 from esp_cli.commands.options import (
     AlgoOption,
     DeviceOption,
@@ -21,7 +22,6 @@ from esp_cli.commands.options import (
     StepsOption,
     TaskOption,
     TransformsOption,
-    chosen_seeds,
     parse_assignments,
     register_learners,
     register_tasks,

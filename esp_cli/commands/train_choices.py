@@ -7,7 +7,8 @@ from typing import Any, get_args
 
 import typer
 
-from esp_cli.commands.options import Device, parse_count, parse_seed_list, parse_seeds
+from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
+from esp_cli.commands.options import Device
 
 _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""

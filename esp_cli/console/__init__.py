@@ -24,6 +24,7 @@ from esp_cli.console.streams import note as note
 from esp_cli.console.streams import out as out
 from esp_cli.console.streams import paged as paged
 from esp_cli.console.streams import say as say
+from esp_cli.console.streams import text as text
 from esp_cli.console.tables import lay_out
 from esp_cli.files.writing import write_file
 from esp_cli.formatting import format_count as format_count  # also console's

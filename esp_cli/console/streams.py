@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pydoc
 import sys
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -18,6 +19,15 @@ err = Console(stderr=True, highlight=False)
 def say(text: str) -> None:
     """Print one line of result on standard output, as it is (no markup, no wrapping)."""
     out.print(Text(text), soft_wrap=True)
+
+
+def text(content: str) -> None:
+    """Print text on standard output; on a terminal, lines break between words and keep their indentation."""
+    for line in content.splitlines():
+        indent = " " * (len(line) - len(line.lstrip()))
+        width = out.width if out.is_terminal else len(line)
+        for part in textwrap.wrap(line, max(width, 1), subsequent_indent=indent + "  ", break_long_words=False) or [""]:
+            say(part)
 
 
 def note(text: str) -> None:

@@ -6,14 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from esp_cli.commands.options import (
-    MAX_SEEDS,
-    chosen_seeds,
-    parse_assignments,
-    parse_count,
-    parse_seed_list,
-    parse_seeds,
-)
+from esp_cli.commands.counts import MAX_SEEDS, chosen_seeds, parse_count, parse_seed_list, parse_seeds
+from esp_cli.commands.options import parse_assignments
 from esp_cli.console import format_count
 
 

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
+import pty
 import re
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, get_args, get_origin
 
 import pytest
 from rich.console import Console
 from rich.table import Table
+from typer.testing import CliRunner
 
 from esp_cli import console
+from esp_cli.app import app, build_command
+from esp_cli.commands import COMMANDS
+from esp_cli.console import streams
 from esp_cli.console.progress import progress_line
 from esp_cli.console.tables import lay_out
-from tests.cli.running import esp
+from esp_cli.deploy.manifest import read_bundled
+from tests.cli.running import TINY_OPTIONS, esp
 
+ROOT = Path(__file__).parents[2]
+_runner = CliRunner()
 COLUMNS = ("policy", "steps>", "95 % interval>", "what it does")
 
 
@@ -56,4 +73,206 @@ def at_80(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
     """Return what a command prints on a terminal of 80 columns."""
     terminal = Console(width=80, height=10_000, force_terminal=True, color_system=None, highlight=False)
     monkeypatch.setattr(console, "out", terminal)
-    return esp(*arguments).stdout.splitlines()
+    monkeypatch.setattr(streams, "out", terminal)
+    text = esp(*arguments).stdout
+    return re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines()
+
+
+def too_wide(lines: list[str]) -> list[str]:
+    """Return the lines that are longer than 80 columns, but for commands, which are there to be copied."""
+    return [line for line in lines if len(line) > 80 and "esp train" not in line]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("tasks",),
+        *(("tasks", task) for task in ("navigation", "predator-prey", "formation", "wildlife")),
+        ("policies",),
+        ("policies", "formation"),
+        ("settings",),
+        ("eval", "navigation", "--episodes", "2"),
+        ("eval", "formation", "--episodes", "2", "--set", "task.horizon=5"),
+    ],
+    ids=" ".join,
+)
+def test_what_a_command_prints_fits_80_columns(monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]) -> None:
+    lines = at_80(monkeypatch, *arguments)
+    assert len(lines) > 5
+    assert too_wide(lines) == []
+    assert not any("…" in line for line in lines)
+
+
+def test_tables_of_runs_fit_80_columns(monkeypatch: pytest.MonkeyPatch, finished: Path, tmp_path: Path) -> None:
+    for arguments in (
+        ("report", finished),
+        ("report", f"plain={finished}", f"esp={finished}", "--at", "100", "--threshold", "-100"),
+        ("export", finished, "-f", "numpy", "--seed", "3", "-o", tmp_path / "export"),
+        (
+            "reproduce",
+            "table1",
+            "--dry-run",
+            "--task",
+            "navigation",
+            "--algo",
+            "mappo",
+            "--steps",
+            "100",
+            *TINY_OPTIONS,
+        ),
+    ):
+        lines = at_80(monkeypatch, *arguments)
+        assert any("navigation" in line or "numpy" in line for line in lines)
+        tables = [line for line in lines if not line.startswith(("disk:", "2 runs to do"))]
+        assert too_wide(tables) == [], arguments
+        assert not any("…" in line for line in lines)
+
+
+def test_the_names_of_policies_are_whole_at_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = at_80(monkeypatch, "policies")
+    for entry in read_bundled():
+        assert any(re.search(rf"(?<![\w-]){entry.name}(?![\w-])", line) for line in lines), entry.name
+
+
+def test_a_line_that_is_too_wide_is_found() -> None:
+    assert too_wide(["x" * 81, "x" * 80, "esp train " + "x" * 90]) == ["x" * 81]
+
+
+def on_terminal(*arguments: str, **environment: str) -> str:
+    """Return what a process shows on a terminal of 80 columns."""
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    known = {
+        name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "FORCE_COLOR", "COLUMNS", "LINES")
+    }
+    known |= {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "environments")]), "TERM": "xterm-256color"}
+    command = [sys.executable, "-c", "from esp_cli.app import main; main()", *arguments]
+    process = subprocess.Popen(command, stdin=slave, stdout=slave, stderr=slave, env=known | environment)
+    os.close(slave)
+    content = b""
+    while True:
+        try:
+            part = os.read(master, 65536)
+        except OSError:  # Linux says so when the other side is closed
+            break
+        if not part:
+            break
+        content += part
+    process.wait()
+    os.close(master)
+    return content.decode()
+
+
+COLOUR = re.compile(r"\x1b\[(?:[0-9]+;)*(?:3[0-8]|9[0-7])(?:;[0-9]+)*m")
+
+
+def test_colours_are_there_and_go_with_no_color() -> None:
+    for arguments in (("eval", "--help"), ("nothing",)):
+        assert COLOUR.search(on_terminal(*arguments))
+        assert not COLOUR.search(on_terminal(*arguments, NO_COLOR="1"))
+
+
+def test_long_output_goes_through_the_pager_on_a_terminal_and_short_output_does_not() -> None:
+    pager = "sed s/^/PAGED/"
+    assert "PAGED" in on_terminal("settings", "mappo", PAGER=pager)
+    assert "PAGED" not in on_terminal("settings", "evaluation", PAGER=pager)
+
+
+def test_nothing_is_paged_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
+    def page(text: str) -> None:
+        raise AssertionError("a pager would wait for a key")
+
+    monkeypatch.setattr(streams.pydoc, "pager", page)
+    assert "learning_rate" in esp("settings", "mappo").stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_80_columns_in_groups_and_h_is_short_for_it(name: str) -> None:
+    told = _runner.invoke(app, [name, "-h"], env={"COLUMNS": "80"}).stdout
+    lines = [line.rstrip() for line in told.splitlines()]
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    assert told == _runner.invoke(app, [name, "--help"], env={"COLUMNS": "80"}).stdout
+    command = build_command(name, COMMANDS[name])
+    options = [one for one in command.params if one.opts[0].startswith("-") and not one.hidden]
+    assert all(one.opts[0] in told for one in options)
+    grouped = [one for one in options if one.rich_help_panel != "Options"]
+    assert len(grouped) >= len(options) - 1
+
+
+def test_defaults_are_told_as_they_are_written() -> None:
+    told = " ".join(_runner.invoke(app, ["train", "-h"], env={"COLUMNS": "80"}).stdout.split())
+    for default in ("navigation", "mappo", "cpu", "(1M)", "(1)"):
+        assert f"[default: {default}]" in told
+
+
+SEVERAL = ("--steps", "-n", "--prior")
+"""Options that a study takes several values of, separated by commas."""
+
+
+def clashes(commands: Iterable[Any], with_hidden: bool = False) -> set[str]:
+    """Return the options that take one kind of value in one command and another kind in another."""
+    kinds: dict[str, set[object]] = {}
+    for command in commands:
+        for one in command.params:
+            if one.opts[0].startswith("-") and (with_hidden or not one.hidden):
+                kind = one.type_descriptor.annotation
+                inner = get_args(kind)[0] if get_origin(kind) in (list, tuple) else kind
+                for name in one.opts:
+                    kinds.setdefault(name, set()).add(str if name in SEVERAL else inner)
+    return {name for name, found in kinds.items() if len(found) > 1}
+
+
+def test_an_option_takes_the_same_kind_of_value_in_every_command() -> None:
+    commands = [build_command(name, target) for name, target in COMMANDS.items()]
+    assert clashes(commands) == set()
+    assert clashes(commands, with_hidden=True) == {"--view"}, "the old spelling that was given up for this reason"
+
+
+def completed(line: str, **environment: str) -> list[str]:
+    """Return what bash is offered at the end of a command line."""
+    words = line.split(" ")
+    asked = {"_ESP_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)}
+    return _runner.invoke(app, [], prog_name="esp", env=asked | environment).stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("esp tr", ["train"]),
+        ("esp train --task na", ["navigation"]),
+        ("esp train --algo q", ["qmix"]),
+        ("esp train --network emp", ["empn"]),
+        ("esp train --prior aug", ["augment"]),
+        ("esp train --track w", ["wandb"]),
+        ("esp train --set mappo.le", ["mappo.learning_rate="]),
+        ("esp train --algo qmix --set qmix.mixer", ["qmix.mixer_width="]),
+        ("esp train --task formation --set task.sensor", ["task.sensor_noise_m="]),
+        ("esp train --set task.sensor", []),
+        ("esp eval formation-mappo-", ["formation-mappo-esp", "formation-mappo-plain"]),
+        ("esp settings pri", ["prior"]),
+        ("esp nothing --task na", []),
+    ],
+)
+def test_the_shell_is_offered_what_can_follow(
+    line: str, offered: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert completed(line) == offered
+
+
+def test_run_folders_are_offered_beside_the_bundled_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "runs" / "form").mkdir(parents=True)
+    (tmp_path / ".hidden").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert completed("esp eval ru") == ["runs/"]
+    assert completed("esp eval runs/f") == ["runs/form/"]
+    assert not any(name.startswith(".") for name in completed("esp eval "))
+
+
+@pytest.mark.parametrize(
+    ("shell", "part"), [("bash", "complete -o default -F"), ("zsh", "#compdef esp"), ("fish", "complete --command esp")]
+)
+def test_each_shell_has_a_script_that_asks_the_application(shell: str, part: str) -> None:
+    told = _runner.invoke(app, [], prog_name="esp", env={"_ESP_COMPLETE": f"source_{shell}"})
+    assert part in told.stdout

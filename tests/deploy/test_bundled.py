@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.commands.options import parse_assignments, parse_count, parse_seeds
+from esp_cli.commands.counts import parse_count, parse_seeds
+from esp_cli.commands.options import parse_assignments
 from esp_cli.deploy import manifest
 from esp_cli.deploy.bundled import find, load_entry, open_policy
 from esp_cli.deploy.bundling import best_seed, bundle, play_greedily, score_of
