@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
+from torch.nn.functional import embedding
 
 from esp_cli.networks.heads import MASKED, Categorical, Head, best, same_disc, squash
 from esp_envs.base import random_choice
@@ -55,7 +55,7 @@ class ExploringChoice(ExploringHead):
 
     def encode(self, action: Tensor) -> Tensor:
         """Return one-hot rows."""
-        return one_hot(action, self.num_outputs).float()
+        return embedding(action, torch.eye(self.num_outputs, device=action.device))
 
 
 class EpsilonGreedy(ExploringChoice):
@@ -112,7 +112,7 @@ class ExploringCategorical(ExploringChoice, Categorical):
         """
         gumbel = -(-(noise.clamp(1e-7, 1 - 1e-7)).log()).log()
         soft = self.normalise(log_probs + gumbel).exp()
-        hard = one_hot(best(soft), self.num_outputs).to(soft.dtype)
+        hard = self.encode(best(soft)).to(soft.dtype)
         return hard + (soft - soft.detach())
 
     def penalty(self, log_probs: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ learns the same alone and among ten.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import islice
 
 import torch
@@ -127,7 +127,11 @@ class SeedMLP(nn.Module):
         return torch.cat(idle, 1).float().mean(1)
 
     def _from_layer(self, first: int, x: Tensor) -> Tensor:
-        parameters = [p for layer in islice(self.layers, first, None) for p in (layer.weight, layer.bias)]
+        layers: Iterator[SeedLinear] = islice(self.layers, first, None)  # type: ignore[arg-type]
+        parameters = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+        few = x.shape[0] * x.shape[1] <= CACHED_ROWS and self.precision == torch.float32
+        if few and not torch.is_grad_enabled():  # acting: a step of all worlds
+            return _run(x, parameters, self.activation, self.activate_output)[-1]
         return _Perceptron.apply(  # type: ignore[no-untyped-call]
             x, self.activation, self.activate_output, self.precision, *parameters
         )
@@ -143,6 +147,15 @@ class SeedMLP(nn.Module):
         return x
 
 
+def _run(x: Tensor, parameters: Sequence[Tensor], activation: str, activate_output: bool) -> list[Tensor]:
+    """Return x and what every layer of a perceptron gives."""
+    run, last = [x], len(parameters) // 2 - 1
+    for k in range(last + 1):
+        layer = _hidden if k < last or activate_output else _linear
+        run.append(layer(parameters[2 * k + 1], run[-1], parameters[2 * k], activation))
+    return run
+
+
 class _Perceptron(Function):
     """y = W_n act(... act(x W_1 + b_1) ...) + b_n with in-place activations and a backward that reuses its buffers.
 
@@ -155,37 +168,46 @@ class _Perceptron(Function):
         ctx.dtype, ctx.rounds = x.dtype, precision != torch.float32
         if ctx.rounds:
             x, parameters = x.to(precision), tuple(p.to(precision) for p in parameters)
-        inputs, weights, biases = [x], parameters[::2], parameters[1::2]
-        last = len(weights) - (0 if activate_output else 1)
-        for bias, weight in zip(biases[:last], weights, strict=False):
-            inputs.append(_hidden(bias, inputs[-1], weight, activation))
-        x = inputs[-1] if activate_output else affine(biases[-1], inputs[-1], weights[-1])
-        ctx.save_for_backward(*inputs, *weights)
-        ctx.activation, ctx.activate_output = activation, activate_output
-        return x.float() if ctx.rounds else x
+        weights = parameters[::2]
+        ctx.size = max(1, CACHED_ROWS // x.shape[0])
+        kept, outputs = [], []
+        for piece in x.split(ctx.size, 1):
+            run = _run(piece, parameters, activation, activate_output)
+            kept += run[: len(weights) + activate_output]
+            outputs.append(run[-1])
+        ctx.save_for_backward(*kept, *weights)
+        ctx.count, ctx.activation, ctx.activate_output = len(weights), activation, activate_output
+        y = outputs[0] if len(outputs) == 1 else torch.cat([y.transpose(1, 2) for y in outputs], 2).transpose(1, 2)
+        return y.float() if ctx.rounds else y
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        saved = ctx.saved_tensors
-        count = (len(saved) - 1) // 2 if ctx.activate_output else len(saved) // 2
-        inputs, weights = saved[:-count], saved[-count:]
+        kept, weights = ctx.saved_tensors[: -ctx.count], ctx.saved_tensors[-ctx.count :]
+        per_piece = ctx.count + ctx.activate_output
         if ctx.rounds:
             grad = grad.to(weights[0].dtype)
-        if ctx.activate_output:
-            grad = _activation_backward(grad.clone(), inputs[count], ctx.activation)
-        grads: list[Tensor | None] = [None] * (2 * count)
-        for k in reversed(range(count)):
-            if ctx.needs_input_grad[4 + 2 * k]:  # not where a critic only passes a gradient on to the actor
-                grads[2 * k] = _outer(inputs[k], grad)
-                grads[2 * k + 1] = grad.sum(1, keepdim=True)
-            if k > 0:
-                grad = _activation_backward(torch.bmm(grad, weights[k].transpose(1, 2)), inputs[k], ctx.activation)
-        grad_x = torch.bmm(grad, weights[0].transpose(1, 2)) if ctx.needs_input_grad[0] else None
+        grads: list[Tensor | None] = [None] * (2 * ctx.count)
+        below = []
+        for n, upper in enumerate(grad.split(ctx.size, 1)):
+            inputs, here = kept[n * per_piece : (n + 1) * per_piece], upper
+            if ctx.activate_output:
+                here = _activation_backward(here.clone(), inputs[-1], ctx.activation)
+            for k in reversed(range(ctx.count)):
+                if ctx.needs_input_grad[4 + 2 * k]:  # not where a critic only passes a gradient on to the actor
+                    grads[2 * k] = _outer(inputs[k], here, grads[2 * k])
+                    grads[2 * k + 1] = _added(here.sum(1, keepdim=True), grads[2 * k + 1])
+                if k > 0:
+                    here = torch.bmm(here, weights[k].transpose(1, 2))
+                    here = _activation_backward(here, inputs[k], ctx.activation)
+            if ctx.needs_input_grad[0]:
+                below.append(torch.bmm(here, weights[0].transpose(1, 2)))
         if ctx.rounds:
             grads = [None if g is None else g.float() for g in grads]
-            grad_x = None if grad_x is None else grad_x.to(ctx.dtype)
-        return grad_x, None, None, None, *grads
+        return torch.cat(below, 1).to(ctx.dtype) if below else None, None, None, None, *grads
 
+
+CACHED_ROWS = 4096
+"""Rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache."""
 
 THIN = 16
 """Outputs below which a batched product runs several times faster with rows and columns exchanged (MKL, measured)."""
@@ -206,6 +228,10 @@ def affine(bias: Tensor, x: Tensor, weight: Tensor, scale: float = 1.0) -> Tenso
     ).transpose(1, 2)
 
 
+def _linear(bias: Tensor, x: Tensor, weight: Tensor, _: str) -> Tensor:
+    return affine(bias, x, weight)
+
+
 def _hidden(bias: Tensor, x: Tensor, weight: Tensor, activation: str) -> Tensor:
     """Return act(x W + b)."""
     if activation == "relu" or x.dtype == torch.bfloat16:
@@ -213,13 +239,18 @@ def _hidden(bias: Tensor, x: Tensor, weight: Tensor, activation: str) -> Tensor:
     return _tanh_from_sigmoid_(affine(bias, x, weight, 2.0).sigmoid_())
 
 
-def _outer(x: Tensor, grad: Tensor) -> Tensor:
-    """Return x' grad, the gradient [S, in, out] of a weight."""
+def _outer(x: Tensor, grad: Tensor, more: Tensor | None = None) -> Tensor:
+    """Return x' grad, the gradient [S, in, out] of a weight, added to `more`."""
     if grad.shape[-1] >= THIN:
-        return torch.bmm(x.transpose(1, 2), grad)
+        rows = x.transpose(1, 2)
+        return torch.bmm(rows, grad) if more is None else more.baddbmm_(rows, grad)
     if grad.shape[-1] == 1:
-        return _outer(x, pad(grad, (0, 1)))[..., :1]
-    return torch.bmm(grad.transpose(1, 2), x).transpose(1, 2)
+        return _added(_outer(x, pad(grad, (0, 1)))[..., :1], more)
+    return _added(torch.bmm(grad.transpose(1, 2), x).transpose(1, 2), more)
+
+
+def _added(part: Tensor, more: Tensor | None) -> Tensor:
+    return part if more is None else more.add_(part)
 
 
 def activate_(x: Tensor, activation: str) -> Tensor:

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from esp_cli.networks import layers
 from esp_cli.networks.build import NETWORKS, build_network
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.recurrent import SeedGRU
@@ -32,6 +33,24 @@ def test_hand_written_backward_equals_autograd(activation, activate_output):
     torch.testing.assert_close(ours, theirs)
     inputs = [x, *mlp.parameters()]
     assert_same_gradients(ours, theirs, weight, inputs)
+
+
+@pytest.mark.parametrize("activate_output", [False, True])
+@pytest.mark.parametrize("outputs", [1, 5, 20])
+def test_rows_go_through_in_pieces_as_they_do_at_once(activate_output, outputs, monkeypatch):
+    mlp = SeedMLP(generators(0, 1), (7, 16, outputs), "tanh", 1.0, activate_output=activate_output)
+    x = torch.randn(2, 11, 7, requires_grad=True)
+    weight, inputs = torch.randn(2, 11, outputs), [x, *mlp.parameters()]
+    whole = mlp(x)
+    expected = torch.autograd.grad(whole, inputs, weight)
+    monkeypatch.setattr(layers, "CACHED_ROWS", 8)  # pieces of four, four and three rows
+    pieces = mlp(x)
+    assert pieces.shape == whole.shape
+    torch.testing.assert_close(pieces, whole)
+    for ours, theirs in zip(torch.autograd.grad(pieces, inputs, weight), expected, strict=True):
+        torch.testing.assert_close(ours, theirs)
+    with torch.no_grad():
+        torch.testing.assert_close(mlp(x), whole)
 
 
 def test_bfloat16_products_stay_near_float32_and_keep_float32_gradients():
