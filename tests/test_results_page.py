@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -81,3 +82,36 @@ def measured_rows() -> dict[tuple[str, str], str]:
 
 def test_the_table_of_the_readme_says_what_the_file_says() -> None:
     assert readme_rows((DOCS.parent / "README.md").read_text(encoding="utf-8")) == measured_rows()
+
+
+def beginning(text: str) -> tuple[str, str, str]:
+    """Return title, first paragraph and what follows it of a page."""
+    title, answer, after = text.split("\n\n", 3)[:3]
+    return title, answer, after
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "measurements").glob("[!i]*.md")), ids=lambda page: page.name)
+def test_a_measurement_begins_with_its_question_its_answer_and_a_figure(page: Path) -> None:
+    title, answer, after = beginning(page.read_text(encoding="utf-8"))
+    assert title.startswith("# ")
+    assert title.endswith("?")
+    assert 8 <= len(answer.split()) <= 75, "one to three sentences"
+    assert after.startswith("![")
+
+
+def test_every_figure_of_a_table_can_be_drawn_again_and_is_on_its_page() -> None:
+    drawing = runpy.run_path(str(DOCS / "make_figures.py"))
+    for name, panels in drawing["FIGURES"].items():
+        for panel in panels:
+            rows = drawing["table"](panel)
+            assert len(rows) >= 2
+            assert all(drawing["numbers"](row[panel.value]) for row in rows if row[panel.value])
+            page = (DOCS / "measurements" / f"{panel.page}.md").read_text(encoding="utf-8")
+            assert f"../measured/{name}.png" in page
+        assert (DOCS / "measured" / f"{name}.png").is_file()
+
+
+def test_a_table_that_is_gone_is_noticed() -> None:
+    drawing = runpy.run_path(str(DOCS / "make_figures.py"))
+    with pytest.raises(ValueError, match="no table with the column 'gone'"):
+        drawing["table"](drawing["Panel"]("choices", "run", ["run"], "gone", ""))

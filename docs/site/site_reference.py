@@ -45,7 +45,8 @@ def _option(parameter: Any) -> tuple[str, str, str]:
         [*parameter.opts, *parameter.secondary_opts] if parameter.opts[0].startswith("-") else [parameter.name.upper()]
     )
     default = parameter.default
-    shown = "" if default in (None, False, ()) or callable(default) else f"`{default}`"
+    default = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    shown = "" if default in (None, False, "") or callable(default) else f"`{default}`"
     return " ".join(f"`{name}`" for name in names), shown, parameter.help or ""
 
 
