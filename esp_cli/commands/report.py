@@ -100,6 +100,7 @@ def report(
     from esp_cli.reporting import collect, curves, loose
     from esp_cli.reporting.csv_file import write_csv
     from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.tuning import TuningFolder
 
     register_tasks(task)
     register_learners(algo or [], network or [])
@@ -112,6 +113,9 @@ def report(
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
     y_limits = _limits(y_limits, view)
+    if TuningFolder.is_tuning(Path(runs[0])):
+        fresh = shlex.quote(str(Path(runs[0]) / "fresh"))
+        raise ValueError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
     is_study = StudyFolder.is_one(Path(runs[0]))
     if is_study:
         if len(runs) > 1 or at or reference or plot or y_limits:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
+from esp_cli.commands.options import check_finite
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import follow, open_engine, report_study, run_cells
@@ -53,6 +54,7 @@ def tune(
 ) -> None:
     """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
+    check_finite("--reach", *(() if reach is None else (reach,)))
     words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
     words += ["--for", goal, *(("--reach", f"{reach:g}") if reach is not None else ())]
     words += ["--trial-seeds", str(trial_seeds)]
@@ -135,7 +137,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
             study = fresh_study(tuning, best, request.seeds, request.episodes)
             fresh = StudyFolder.create(folder.path / "fresh", study)
             complete, failed = run_cells(fresh, study, others, jobs, engine, requests)
-        _report(trials, outcomes, write_presets(folder, outcomes))
+        _report(trials, outcomes, write_presets(folder, outcomes), quiet=choices.json == "-")
     if fresh is not None and complete:
         report_study(fresh, choices.json, None, ())
     if not complete:
@@ -145,15 +147,16 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
         raise ValueError(f"{len(failed)} runs failed ({', '.join(failed)}); the same command tries them again")
 
 
-def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path]) -> None:
-    """Print what the search found, write its page, and say what to do next."""
+def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path], quiet: bool) -> None:
+    """Write the page of the search and say what to do next; print what it found, unless standard output is for JSON."""
     from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
 
-    headings, rows = budget_table(outcomes)
-    console.table(headings, rows, title=trials.folder.study.title, caption=budget_sentence(trials.tuning))
-    if any(found.settings for found in outcomes):
-        console.table(*settings_table(outcomes), title="Best settings")
-    else:
+    if not quiet:
+        headings, rows = budget_table(outcomes)
+        console.table(headings, rows, title=trials.folder.study.title, caption=budget_sentence(trials.tuning))
+        if any(found.settings for found in outcomes):
+            console.table(*settings_table(outcomes), title="Best settings")
+    if not any(found.settings for found in outcomes):
         console.note("no trial has a score yet; with --reach, a lower return is easier to come to")
     console.note(f"report -> {write_page(trials, outcomes, trials.folder.path / 'report')}")
     for path in presets:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def budget_sentence(tuning: Tuning) -> str:
 
 
 def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
-    """Write `tuning.md` and Optuna's figures.
+    """Write `tuning.md`, the same numbers as `tuning.json`, and Optuna's figures.
 
     Args:
         trials: the record.
@@ -79,6 +80,8 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     """
     tuning = trials.tuning
     out.mkdir(parents=True, exist_ok=True)
+    document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(found) for found in outcomes]}
+    replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
     lines = [f"# {trials.folder.study.title}", "", budget_sentence(tuning), "", f"`{tuning.command}`", ""]
     lines += ["## Budgets and scores", "", *_markdown(*budget_table(outcomes))]
     lines += ["", "## Best settings", "", *_markdown(*settings_table(outcomes))]

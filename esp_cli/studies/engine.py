@@ -42,4 +42,8 @@ class Engine(Protocol):
         Args:
             arguments: of the command line, without the program.
             log: file to which all that the job prints is appended.
+
+        Raises:
+            OSError: the machine failed.
+            ValueError: the job cannot be started; the run fails, and the others go on.
         """

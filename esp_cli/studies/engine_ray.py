@@ -24,7 +24,7 @@ from ray.exceptions import RayActorError, RayError
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import sentence
 from esp_cli.studies.mirror import FileGoneError, Mirror
-from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect
+from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect, offers, refuse_what_no_node_has
 from esp_cli.studies.versions import refuse_difference
 from esp_cli.studies.worker import LEASE_S, SILENCE_S, CellWorker, Lease, LeaseLostError, News
 from esp_cli.training.loading import parse_config
@@ -74,6 +74,7 @@ class RayEngine:
         self.folder, self.gpus, self.lease_s, self.silence_s = folder, gpus, lease_s, silence_s
         self.owner = f"process {os.getpid()} on {platform.node()} ({secrets.token_hex(4)})"
         connect(address)
+        self._offers = offers()  # of nodes that were ever there: a lost one may come back
 
     def __enter__(self) -> RayEngine:
         return self
@@ -90,6 +91,9 @@ class RayEngine:
         """Start the application with these arguments on some node; what it prints is appended to the log."""
         run = RunFolder.open(log.parent)
         config = parse_config(run.config, run.path)
+        gpus, memory = self.gpus if config.device == "cuda" else 0.0, process_bytes(config)
+        self._offers += [offer for offer in offers() if offer not in self._offers]
+        refuse_what_no_node_has({"CPU": 1, "GPU": gpus, "memory": memory}, run.path.name, self._offers)
         key = f"{self._identity()}/{run.path.name}/{arguments[0]}"
         actor = ray.remote(CellWorker).options(
             name=f"esp-{hashlib.sha256(key.encode()).hexdigest()[:32]}",
@@ -98,8 +102,8 @@ class RayEngine:
             get_if_exists=True,
             max_restarts=0,
             num_cpus=1,
-            num_gpus=self.gpus if config.device == "cuda" else 0,
-            memory=process_bytes(config),
+            num_gpus=gpus,
+            memory=memory,
         )
         return RayJob(self.owner, lambda: actor.remote(self.lease_s, self.silence_s), arguments, run)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import ray
@@ -57,6 +57,29 @@ def connect(address: str | None) -> None:
     except BaseException:
         ray.shutdown()
         raise
+
+
+def offers() -> list[Mapping[str, float]]:
+    """Return what each node that is there has, by Ray's name of the resource."""
+    return [node["Resources"] for node in ray.nodes() if node["Alive"]]
+
+
+def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Sequence[Mapping[str, float]]) -> None:
+    """Refuse a run that would wait for ever, since no node offers what it needs.
+
+    Args:
+        needed: resources by Ray's name: "CPU", "GPU", and "memory" in bytes.
+        name: of the run.
+        nodes: what each node offers.
+
+    Raises:
+        ClusterError: there is no such node.
+    """
+    if any(all(node.get(kind, 0.0) >= amount for kind, amount in needed.items()) for node in nodes):
+        return
+    memory = f"{needed['memory'] / 1e9:.1f} GB of memory"
+    asked = ", ".join(["a core", *(["a GPU"] if needed["GPU"] else []), memory])
+    raise ClusterError(f"no node of the cluster offers what {name} needs ({asked}); add one, or use fewer seeds")
 
 
 def _knock(address: str) -> None:

@@ -193,6 +193,8 @@ class Scheduler:
             run.job = self.engine.start(arguments, folder.log_path(cell))
         except OSError as error:
             run.status, run.message = "failed", sentence(error)
+        except ValueError as error:
+            run.status, run.message = "failed", str(error)
 
     def _follow(self, run: Run, going: bool) -> None:
         """Look at a run: how far it is, and whether its process has ended."""

@@ -142,15 +142,6 @@ class TuningFolder(StudyFolder):
         """Return whether a folder holds a tuning."""
         return (path / _TUNING).is_file()
 
-    @classmethod
-    def reopen(cls, path: Path) -> TuningFolder:
-        """Open the folder of an existing tuning.
-
-        Raises:
-            StudyError: it is missing, damaged or foreign.
-        """
-        return cls(path, TUNING_FORMAT.parse(path / _TUNING, Tuning))
-
     def cell(self, prior: str, number: int, settings: Mapping[str, object]) -> Cell:
         """Return the run of a trial."""
         name = f"{prior}-{number:03d}"

@@ -36,6 +36,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--algo", "mappo,qmix"], "esp tune takes one --algo, not 2"),
         (["--prior", "magic"], "--prior names each kind once; they are none, esp, augment, consistency"),
         (["--for", "steps"], "--for steps needs --reach RETURN"),
+        (["--for", "steps", "--reach", "nan"], "--reach"),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
         (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
@@ -74,5 +75,9 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
     again = esp(*words)
     assert "2 runs, 2 of them finished" in again.stderr
     assert f"next: esp report {out / 'fresh'}" in again.stderr
+    assert f"report its study by: esp report {out / 'fresh'}" in refused("report", out)
+    outcome = json.loads((out / "report" / "tuning.json").read_text())["outcomes"][0]
+    assert (outcome["prior"], outcome["trials"]) == ("esp", 2)
+    json.loads(esp(*words, "--json", "-").stdout)
     esp("report", out / "fresh")
     assert (out / "fresh" / "report" / "report.html").is_file()

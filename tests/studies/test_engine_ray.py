@@ -19,7 +19,7 @@ import ray
 from ray.cluster_utils import Cluster
 
 from esp_cli.library.run import Run
-from esp_cli.studies import versions
+from esp_cli.studies import engine_ray, versions
 from esp_cli.studies.engine_ray import RayEngine
 from esp_cli.studies.mirror import Mirror
 from esp_cli.studies.ray_cluster import ClusterError
@@ -203,6 +203,17 @@ def test_a_full_disk_of_the_driver_fails_a_run_that_the_same_command_finishes(
     assert workers() == []
     assert scheduled(folder, engine, lambda _: True, cells=[plain]).runs[0].status == "finished"
     assert same(folder, plain, alone[plain.name])
+
+
+def test_a_run_that_no_node_has_room_for_fails_at_once(
+    folder: StudyFolder, engine: RayEngine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_ray, "process_bytes", lambda config: 10**15)
+    runs = scheduled(folder, engine, lambda _: True).runs
+    assert [run.status for run in runs] == ["failed"] * 2
+    assert (
+        f"no node of the cluster offers what {runs[0].cell.name} needs (1 cores, 1e+06 GB of memory)" in runs[0].message
+    )
 
 
 def test_a_cluster_of_another_version_or_none_is_refused_in_one_sentence(

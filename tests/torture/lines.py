@@ -171,6 +171,7 @@ _NEEDED = {
     "reproduce": ["--dry-run"],
     "ablate": ["--dry-run"],
     "compare-homomorphic": ["--dry-run"],
+    "tune": ["--dry-run"],
     "train": ["--out", "out"],
 }
 _NAMES = (

@@ -48,3 +48,11 @@ def test_every_seed_counts():
     spec = build_environment(one, 1, "shape").spec
     needed = memory.least_bytes(one, settings, spec)
     assert memory.least_bytes(ten, settings, spec) == {name: 10 * size for name, size in needed.items()}
+
+
+def test_a_process_on_a_cluster_is_given_room_for_its_replay_and_its_libraries():
+    small, large = (resolve_config("navigation", "qmix", seeds=range(count)) for count in (1, 10))
+    settings = ALGORITHMS["qmix"].config_class(**small.algorithm_settings)
+    held = sum(memory.least_bytes(small, settings, build_environment(small, 1, "shape").spec).values())
+    assert memory.process_bytes(small) > 500e6 + held
+    assert memory.process_bytes(large) - memory.process_bytes(small) == 2 * 9 * held
