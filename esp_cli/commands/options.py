@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 import typer
 
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
-from esp_cli.files.documents import parse_value
 
 T = TypeVar("T")
 
@@ -27,6 +26,8 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
     Raises:
         ValueError: an item without "=" or without a name, or a name twice.
     """
+    from esp_cli.files.documents import parse_value  # pydantic comes with it, which no help needs
+
     settings: dict[str, object] = {}
     for item in items:
         name, equals, text = item.partition("=")

@@ -172,6 +172,15 @@ def test_colours_are_there_and_go_with_no_color() -> None:
         assert not COLOUR.search(on_terminal(*arguments, NO_COLOR="1"))
 
 
+def test_the_live_line_of_a_training_fits_the_terminal_and_says_what_matters(tmp_path: Path) -> None:
+    shown = on_terminal("train", *map(str, TINY_OPTIONS), "--steps", "2k", "--out", str(tmp_path / "run"))
+    lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", part).rstrip() for part in re.split(r"[\r\n]+", shown)]
+    live = [line for line in lines if "steps/s" in line]
+    assert live
+    assert too_wide(live) == []
+    assert re.search(r"navigation .*2k/2k  \S+ steps/s  0 s left  greedy -[\d.]+", live[-1])
+
+
 def test_long_output_goes_through_the_pager_on_a_terminal_and_short_output_does_not() -> None:
     pager = "sed s/^/PAGED/"
     assert "PAGED" in on_terminal("settings", "mappo", PAGER=pager)

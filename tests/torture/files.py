@@ -224,6 +224,8 @@ def _agrees(text: Any, taken: Any) -> bool:
         return all(_agrees(value, taken[key]) for key, value in text.items() if key in taken)
     if isinstance(text, list) and isinstance(taken, list):
         return len(text) == len(taken) and all(map(_agrees, text, taken))
+    if isinstance(taken, float) and isinstance(text, int) and not isinstance(text, bool):
+        text = float(text)  # an integer of many digits stands for the number that is nearest to it
     return isinstance(text, bool) == isinstance(taken, bool) and text == taken
 
 
