@@ -71,7 +71,7 @@ class Registry(Mapping[str, type[T]]):
         if entry := self._installed().get(name):
             try:
                 return self._checked(entry.load(), name)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise ValueError(
                     f"the installed {self.noun} '{name}' cannot be imported: {_last_line(error)}"
                 ) from error
@@ -109,7 +109,7 @@ class Registry(Mapping[str, type[T]]):
         invalidate_caches()  # the user may have written the file a moment ago
         try:
             module = import_module(module_name)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ValueError(
                 f"cannot import the module '{module_name}' of the {self.noun}: {_last_line(error)}"
             ) from error
@@ -140,7 +140,7 @@ def _load(target: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def _last_line(error: Exception) -> str:
+def _last_line(error: BaseException) -> str:
     """Return the last line of a traceback."""
     text = str(error).strip()
     return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+import esp_envs
 from esp_envs import BatchedTask, Environment, installed, make, register, registry, task_class, task_names
 from tests.own_tasks import save_page_files
 
@@ -50,6 +51,10 @@ def test_a_class_can_be_registered_itself(folder: Path) -> None:
     assert task_class(name) is navigation
 
 
+def test_every_public_name_can_be_imported() -> None:
+    assert all(hasattr(esp_envs, name) for name in esp_envs.__all__)
+
+
 def test_an_ordinary_name_needs_no_registration() -> None:
     assert register("navigation") == "navigation"
 
@@ -61,6 +66,7 @@ def test_an_ordinary_name_needs_no_registration() -> None:
             "import no_such_module\n",
             "cannot import the module 'mine' of the task: ModuleNotFoundError: No module",
         ),
+        ("raise SystemExit(3)\n", "cannot import the module 'mine' of the task: SystemExit: 3"),
         ("def f(:\n", "cannot import the module 'mine' of the task: SyntaxError: "),
         ("raise RuntimeError('first\\nlast')\n", "cannot import the module 'mine' of the task: RuntimeError: last"),
         ("Task = 3\n", "'mine:Task' is not a task; a task is a subclass of esp_envs.base.Environment"),
