@@ -108,7 +108,17 @@ def report(failure: Exception) -> int | None:
     if isinstance(failure, OSError) and failure.errno is not None:
         console.error(failures.sentence(failure))
         return EXIT_USER if failures.is_correctable(failure) else EXIT_MACHINE
-    return None
+    return _report_own_code(failure)
+
+
+def _report_own_code(failure: Exception) -> int | None:
+    """Print where code that the user brought along raised, and return the exit code; None where other code did."""
+    installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of others ran
+    place = None if installed is None else installed.raised_in(failure)
+    if installed is None or place is None:
+        return None
+    console.error(f"your code raises in {place}: {installed.last_line(failure)}; ESP_TRACEBACK=1 shows the traceback")
+    return EXIT_USER
 
 
 def _report_usage(failure: typer.TyperException) -> int:

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+_FOREIGN: set[str] = set()
+"""Top-level modules of the classes that are registered or installed."""
 
 _MODULE_AND_CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
@@ -56,6 +58,7 @@ class Registry(Mapping[str, type[T]]):
         else:
             name, cls = f"{given.__module__}:{given.__qualname__}", self._checked(given, given.__qualname__)
         self._registered[name] = cls
+        _FOREIGN.add(cls.__module__.partition(".")[0])
         return name
 
     def __getitem__(self, name: str) -> type[T]:
@@ -69,11 +72,12 @@ class Registry(Mapping[str, type[T]]):
         if name in self._built_in:
             return self._checked(_load(self._built_in[name]), name)
         if entry := self._installed().get(name):
+            _FOREIGN.add(entry.module.partition(".")[0])
             try:
                 return self._checked(entry.load(), name)
             except (Exception, SystemExit) as error:
                 raise ValueError(
-                    f"the installed {self.noun} '{name}' cannot be imported: {_last_line(error)}"
+                    f"the installed {self.noun} '{name}' cannot be imported: {last_line(error)}"
                 ) from error
         if _MODULE_AND_CLASS.fullmatch(name):
             raise ValueError(
@@ -111,7 +115,7 @@ class Registry(Mapping[str, type[T]]):
             module = import_module(module_name)
         except (Exception, SystemExit) as error:
             raise ValueError(
-                f"cannot import the module '{module_name}' of the {self.noun}: {_last_line(error)}"
+                f"cannot import the module '{module_name}' of the {self.noun}: {last_line(error)}"
             ) from error
         finally:
             sys.path.remove(here)
@@ -135,12 +139,24 @@ class Registry(Mapping[str, type[T]]):
         return cls
 
 
+def raised_in(failure: BaseException) -> str | None:
+    """Return where the code of a user raised: "'step' (mine.py, line 7)"; None where esp itself or a library did."""
+    place, trace = None, failure.__traceback__
+    while trace is not None:
+        frame = trace.tb_frame
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in _FOREIGN - {"esp_cli", "esp_envs"}:
+            code = frame.f_code
+            place = f"'{code.co_name}' ({Path(code.co_filename).name}, line {trace.tb_lineno})"
+        trace = trace.tb_next
+    return place
+
+
 def _load(target: str) -> Any:
     module, attribute = target.split(":")
     return getattr(import_module(module), attribute)
 
 
-def _last_line(error: BaseException) -> str:
+def last_line(error: BaseException) -> str:
     """Return the last line of a traceback."""
     text = str(error).strip()
     return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__

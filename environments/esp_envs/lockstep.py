@@ -109,6 +109,8 @@ class BatchedTask(LockstepTask):
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         self.spec = self._describe()
+        if not isinstance(self.spec, TaskSpec):
+            raise ValueError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
 
     @abstractmethod
@@ -170,6 +172,9 @@ class BatchedTask(LockstepTask):
 
     def _begin(self) -> None:
         drawn = [self._start(generator) for generator in self.generators]
+        for name, value in drawn[0].items():
+            if not isinstance(value, Tensor):
+                raise ValueError(f"'{name}' of what '_start' of {self.spec.name} drew is no tensor; give tensors")
         self.world = {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
         for field in self.spec.state.fields:
             found = self.world.get(field.name)
@@ -182,6 +187,7 @@ class BatchedTask(LockstepTask):
         reward, metrics = self._advance(self.world, self._admissible(action))
         if reward.dim() == 2:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
+        require_shape("reward", reward, self.action_shape[:3])
         metrics = {name: value.float().contiguous().clone() for name, value in metrics.items()}
         return reward.float().contiguous().clone(), metrics
 

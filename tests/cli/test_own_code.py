@@ -1,0 +1,98 @@
+"""Code of the user that fails: one sentence that names the line, exit code 2, and nothing of the run lost."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from esp_envs import installed
+from esp_envs.installed import raised_in
+from esp_envs.registry import TASKS
+from tests.cli.running import esp
+from tests.own_tasks import save_page_files
+
+SHORT = ["--steps", "200", "--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory of its own, whose modules are forgotten afterwards."""
+    save_page_files(tmp_path)
+    (tmp_path / "wrong.py").write_text(WRONG)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(TASKS, "_registered", {})
+    monkeypatch.setattr(installed, "_FOREIGN", set())
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if name in ("wrong", "rendezvous"):
+            del sys.modules[name]
+
+
+WRONG = """
+import torch
+from rendezvous import Rendezvous
+
+class Raises(Rendezvous):
+    steps = 0
+
+    def _advance(self, world, action):
+        Raises.steps += 1
+        if Raises.steps > 130:
+            raise KeyError("lost")
+        return super()._advance(world, action)
+
+class Builds(Rendezvous):
+    def __init__(self, *arguments):
+        raise RuntimeError("no simulator here")
+
+class Describes(Rendezvous):
+    def _describe(self):
+        return None
+
+class Starts(Rendezvous):
+    def _start(self, generator):
+        return {"position": 1}
+
+class Pays(Rendezvous):
+    def _advance(self, world, action):
+        reward, metrics = super()._advance(world, action)
+        return reward[..., :1], metrics
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Raises", "your code raises in '_advance' (wrong.py, line 11): KeyError: 'lost'"),
+        ("Builds", "your code raises in '__init__' (wrong.py, line 16): RuntimeError: no simulator here"),
+        ("Describes", "'_describe' of Describes returns None; return a TaskSpec"),
+        ("Starts", "'position' of what '_start' of rendezvous drew is no tensor; give tensors"),
+        ("Pays", "the reward has shape (1, 1, 3), expected"),
+    ],
+)
+def test_a_task_that_fails_is_answered_by_one_sentence(folder, name, sentence):
+    told = esp("train", "--task", f"wrong:{name}", *SHORT, "--out", "run", code=2).stderr
+    assert sentence in told.splitlines()[-1]
+
+
+def test_a_run_whose_task_raised_goes_on_from_its_checkpoint(folder):
+    """The task raises after 130 steps of all worlds; then, put right, it is trained to the end."""
+    options = ["--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2", "--set", "evaluation.every_steps=100"]
+    told = esp("train", "--task", "wrong:Raises", "--steps", 400, *options, "--out", "run", code=2).stderr
+    assert "'lost'" in told.splitlines()[-1]
+    kept = sorted(path.name for path in (folder / "run" / "checkpoints").glob("*.safetensors"))
+    assert kept
+    TASKS["wrong:Raises"].steps = -1000
+    esp("train", "--resume", "run", "--task", "wrong:Raises")
+    assert "after 400 steps" in esp("eval", "run", "--task", "wrong:Raises", "--episodes", 2).stdout
+
+
+def test_what_esp_itself_does_wrong_is_no_fault_of_the_users_code():
+    """Negative control: an error whose traceback has no line of the user's."""
+    with pytest.raises(KeyError) as caught:
+        {}["nothing"]
+    assert raised_in(caught.value) is None
