@@ -17,7 +17,7 @@ _NOT_PROSE = re.compile(
     r"^(```|~~~).*?^\1|^<!--.*?-->|^ {0,3}\|.*?$|^#.*?$|!?\[[^\]]*\]\([^)]*\)(?=\s*$)", re.MULTILINE | re.DOTALL
 )
 _AVOIDED = re.compile(
-    r"\b(whom|whoever|whomever|thereof|shall|contestants?|judgements?|both means|the box|the way there)\b",
+    r"\b(whom|whoever|whomever|thereof|shall|contestants?|judgements?|judged|both means|the box|the way there)\b",
     re.IGNORECASE,
 )
 
