@@ -177,6 +177,11 @@ def test_what_does_not_fit_is_refused_when_the_task_is_made(sentence: str) -> No
     assert str(caught.value) == sentence
 
 
+def test_what_a_class_does_not_say_is_named() -> None:
+    with pytest.raises(ValueError, match="the class Silent does not say its action, symmetry; set it in the class"):
+        worlds(type("Silent", (Walking,), {"action": None, "symmetry": None}))
+
+
 def test_an_agent_that_does_not_learn_needs_an_opponent() -> None:
     class Silent(Walking):
         opponent = ParallelTask.opponent

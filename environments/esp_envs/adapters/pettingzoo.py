@@ -32,6 +32,7 @@ from esp_envs.base import (
     Step,
     TaskSettings,
     generator_states,
+    require_attributes,
     require_shape,
     restore_generators,
 )
@@ -63,6 +64,7 @@ class ParallelTask(CopyHooks, Environment):
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
+        require_attributes(self, "observation", "action", "symmetry", "convention")
         one = Copy(self)
         agents = len(one.learners)
         self.spec = TaskSpec(

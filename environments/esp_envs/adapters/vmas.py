@@ -26,6 +26,7 @@ from esp_envs.base import (
     Step,
     TaskSettings,
     generator_states,
+    require_attributes,
     require_shape,
     restore_generators,
 )
@@ -84,6 +85,7 @@ class VmasTask(Environment):
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
+        require_attributes(self, "scenario", "symmetry", "convention")
         make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
         self._sims = [make() for _ in self.generators]
         self._dice = [simulation.Dice(generator.initial_seed()) for generator in self.generators]
