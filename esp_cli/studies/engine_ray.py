@@ -216,7 +216,8 @@ class RayJob:
             for name, part in mirror.outgoing():
                 self._ask(actor.put.remote(owner, name, part))
             environment = {name: os.environ[name] for name in _FORWARDED if name in os.environ}
-            self._ask(actor.begin.remote(owner, _moved(self._arguments, self._folder.path, lease), environment))
+            arguments = _moved(self._arguments, self._folder.path, lease)
+            mirror.know(self._ask(actor.begin.remote(owner, arguments, environment)))
         while True:
             reference = actor.look.remote(owner, mirror.log_offset, mirror.metrics_id, mirror.metrics_offset)
             news: News = self._ask(reference)

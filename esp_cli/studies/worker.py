@@ -99,6 +99,9 @@ class CellWorker:
         held = self._owner not in ("", owner) and time.monotonic() - self._heard < self._silence_s
         if not held:
             self._owner, self._heard = owner, time.monotonic()
+            if self._job is None:  # what a lost driver had sent so far
+                shutil.rmtree(self._run)
+                (self._run / CHECKPOINTS).mkdir(parents=True)
         return {
             "holder": self._owner if held else "",
             "begun": self._job is not None,
@@ -114,11 +117,15 @@ class CellWorker:
         with self._path(name).open("ab") as file:
             file.write(content)
 
-    def begin(self, owner: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
-        """Start the job."""
+    def begin(
+        self, owner: str, arguments: Sequence[str], environment: Mapping[str, str]
+    ) -> Mapping[str, tuple[int, int]]:
+        """Start the job; return size and time of the files that it begins with."""
         self._beat(owner)
         os.environ.update(environment)
+        files = self._files()
         self._job = self._engine.start(arguments, self._run / LOG)
+        return files
 
     def look(self, owner: str, log_offset: int, metrics_id: str, metrics_offset: int) -> News:
         """Return what is new.

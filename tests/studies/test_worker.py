@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -29,7 +30,7 @@ WRITES_AND_WAITS = (
 
 @pytest.fixture
 def worker(tmp_path):
-    made = CellWorker(30.0, 0.05, str(tmp_path), (sys.executable, "-S", "-c", WRITES_AND_WAITS))
+    made = CellWorker(600.0, 60.0, str(tmp_path), (sys.executable, "-S", "-c", WRITES_AND_WAITS))
     yield made
     made._clear()
 
@@ -69,10 +70,20 @@ def test_a_worker_has_one_driver_until_that_one_is_silent(worker):
     worker.put("first", "metrics.jsonl", b"")
     with pytest.raises(LeaseLostError):
         worker.put("second", "metrics.jsonl", b"")
-    time.sleep(0.1)
+    worker._heard -= 100.0  # seconds of silence
     assert worker.attach("second")["holder"] == ""
     with pytest.raises(LeaseLostError, match="second has taken over"):
         worker.stop("first")
+
+
+def test_who_takes_a_worker_over_before_its_job_begins_sends_all_files_anew(worker):
+    lease = worker.attach("first")
+    worker.put("first", "step-000000000100.safetensors", b"wei")
+    worker._heard -= 100.0  # seconds of silence
+    assert not worker.attach("second")["begun"]
+    worker.put("second", "step-000000000100.safetensors", b"wei")
+    worker.put("second", "step-000000000100.safetensors", b"ghts")
+    assert (Path(lease["folder"]) / "checkpoints" / "step-000000000100.safetensors").read_bytes() == b"weights"
 
 
 def test_a_worker_that_nobody_calls_ends_itself_and_its_job(tmp_path):
@@ -95,7 +106,10 @@ def test_a_folder_follows_the_one_of_the_worker(worker, folder):
     lease = worker.attach("me")
     for name, part in mirror.outgoing():
         worker.put("me", name, part)
-    worker.begin("me", ["train", lease["folder"]], {})
+    files = worker.begin("me", ["train", lease["folder"]], {})
+    assert mirror.wanted(files) == ["config.json"]
+    mirror.know(files)
+    assert mirror.wanted(files) == []
 
     def look():
         found = worker.look("me", mirror.log_offset, mirror.metrics_id, mirror.metrics_offset)
@@ -113,7 +127,7 @@ def test_a_folder_follows_the_one_of_the_worker(worker, folder):
     assert folder.policy_path.read_bytes() == b"policy"
     assert "hello" in (folder.path / "log.txt").read_text()
     # who takes over is told what the first has, and the log is not written twice
-    time.sleep(0.1)
+    worker._heard -= 100.0  # seconds of silence
     assert worker.attach("other")["log_offset"] == mirror.log_offset > 0
 
 
