@@ -90,12 +90,12 @@ def test_a_worker_that_nobody_calls_ends_itself_and_its_job(tmp_path):
     program = (sys.executable, "-S", "-c", "import time; time.sleep(60)")
     code = (
         "import time; from esp_cli.studies.worker import CellWorker\n"
-        f"worker = CellWorker(1.0, 0.1, {str(tmp_path)!r}, {program!r})\n"
+        f"worker = CellWorker(5.0, 1.0, {str(tmp_path)!r}, {program!r})\n"
         "worker.attach('me'); worker.begin('me', [], {}); print(worker._job.pid, flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
         job = int(process.stdout.readline())
-        assert process.wait(30) == 0
+        assert process.wait(120) == 0
     with pytest.raises(ProcessLookupError):
         os.kill(job, 0)
     assert list(tmp_path.iterdir()) == []
