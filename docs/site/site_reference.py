@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -83,14 +84,31 @@ def _written(value: object) -> str:
 
 
 def tasks() -> str:
-    """Return the page of task cards: the class docstring, the observation and the symmetries of every task."""
-    text = "# Tasks\n\nThese are the cards that `esp tasks NAME` prints.\n"
+    """Return the page of task cards: the class docstring and the symmetries of every task."""
+    text = (
+        "# Task cards\n\n`esp tasks NAME` prints these cards; [Settings](settings.md) has the settings of the tasks.\n"
+    )
     for name in task_names():
-        spec = make(name, 1, [0]).spec
-        text += f"\n## {name}\n\n~~~~~~ {{.text .card}}\n{inspect.cleandoc(task_class(name).__doc__ or '')}\n~~~~~~\n\n"
-        text += "\n".join(_table(("index", "field", "kind", "unit"), spec.observation.table()))
-        text += f"\nSymmetries: {', '.join(carried_groups(spec))}\n"
+        groups = ", ".join(f"`{group}`" for group in carried_groups(make(name, 1, [0]).spec))
+        text += f"\n## {name}\n\n{_card(inspect.cleandoc(task_class(name).__doc__ or ''))}\n\n**Carries:** {groups}\n"
     return text
+
+
+def _card(docstring: str) -> str:
+    """Return a card as Markdown: its labels in bold, its indented items as lists, its tables as they are."""
+    blocks = []
+    for block in re.split(r"\n\s*\n", docstring):
+        lines = block.splitlines()
+        if lines[0].lstrip().startswith("|"):
+            blocks.append("\n".join(line.strip() for line in lines))
+            continue
+        text = re.sub(r"^([A-Z][^:.`]{2,40}):", r"**\1:**", lines[0])
+        for line in lines[1:]:
+            item = re.match(r" {4}(?! )([^:]{2,45}):", line)
+            start = "\n- " if "\n- " in text else "\n\n- "
+            text += f"{start if item else ' '}{line.strip()}"
+        blocks.append(text)
+    return "\n\n".join(blocks)
 
 
 def _table(header: tuple[str, ...], rows: Iterable[Iterable[object]]) -> Iterator[str]:
