@@ -80,11 +80,13 @@ class SeedAdam:
 
     def gradient(self, loss: Tensor) -> Tensor:
         """Return the gradients [S, P] of the losses [S] of all seeds."""
+        return self.gradient_through([loss], [torch.ones_like(loss)])
+
+    def gradient_through(self, outputs: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
+        """Return the gradients [S, P] of losses whose gradients by some outputs of the networks are known."""
         parameters = self.parameters.parameters
-        gradients = torch.autograd.grad(
-            loss, parameters, torch.ones_like(loss), allow_unused=True, materialize_grads=True
-        )
-        return self.parameters.flat(gradients)
+        found = torch.autograd.grad(outputs, parameters, gradients, allow_unused=True, materialize_grads=True)
+        return self.parameters.flat(found)
 
     @torch.no_grad()
     def step(self, gradient: Tensor) -> list[Tensor]:

@@ -1,7 +1,6 @@
-"""MAPPO's losses for discrete actions with gradients worked out by hand: some fifty operations instead of some 250.
+"""The gradient of MAPPO's losses by what the networks say, for discrete actions: a fifth of autograd's operations.
 
-`Mappo.reference_loss` under autograd says the same in the terms of the paper; tests hold both together. A loss is
-computed together with its gradient, since each is a sum over rows of what both need.
+`Mappo.reference_loss` says in the terms of the paper what these are the gradients of; tests hold both together.
 
 Shape letters: S seeds, K copies of every row, R rows (of all agents, or of worlds) without copies, A actions.
 """
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Protocol
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
@@ -79,11 +77,12 @@ def weights_of(config: Settings, entropy_coef: float, prior: PriorConfig, augmen
 
 
 def carries(transforms: Sequence[Transform]) -> bool:
-    """Return whether `policy_loss` can pull back the logits of copies: where agents stay, and actions are discrete."""
+    """Return whether `policy_gradient` can pull logits back: where agents stay, and actions are discrete."""
     return all(g.agents is None and isinstance(g.output_map, Gather) for g in transforms)
 
 
-def policy_loss(
+@torch.no_grad()
+def policy_gradient(
     logits: Tensor,
     transforms: Sequence[Transform],
     action: Tensor,
@@ -91,7 +90,7 @@ def policy_loss(
     advantage: Tensor,
     weights: Weights,
 ) -> Tensor:
-    """Return the negative of J_pi + entropy - c S_pi (Eq. 3, 7, 8) per seed: [S].
+    """Return the gradient, by the logits, of the negative of J_pi + entropy - c S_pi (Eq. 3, 7, 8): as `logits`.
 
     Args:
         logits: [S, (1 + K) B, N, T, A] of the originals and, behind them, of their copies, not pulled back.
@@ -101,108 +100,77 @@ def policy_loss(
         advantage: [S, B, T, N].
         weights: of the terms.
     """
-    rows = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
     maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
-    return _PolicyLoss.apply(  # type: ignore[no-untyped-call]
-        logits.flatten(1, 3), maps, *rows, weights
-    )
+    action, old_log_prob, advantage = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
+    parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1)).unbind(2)
+    pulled = _reordered(parts, [m.back for m in maps])
+    log_prob = torch.log_softmax(torch.stack(pulled, 1), 2)  # [S, 1 + K, A, R]
+    prob = log_prob.exp()
+    gradient = _objective_gradient(log_prob, prob, action, old_log_prob, advantage, weights)
+    if weights.policy_gap and maps:
+        _add_divergence(gradient, log_prob, prob, weights)
+    by_logits = torch._log_softmax_backward_data(gradient, log_prob, 2, gradient.dtype)
+    back = torch.stack(_reordered(by_logits.unbind(1), [m.source for m in maps]), 2)
+    return back.flatten(2).transpose(1, 2).view(logits.shape)
 
 
-def critic_loss(values: Tensor, target: Tensor, weights: Weights) -> Tensor:
-    """Return the weighted Huber loss + c S_V (Eq. 4, 9) per seed: [S].
+def _objective_gradient(
+    log_prob: Tensor, prob: Tensor, action: Tensor, old_log_prob: Tensor, advantage: Tensor, weights: Weights
+) -> Tensor:
+    """Return the gradient of -(J_pi + entropy) by the log-probabilities [S, 1 + K, A, R]; rows [S, R] of originals.
+
+    What is the same for all actions is left out, as the 1 in the entropy's (log p + 1) p: the gradient by the logits
+    does not depend on it.
+    """
+    if not weights.augments and log_prob.shape[1] > 1:
+        own = _objective_gradient(log_prob[:, :1], prob[:, :1], action, old_log_prob, advantage, weights)
+        return torch.cat([own, torch.zeros_like(log_prob[:, 1:])], 1)
+    share = 1.0 / (log_prob.shape[1] * log_prob.shape[3])
+    taken, advantage = action[:, None, None].expand(-1, log_prob.shape[1], 1, -1), advantage[:, None, None]
+    ratio = (log_prob.gather(2, taken) - old_log_prob[:, None, None]).exp_()
+    gain = ratio * advantage
+    bound = ratio.clamp_(1 - weights.clip_epsilon, 1 + weights.clip_epsilon).mul_(advantage)
+    slope = gain.masked_fill_(gain > bound, 0.0)  # of the objective by log pi: rho A, or 0 where it is clipped
+    gradient = (log_prob * prob).mul_(weights.entropy_coef * share)
+    return gradient.scatter_add_(2, taken, slope.mul_(-share))
+
+
+def _add_divergence(gradient: Tensor, log_prob: Tensor, prob: Tensor, weights: Weights) -> None:
+    """Add the gradient of c KL[copy || original], averaged over copies and rows."""
+    weight = weights.policy_gap / ((log_prob.shape[1] - 1) * log_prob.shape[3])
+    moved = prob[:, 1:]
+    if weights.stop_gradient != "transformed":
+        gradient[:, 1:].addcmul_(log_prob[:, 1:] - log_prob[:, :1], moved, value=weight)
+    if weights.stop_gradient != "original":
+        gradient[:, :1].sub_(moved if moved.shape[1] == 1 else moved.sum(1, keepdim=True), alpha=weight)
+
+
+@torch.no_grad()
+def critic_gradient(values: Tensor, target: Tensor, weights: Weights) -> Tensor:
+    """Return the gradient, by the values, of the weighted Huber loss + c S_V (Eq. 4, 9): as `values`.
 
     Args:
         values: [S, (1 + K) B, T, C] of the originals and, behind them, of their copies.
         target: [S, B, T, C].
         weights: of the terms.
     """
-    by_part = values.reshape(values.shape[0], values.shape[1] // target.shape[1], -1)
-    return _CriticLoss.apply(by_part, target.flatten(1), weights)  # type: ignore[no-untyped-call]
+    parts = values.unflatten(1, (-1, target.shape[1]))
+    learned = parts if weights.augments else parts[:, :1]
+    gradient = (learned - target.unsqueeze(1)).clamp_(-weights.huber_delta, weights.huber_delta)
+    gradient.mul_(weights.value_coef * values.shape[0] / learned.numel())
+    if learned.shape[1] < parts.shape[1]:
+        gradient = torch.cat([gradient, torch.zeros_like(parts[:, 1:])], 1)
+    if weights.value_gap and parts.shape[1] > 1:
+        gap = parts[:, 1:] - parts[:, :1]
+        weight = 2 * weights.value_gap * values.shape[0] / gap.numel()
+        if weights.stop_gradient != "transformed":
+            gradient[:, 1:].add_(gap, alpha=weight)
+        if weights.stop_gradient != "original":
+            gradient[:, :1].sub_(gap if gap.shape[1] == 1 else gap.sum(1, keepdim=True), alpha=weight)
+    return gradient.view(values.shape)
 
 
-def _by_part(x: Tensor, num_parts: int) -> list[Tensor]:
-    """Cut [S, A, (1 + K) R] into 1 + K parts [S, A, R]; views."""
-    return list(x.unflatten(2, (num_parts, -1)).unbind(2))
-
-
-def _reordered(parts: list[Tensor], orders: Sequence[Tensor]) -> list[Tensor]:
-    """Give the actions of every copy another order [S or 1, A]; the originals' stays."""
+def _reordered(parts: Sequence[Tensor], orders: Sequence[Tensor]) -> list[Tensor]:
+    """Give the actions of every copy [S, A, R] another order [S or 1, A]; the originals', the first part, stays."""
     here, *copies = parts
     return [here, *(x.gather(1, order.unsqueeze(2).expand(x.shape)) for x, order in zip(copies, orders, strict=True))]
-
-
-class _PolicyLoss(Function):
-    @staticmethod
-    def forward(ctx, logits, maps, action, old_log_prob, advantage, weights):  # type: ignore[no-untyped-def]
-        parts = _by_part(logits.transpose(1, 2), 1 + len(maps))
-        log_prob = torch.log_softmax(torch.stack(_reordered(parts, [m.back for m in maps]), 1), 2)  # [S, 1 + K, A, R]
-        prob = log_prob.exp()
-        num_learned = len(parts) if weights.augments else 1
-        share = 1.0 / (num_learned * action.shape[1])
-        learned, taken = log_prob[:, :num_learned], action[:, None, None].expand(-1, num_learned, 1, -1)
-        advantage = advantage.unsqueeze(1)
-
-        ratio = (learned.gather(2, taken).squeeze(2) - old_log_prob.unsqueeze(1)).exp_()
-        gain = ratio * advantage
-        bound = ratio.clamp_(1 - weights.clip_epsilon, 1 + weights.clip_epsilon).mul_(advantage)
-        objective = torch.minimum(gain, bound).sum((1, 2))
-        slope = gain.masked_fill_(gain > bound, 0.0)  # of the objective by log pi: rho A, or 0 where it is clipped
-
-        # By the logits: log_softmax's backward takes away what is the same for all actions, as the 1 in (log p + 1) p.
-        surprise = learned * prob[:, :num_learned]
-        loss = (surprise.sum((1, 2, 3)) * weights.entropy_coef - objective) * share
-        grad = torch.zeros_like(log_prob)
-        torch.mul(surprise, weights.entropy_coef * share, out=grad[:, :num_learned])
-        grad[:, :num_learned].scatter_add_(2, taken, slope.mul_(-share).unsqueeze(2))
-        if weights.policy_gap and maps:
-            loss += _add_divergence(grad, log_prob, prob, weights)
-        ctx.save_for_backward(grad, log_prob)
-        ctx.maps = maps
-        return loss
-
-    @staticmethod
-    def backward(ctx, upstream):  # type: ignore[no-untyped-def]
-        grad, log_prob = ctx.saved_tensors
-        by_logits = torch._log_softmax_backward_data(grad, log_prob, 2, grad.dtype)
-        parts = by_logits.mul_(upstream.view(-1, 1, 1, 1)).unbind(1)
-        back = torch.stack(_reordered(list(parts), [m.source for m in ctx.maps]), 2)
-        return back.flatten(2).transpose(1, 2), None, None, None, None, None
-
-
-def _add_divergence(grad: Tensor, log_prob: Tensor, prob: Tensor, weights: Weights) -> Tensor:
-    """Add the gradient of c KL[copy || original] to `grad`, and return c KL, averaged over copies and rows: [S]."""
-    weight = weights.policy_gap / ((log_prob.shape[1] - 1) * log_prob.shape[3])
-    moved = prob[:, 1:]
-    divergence = (log_prob[:, 1:] - log_prob[:, :1]).mul_(moved)
-    if weights.stop_gradient != "transformed":
-        grad[:, 1:].add_(divergence, alpha=weight)
-    if weights.stop_gradient != "original":
-        grad[:, :1].sub_(moved.sum(1, keepdim=True), alpha=weight)
-    return divergence.sum((1, 2, 3)) * weight
-
-
-class _CriticLoss(Function):
-    @staticmethod
-    def forward(ctx, values, target, weights):  # type: ignore[no-untyped-def]
-        num_learned = values.shape[1] if weights.augments else 1
-        share = weights.value_coef / (num_learned * values.shape[2])
-        error = values[:, :num_learned] - target.unsqueeze(1)
-        inner = error.clamp(-weights.huber_delta, weights.huber_delta)
-        loss = error.sub_(inner, alpha=0.5).mul_(inner).sum((1, 2)) * share
-        grad = torch.zeros_like(values)
-        torch.mul(inner, share, out=grad[:, :num_learned])
-        if weights.value_gap and values.shape[1] > 1:
-            weight = weights.value_gap / ((values.shape[1] - 1) * values.shape[2])
-            gap = values[:, 1:] - values[:, :1]
-            loss += gap.square().sum((1, 2)) * weight
-            if weights.stop_gradient != "transformed":
-                grad[:, 1:].add_(gap, alpha=2 * weight)
-            if weights.stop_gradient != "original":
-                grad[:, :1].sub_(gap.sum(1, keepdim=True), alpha=2 * weight)
-        ctx.save_for_backward(grad)
-        return loss
-
-    @staticmethod
-    def backward(ctx, upstream):  # type: ignore[no-untyped-def]
-        (grad,) = ctx.saved_tensors
-        return grad * upstream.view(-1, 1, 1), None, None

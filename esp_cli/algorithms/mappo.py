@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
-from esp_cli.algorithms.closed_form import carries, critic_loss, policy_loss, weights_of
+from esp_cli.algorithms.closed_form import carries, critic_gradient, policy_gradient, weights_of
 from esp_cli.algorithms.learner import Iteration, Learner
 from esp_cli.algorithms.losses import (
     clipped_surrogate,
@@ -212,16 +212,19 @@ class Mappo(Learner):
         gradients = []
         for chunk in copies.chunks(size):
             weight = chunk.originals.count / total
-            loss_of = self._loss if self._closed_form and carries(chunk.transforms) else self.reference_loss
-            gradients.append(self.optimiser.gradient(loss_of(chunk, entropy_coef, weight, sums)).mul_(weight))
+            if self._closed_form and carries(chunk.transforms):
+                gradient = self._closed_form_gradient(chunk, entropy_coef, weight, sums)
+            else:
+                gradient = self.optimiser.gradient(self.reference_loss(chunk, entropy_coef, weight, sums))
+            gradients.append(gradient if weight == 1 else gradient.mul_(weight))
         actor_norm, critic_norm = self.optimiser.step(sum(gradients[1:], start=gradients[0]))
         if sums is not None:
             _add(sums, 1.0, actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
 
-    def _loss(
+    def _closed_form_gradient(
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
     ) -> Tensor:
-        """Return what `reference_loss` returns, by fewer operations."""
+        """Return the gradient [S, P] of `reference_loss`, by fewer operations."""
         config, batch = self.config, copies.originals
         logits = self.policy.rows(copies.obs, config.truncation)
         state = copies.state if self.critic.reads == "state" else batch.state
@@ -230,8 +233,9 @@ class Mappo(Learner):
             outputs = self.policy.head.normalise(copies.original(logits.detach()).transpose(2, 3))
             self._watch(batch, outputs, copies.original(values.detach()), weight, sums)
         weights = weights_of(config, entropy_coef, self.prior.config, copies.augments)
-        loss = policy_loss(logits, copies.transforms, batch.action, batch.log_prob, batch.advantage, weights)
-        return loss + critic_loss(values, batch.target, weights)
+        by_logits = policy_gradient(logits, copies.transforms, batch.action, batch.log_prob, batch.advantage, weights)
+        by_values = critic_gradient(values, batch.target, weights)
+        return self.optimiser.gradient_through((logits, values), (by_logits, by_values))
 
     def reference_loss(
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None

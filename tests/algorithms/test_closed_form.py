@@ -1,4 +1,4 @@
-"""The losses with gradients worked out by hand against the same losses in the terms of the paper, under autograd."""
+"""Gradients worked out by hand against those of the same losses in the terms of the paper, under autograd."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from esp_cli.algorithms import closed_form
-from esp_cli.algorithms.closed_form import Weights, carries, critic_loss, policy_loss
+from esp_cli.algorithms.closed_form import Weights, carries, critic_gradient, policy_gradient
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
@@ -39,7 +39,7 @@ def weights(**changes):
 
 
 def gradients(trained, reference):
-    """Return the loss and the gradients of a minibatch, by the closed form or by the reference.
+    """Return the gradients of actor and critic on a minibatch, by the closed form or by the reference.
 
     The networks are far from their first weights, where the policy is uniform and the entropy has no gradient.
     """
@@ -50,9 +50,12 @@ def gradients(trained, reference):
     batch, _ = trained.prepare(trained.collector.collect(25))
     copies = trained.prior.copies(trained._minibatches(batch)[0], trained.generators["prior"])
     assert carries(copies.transforms)
-    loss = (trained.reference_loss if reference else trained._loss)(copies, 0.01, 1.0, None)
-    gradient, size = trained.optimiser.gradient(loss), sum(p[0].numel() for p in trained.policy.parameters())
-    return loss.detach(), gradient[:, :size], gradient[:, size:]
+    if reference:
+        gradient = trained.optimiser.gradient(trained.reference_loss(copies, 0.01, 1.0, None))
+    else:
+        gradient = trained._closed_form_gradient(copies, 0.01, 1.0, None)
+    size = sum(p[0].numel() for p in trained.policy.parameters())
+    return gradient[:, :size], gradient[:, size:]
 
 
 def gap(ours, theirs):
@@ -77,18 +80,17 @@ CHOICES = [
 
 @pytest.mark.parametrize("choice", CHOICES)
 def test_the_closed_form_is_the_reference_to_rounding(choice):
-    loss, *ours = gradients(learner(**choice), reference=False)
-    expected_loss, *theirs = gradients(learner(**choice), reference=True)
-    torch.testing.assert_close(loss, expected_loss, rtol=1e-4, atol=1e-5)
+    ours = gradients(learner(**choice), reference=False)
+    theirs = gradients(learner(**choice), reference=True)
     assert max(map(gap, ours, theirs)) < 1e-4
 
 
 @pytest.mark.parametrize("change", ["entropy_coef", "policy_gap", "value_gap", "value_coef", "augments"])
 def test_each_term_of_the_closed_form_moves_the_gradient(change, monkeypatch):
     """The negative control of the comparison above."""
-    _, *theirs = gradients(learner(), reference=True)
+    theirs = gradients(learner(), reference=True)
     monkeypatch.setattr("esp_cli.algorithms.closed_form.Weights", lambda **k: Weights(**k | {change: k[change] * 0}))
-    _, *ours = gradients(learner(), reference=False)
+    ours = gradients(learner(), reference=False)
     assert max(map(gap, ours, theirs)) > 3e-3
 
 
@@ -98,37 +100,37 @@ def test_each_term_of_the_closed_form_moves_the_gradient(change, monkeypatch):
     [(1.0, 0.5, 1.0), (1.0, 0.25, 0.0), (1.0, 1.0, 0.5), (-1.0, 0.25, -2.0), (-1.0, 1.0, 0.0)],
 )
 def test_the_clipped_objective_by_hand(advantage, old, slope):
-    logits = torch.zeros(1, 1, 1, 1, 2, requires_grad=True)
     old, advantage = (torch.full((1, 1, 1, 1), number) for number in (old, advantage))
     action = torch.zeros(1, 1, 1, 1, dtype=torch.int64)
-    loss = policy_loss(logits, [], action, old.log(), advantage, weights())
-    ratio = 0.5 / old
-    torch.testing.assert_close(-loss, torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).view(1))
-    (grad,) = torch.autograd.grad(loss.sum(), logits)
-    # d log pi_0 / d logits = (1 - 1/2, -1/2)
-    torch.testing.assert_close(grad.flatten(), torch.tensor([-slope / 2, slope / 2]))
+    gradient = policy_gradient(torch.zeros(1, 1, 1, 1, 2), [], action, old.log(), advantage, weights())
+    # d log pi_0 / d logits = (1 - 1/2, -1/2), and the loss is minus the objective
+    torch.testing.assert_close(gradient.flatten(), torch.tensor([-slope / 2, slope / 2]))
 
 
-def test_the_copies_of_a_policy_that_turns_with_the_world_have_no_divergence_and_others_have():
+def test_the_copies_of_a_policy_that_turns_with_the_world_are_left_alone_and_others_are_drawn_to_it():
     (turn,) = transform_set("rot90", SPACES).each()
     here = torch.tensor([0.5, 0.25, 0.125, 0.125]).log()
     ahead = turn.push_outputs(here.view(1, 1, 1, 4)).view(4)
     none = torch.zeros(1, 1, 1, 1)
-    # pulled back, the copy says 1/4, 1/8, 1/8, 1/2: its divergence is (-1/4 - 1/8 + 1) log 2
-    for there, gap in ((ahead, 0.0), (here, 0.625 * math.log(2))):
+    for there in (ahead, here):
         logits = torch.stack([here, there]).view(1, 2, 1, 1, 4)
-        loss = policy_loss(logits, [turn], none.long(), here[:1].view(1, 1, 1, 1), none, weights(policy_gap=1.0))
-        assert loss.item() == pytest.approx(gap, abs=1e-6)
+        ours = policy_gradient(logits, [turn], none.long(), none, none, weights(policy_gap=1.0)).view(2, 4)
+        original, copy = (x.clone().requires_grad_() for x in (here, there))
+        p, q = turn.pull_back(copy.view(1, 1, 1, 4)).view(4).log_softmax(0), original.log_softmax(0)
+        divergence = (p.exp() * (p - q)).sum()
+        expected = torch.autograd.grad(divergence, (original, copy))
+        torch.testing.assert_close(ours, torch.stack(expected), atol=1e-6, rtol=1e-5)
+        # pulled back, the copy that does not turn says 1/4, 1/8, 1/8, 1/2
+        assert divergence.item() == pytest.approx(0.0 if there is ahead else 0.625 * math.log(2), abs=1e-6)
+        assert (ours.abs().max() > 0.1) == (there is here)
 
 
-def test_the_critics_loss_by_hand():
-    values = torch.tensor([1.0, 2.0, 1.0, 4.0]).view(1, 4, 1, 1).requires_grad_()
+def test_the_critics_gradient_by_hand():
+    values = torch.tensor([1.0, 2.0, 1.0, 4.0]).view(1, 4, 1, 1)
     target = torch.tensor([0.0, 2.0]).view(1, 2, 1, 1)
-    loss = critic_loss(values, target, weights(huber_delta=1.0, value_gap=0.5))
-    # Huber: 1/2, 0 of the originals, 1/2, 2 - 1/2 of the copies; gaps 0 and 2
-    assert loss.item() == pytest.approx(2.5 / 4 + 0.5 * 4 / 2)
-    (grad,) = torch.autograd.grad(loss.sum(), values)
-    assert grad.flatten().tolist() == [0.25, -1.0, 0.25, 0.25 + 1.0]
+    # errors 1, 0 of the originals, 1, 2 of the copies, cut at 1, over four rows; gaps 0 and 2 over two rows
+    gradient = critic_gradient(values, target, weights(huber_delta=1.0, value_gap=0.5))
+    assert gradient.flatten().tolist() == [0.25, -1.0, 0.25, 0.25 + 1.0]
 
 
 def test_copies_whose_agents_change_places_take_the_reference():
@@ -139,7 +141,7 @@ def test_copies_whose_agents_change_places_take_the_reference():
 def test_default_training_takes_the_closed_form_and_clipped_values_do_not(monkeypatch):
     calls = []
     monkeypatch.setattr(
-        "esp_cli.algorithms.mappo.policy_loss", lambda *a: calls.append(1) or closed_form.policy_loss(*a)
+        "esp_cli.algorithms.mappo.policy_gradient", lambda *a: calls.append(1) or closed_form.policy_gradient(*a)
     )
     learner(mappo__clip_value=True).iterate(0.0)
     assert not calls
