@@ -49,8 +49,8 @@ def connect(address: str | None) -> None:
     except (OSError, RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
         raise ClusterError(
-            f"cannot use the Ray cluster at {address or 'RAY_ADDRESS'} ({reason}); check --address, and that the "
-            "nodes have the same versions of Ray and Python"
+            f"cannot use the Ray cluster at {address or 'RAY_ADDRESS'} ({reason}); check --address, "
+            "RAY_AUTH_MODE, and that the nodes have the same versions of Ray and Python"
         ) from None
     try:
         _refuse_other_versions()
@@ -87,8 +87,11 @@ def _knock(address: str) -> None:
 
     Raises:
         OSError: nobody answers.
+        ValueError: it is that of a server for Ray's client.
     """
-    host, colon, port = address.rpartition("://")[2].rpartition(":")
+    if address.startswith("ray://"):
+        raise ValueError("the driver has to be a machine of the cluster; Ray's client is not supported")
+    host, colon, port = address.rpartition(":")
     if colon and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
 

@@ -222,5 +222,8 @@ def test_a_cluster_of_another_version_or_none_is_refused_in_one_sentence(
     with pytest.raises(ValueError, match=r"the node .* has torch .*, but this machine has 0.1; install"):
         RayEngine(folder.path, cluster.address)
     assert not ray.is_initialized()
-    with pytest.raises(ClusterError, match=r"cannot use the Ray cluster at 127.0.0.1:1 \(.*\); check --address"):
-        RayEngine(folder.path, "127.0.0.1:1")
+    for address, reason in (("127.0.0.1:1", "refused"), ("ray://127.0.0.1:1", "client is not supported")):
+        with pytest.raises(
+            ClusterError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
+        ):
+            RayEngine(folder.path, address)
