@@ -9,7 +9,8 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from esp_cli import __version__
-from esp_cli.evaluation.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
+from esp_cli.evaluation.spread import EpisodeSpread, spread_over_episodes
+from esp_cli.evaluation.statistics import SeedSummary, summarise
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import (

@@ -67,33 +67,6 @@ def summarise(values: ArrayLike) -> SeedSummary:
     return SeedSummary(mean, sem, bootstrap_interval(good) if good.size else None, per_seed)
 
 
-@dataclass(frozen=True)
-class EpisodeSpread:
-    """How far the mean return of one policy can be trusted, by its episodes; other seeds are another question.
-
-    Attributes:
-        sem: standard error of the mean over episodes; None for one episode.
-        ci95: 95 % interval of the mean over episodes; None for one episode, or where all episodes are alike.
-    """
-
-    sem: float | None
-    ci95: Interval | None
-
-
-MOST_RESAMPLED = 512
-"""More numbers than this have the interval of the normal distribution, from which the bootstrap's hardly differs."""
-
-
-def spread_over_episodes(returns: ArrayLike) -> EpisodeSpread:
-    """Return standard error and 95 % interval of the mean over the episodes of one policy."""
-    sample = _sample(returns)
-    mean, sem = mean_and_sem(sample)
-    if sem is None or sample.size <= MOST_RESAMPLED:
-        return EpisodeSpread(sem, None if sem is None else bootstrap_interval(sample))
-    reach = float(stats.norm.ppf((1 + CONFIDENCE) / 2)) * sem
-    return EpisodeSpread(sem, (mean - reach, mean + reach))
-
-
 def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
     """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed.
 

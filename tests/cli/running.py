@@ -117,7 +117,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a device nobody has": (lambda run: edit_config(run, device="tpu"), "bad value 'tpu' for 'config.device'"),
     "a key nobody knows": (lambda run: edit_config(run, colour="red"), "unknown setting 'config.colour'"),
     "a task nobody has": (lambda run: edit_config(run, task="chess"), "unknown task 'chess'"),
-    "an algorithm nobody has": (lambda run: edit_config(run, algorithm="magic"), "was trained by 'magic'"),
+    "an algorithm nobody has": (lambda run: edit_config(run, algorithm="magic"), "unknown algorithm 'magic'"),
     "task settings of another": (
         lambda run: edit_config(run, task_settings={"wind": 1}),
         "unknown setting 'task.wind'",

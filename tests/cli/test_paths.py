@@ -57,7 +57,9 @@ def test_a_link_given_to_json_is_followed_and_kept(tmp_path: Path) -> None:
         ("/proc/no/such", "no such file or directory"),
     ],
 )
-@pytest.mark.parametrize("command", [("tasks", "navigation", "--json"), ("eval", "navigation", "-e", "2", "--json")])
+@pytest.mark.parametrize(
+    "command", [("tasks", "navigation", "--json"), ("eval", "navigation-mappo-esp", "-e", "2", "--json")]
+)
 def test_a_place_that_cannot_be_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], place: str, reason: str
 ) -> None:

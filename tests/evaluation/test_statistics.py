@@ -10,9 +10,8 @@ import pytest
 from scipy import stats
 
 from esp_cli.evaluation.curve_statistics import StepsToThreshold, area_under_curve, curve_band, steps_to_threshold
+from esp_cli.evaluation.spread import MOST_RESAMPLED, EpisodeSpread, spread_over_episodes
 from esp_cli.evaluation.statistics import (
-    MOST_RESAMPLED,
-    EpisodeSpread,
     Estimate,
     aggregate,
     bootstrap_interval,
@@ -21,7 +20,6 @@ from esp_cli.evaluation.statistics import (
     mean_and_sem,
     normalise,
     probability_of_improvement,
-    spread_over_episodes,
 )
 
 TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]
