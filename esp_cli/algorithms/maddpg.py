@@ -123,7 +123,8 @@ class Maddpg(OffPolicyLearner):
         rows, batch = copies.rows, copies.batch
         outputs = self._outputs(rows)
         lead = (copies.originals.count, *outputs.shape[2:])
-        noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]]).to(self.device)
+        noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]])
+        noise = noise.to(self.device, non_blocking=True)
         learned = copies.learned(outputs)
         self.critic.requires_grad_(False)
         value = self._value_of_policy(copies.learned(seen)[:, :, :-1], learned, copies.repeated(noise), batch)

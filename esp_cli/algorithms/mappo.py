@@ -198,7 +198,8 @@ class Mappo(Learner):
         count, parts = batch.obs.shape[1], self.config.num_minibatches
         if parts == 1:
             return [batch]
-        order = torch.stack([torch.randperm(count, generator=g) for g in self.generators["learner"]]).to(self.device)
+        order = torch.stack([torch.randperm(count, generator=g) for g in self.generators["learner"]])
+        order = order.to(self.device, non_blocking=True)
         size = count // parts
         return batch.select(order[:, : parts * size]).chunks(size)
 

@@ -112,7 +112,7 @@ class EpisodeReplay:
     def sample(self, count: int, generators: list[torch.Generator]) -> EpisodeBatch:
         """Draw `count` episodes per seed, uniformly and with replacement, each seed by its own generator."""
         places = [torch.randint(self.size, (count,), generator=g) for g in generators]
-        return self.select(torch.stack(places).to(self._store.obs.device))
+        return self.select(torch.stack(places).to(self._store.obs.device, non_blocking=True))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the filled part and the cursor."""
