@@ -131,6 +131,7 @@ def _panels(material: Material) -> list[Panel]:
             lines |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
         if found:
             title = cells[0].config.task if entries[cells[0].name].at is not None else name
+            title = title.rpartition(":")[2]  # of a task of the caller, the class
             curves = [Curve(cell.variant, c.steps, c.values) for cell, c in zip(cells, found, strict=True)]
             panels.setdefault(tuple(map(id, found)), Panel(title, curves, lines))
     return list(panels.values())
