@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -114,6 +115,8 @@ def test_a_study_hands_the_task_to_its_workers(folder: Path) -> None:
     ]
     esp(folder, *words, *SHORT)
     assert "found nothing" not in esp(folder, "report", "study", "--task", TASK).stdout
+    page = (folder / "study" / "report" / "report.html").read_text(encoding="utf-8")
+    assert re.search(r">\s*Rendezvous, MAPPO", page), "a chart is titled by the class"
     assert esp(folder, "report", "study", code=2).stderr.count("add --task") == 1
 
 
