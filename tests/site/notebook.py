@@ -19,9 +19,12 @@ def executed(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.Notebook
     Raises:
         nbclient.exceptions.CellExecutionError: a cell fails.
     """
-    os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    client = NotebookClient(notebook, timeout=400, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
-    done = client.execute()
+    # tests draw without a window; a notebook shows what it draws
+    env = os.environ | {"MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    env["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{env['PATH']}"
+    patience = {"timeout": 400, "startup_timeout": 300}
+    client = NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}, **patience)
+    done = client.execute(env=env)
     for cell in done.cells:
         cell.metadata.pop("execution", None)  # times of day
         for output in cell.get("outputs", []):
