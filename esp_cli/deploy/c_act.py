@@ -15,8 +15,11 @@ def seen(program: Program) -> str:
 def signature(program: Program) -> str:
     """Return the declaration of the function, without a semicolon."""
     parameters = [f"const float observation[{seen(program)}]"]
+    if program.masked:
+        agents = "ESP_POLICY_AGENTS * " if program.team > 1 else ""
+        parameters.append(f"const unsigned char allowed[{agents}ESP_POLICY_ACTION]")
     if program.team > 1:
-        return f"void esp_policy_act({parameters[0]}, int action[ESP_POLICY_AGENTS])"
+        return f"void esp_policy_act({', '.join(parameters)}, int action[ESP_POLICY_AGENTS])"
     parameters += ["float memory[ESP_POLICY_MEMORY]"] if program.memory_width else []
     parameters += ["float action[ESP_POLICY_ACTION]"] if program.head == "squash" else []
     return f"{'int' if program.head == 'choose' else 'void'} esp_policy_act({', '.join(parameters)})"
@@ -39,7 +42,8 @@ def act_function(program: Program) -> str:
     lines.append(f"    last = {row.name};")
     if row.team:
         variables = "    int i;\n"
-        lines.append(row.each(f"action[i] = choose({row.here});"))
+        allowed = ", allowed + i * ESP_POLICY_ACTION" if program.masked else ""
+        lines.append(row.each(f"action[i] = choose({row.here}{allowed});"))
     elif program.head == "choose":
         variables = "    int best;\n" if not program.previous else "    int k, best;\n"
         lines += _choose_lines(program, row.name)
@@ -109,7 +113,7 @@ def _recur_lines(k: int, layer: layers.Recurrent, here: str) -> list[str]:
 
 
 def _choose_lines(program: Program, here: str) -> list[str]:
-    lines = [f"    best = choose({here});"]
+    lines = [f"    best = choose({here}{', allowed' if program.masked else ''});"]
     if program.previous:
         lines.append(
             f"    for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = k == best ? 1.0f : 0.0f;"

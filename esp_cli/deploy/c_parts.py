@@ -109,6 +109,18 @@ CHOOSE = """static int choose(const float *x)
 }
 """
 
+CHOOSE_ALLOWED = """static int choose(const float *x, const unsigned char *allowed)
+{
+    int k, best = -1, any = 0;
+    for (k = 0; k < ESP_POLICY_ACTION; k++) any |= allowed[k];
+    for (k = 0; k < ESP_POLICY_ACTION; k++) {
+        if ((allowed[k] || !any) && (best < 0 || x[k] > x[best])) best = k;
+    }
+    return best;
+}
+"""
+"""Where nothing is allowed, everything is."""
+
 RECUR = """static float sigmoid(float x)
 {
     return 0.5f + 0.5f * tanhf(0.5f * x);

@@ -63,12 +63,16 @@ def _row_width(program: Program) -> int:
     return max(widths)
 
 
-def example_source(program: Program, observation: Iterable[float], action: Iterable[float]) -> str:
+def example_source(
+    program: Program, observation: Iterable[float], action: Iterable[float], allowed: Iterable[int] = ()
+) -> str:
     """Return a program that acts on the worked example and says whether the action is the right one."""
     choose, remembers, team = program.head == "choose", program.memory_width > 0, program.team > 1
     memory = "    float memory[ESP_POLICY_MEMORY];\n" if remembers else ""
     reset = "    esp_policy_reset(memory);\n" if remembers else ""
-    given = "observation, memory" if remembers else "observation"
+    masked = ", ".join(str(int(flag)) for flag in allowed)
+    mask = f"    const unsigned char allowed[] = {{{masked}}};\n" if program.masked else ""
+    given = ", ".join(["observation", *["allowed"] * program.masked, *["memory"] * remembers])
     head = f"""/* Acts on the worked example: cc policy_example.c policy.c -lm && ./a.out */
 #include "policy.h"
 
@@ -79,14 +83,14 @@ int main(void)
 {{
     const float observation[{seen(program)}] = {{
 {numbers(observation)}    }};
-"""
+{mask}"""
     if team:
         indices = ", ".join(str(int(index)) for index in action)
         return f"""{head}    const int expected[ESP_POLICY_AGENTS] = {{{indices}}};
     int action[ESP_POLICY_AGENTS];
     int i, wrong = 0;
 
-    esp_policy_act(observation, action);
+    esp_policy_act({given}, action);
     for (i = 0; i < ESP_POLICY_AGENTS; i++) {{
         printf("action %d, expected %d\\n", action[i], expected[i]);
         wrong |= action[i] != expected[i];
@@ -127,6 +131,8 @@ def _header(program: Program, comment: str) -> str:
         returns = "Returns the index of the best action."
     else:
         returns = "Writes the action, within its bounds."
+    if program.masked:
+        returns += " `allowed` is 1 for each action that may be taken, else 0."
     agents = f"#define ESP_POLICY_AGENTS {program.team}\n" if program.team > 1 else ""
     memory = (
         f"#define ESP_POLICY_MEMORY {program.memory_width}\n\n"
@@ -184,7 +190,8 @@ def _source(program: Program) -> str:
     parts += [code for kind, code in c_parts.LAYERS.items() if kind in kinds]
     parts += [c_parts.aggregate(layer) for layer in program.layers if isinstance(layer, layers.MessageAggregation)][:1]
     parts += [c_parts.RECUR.replace("HIDDEN", str(program.hidden))] if program.hidden else []
-    parts += [c_parts.CHOOSE] if program.head == "choose" else []
+    choose = c_parts.CHOOSE_ALLOWED if program.masked else c_parts.CHOOSE
+    parts += [choose] if program.head == "choose" else []
     parts.append(act_function(program))
     parts.append(f"{_outputs(program)}\n{{\n    return last{' + agent * ROW' if program.team > 1 else ''};\n}}")
     if program.memory_width:

@@ -17,6 +17,7 @@ from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
 _MOST_ROWS = 16
 """Actions beyond which the README leaves the list to `policy.json`."""
+_MASKED = "A mask says which actions are allowed: action_mask, in C allowed. Where none is allowed, all are."
 
 
 def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:
@@ -63,6 +64,7 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
         "example": {
             "observation": sample.obs[first].tolist(),
             "memory": sample.memory[first].tolist(),
+            **({} if sample.mask is None else {"action_mask": sample.mask[first].tolist()}),
             "outputs": sample.outputs[first].tolist(),
             "action": sample.action[first].tolist(),
             "memory_after": sample.after[first].tolist(),
@@ -104,6 +106,7 @@ def summary(alone: TrainedPolicy, program: Program) -> str:
         shown = list(describe_action(spec.action))
         lines += [f"  {name}: {means}" for name, means in shown[:_MOST_ROWS]]
         lines += ["  ... (the rest is in policy.json)"] if len(shown) > _MOST_ROWS else []
+        lines += [_MASKED] if program.masked else []
     else:
         lines += [f"  {span:>7}  {name}: {kind}{_unit(unit)}" for span, name, kind, unit in spec.action.layout.table()]
         lines.append("  each number in [-1, 1], planar vectors in the unit disc")
@@ -141,6 +144,7 @@ def readme(alone: TrainedPolicy, description: dict[str, Any], sections: list[str
         lines += [f"The index of one option; each means a {spec.action.kind.name}.", ""]
         lines += ["| option | means |", "|---|---|", *(f"| {name} | {means} |" for name, means in shown[:_MOST_ROWS])]
         lines += ["", f"All {len(shown)} are in `policy.json`."] if len(shown) > _MOST_ROWS else []
+        lines += ["", _MASKED] if spec.masks else []
     else:
         lines += ["Numbers in [-1, 1], planar vectors in the unit disc.", "", "| index | field | kind | unit |"]
         lines += ["|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in spec.action.layout.table())]

@@ -32,19 +32,28 @@ TOLERANCE = 1e-4
 _STEPS = 50
 
 Numbers = NDArray[Any]
-Runner = Callable[[Floats, Floats], tuple[Numbers, Numbers, Numbers]]
-"""(observation [B, D], memory [B, H]) -> (action [B] or [B, width], outputs [B, O], memory after [B, H])."""
+Runner = Callable[[Floats, Floats, Numbers | None], tuple[Numbers, Numbers, Numbers]]
+"""(observation [B, D], memory [B, H], action mask [B, A] or None) to (action [B] or [B, width], outputs [B, O], memory
+after [B, H])."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What the policy itself does: row by row observation, memory, outputs, action and memory after it."""
+    """What the policy itself does, row by row: observation, memory, outputs, action, next memory, allowed actions."""
 
     obs: Floats
     memory: Floats
     outputs: Floats
     action: Numbers
     after: Floats
+    mask: Numbers | None = None
+
+    @property
+    def choosable(self) -> Floats:
+        """Outputs with -infinity for actions that the mask forbids, unless it forbids all."""
+        if self.mask is None:
+            return self.outputs
+        return np.where(self.mask | ~self.mask.any(-1, keepdims=True), self.outputs, -np.inf)
 
 
 @dataclass(frozen=True)
@@ -76,30 +85,37 @@ def take_sample(alone: TrainedPolicy, program: Program, count: int = OBSERVATION
     if program.previous and program.head == "choose":
         memory[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=missing)]
     rows = torch.cat([met[0], torch.from_numpy(obs)]), torch.cat([met[1], torch.from_numpy(memory)])
-    action, after = alone.policy.act(rows[0][None, None], rows[1][None])
+    mask = None
+    if met[2] is not None:
+        mask = torch.cat([met[2], torch.from_numpy(rng.random((missing, program.num_outputs)) < 0.6)])
+    allowed = None if mask is None else mask[None, None]
+    action, after = alone.policy.act(rows[0][None, None], rows[1][None], action_mask=allowed)
     outputs = _raw_outputs(alone.policy, *rows)
     width = action.shape[3:]
     parts = (rows[0], rows[1], outputs, action.reshape(len(rows[0]), *width), after[0])
-    return Sample(*(part.numpy() for part in parts))
+    seen, carried, told, done, kept = (part.numpy() for part in parts)
+    return Sample(seen, carried, told, done, kept, None if mask is None else mask.numpy())
 
 
 def _whole(count: int, team: int) -> int:
     return math.ceil(count / team) * team
 
 
-def _met(alone: TrainedPolicy, count: int) -> tuple[Tensor, Tensor]:
-    """Play a little and return the first observations and memories that the policy meets."""
+def _met(alone: TrainedPolicy, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Play a little and return the first observations, memories and action masks that the policy meets."""
     steps = min(_STEPS, alone.spec.horizon)
     env = build_environment(alone.config, math.ceil(count / (steps * alone.spec.num_agents)), "export")
     observation = env.reset()
     memory = alone.policy.initial_memory(env.num_envs, observation.obs)
-    seen, carried = [], []
+    seen, carried, masks = [], [], []
     for _ in range(steps):
         seen.append(observation.obs.flatten(0, 2))
         carried.append(memory[0])
-        action, memory = alone.policy.act(observation.obs, memory)
+        mask = observation.action_mask
+        masks += [] if mask is None else [mask.flatten(0, 2)]
+        action, memory = alone.policy.act(observation.obs, memory, action_mask=mask)
         observation = env.step(action).next
-    return torch.cat(seen)[:count], torch.cat(carried)[:count]
+    return torch.cat(seen)[:count], torch.cat(carried)[:count], torch.cat(masks)[:count] if masks else None
 
 
 def _raw_outputs(policy: Policy, obs: Tensor, memory: Tensor) -> Tensor:
@@ -114,13 +130,13 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
     Raises:
         RuntimeError: they do not agree, which is a bug.
     """
-    action, outputs, after = runner(sample.obs, sample.memory)
+    action, outputs, after = runner(sample.obs, sample.memory, sample.mask)
     largest = max(1.0, float(np.abs(sample.outputs).max()))
     gap = float(np.abs(outputs - sample.outputs).max())
     differing = np.zeros(len(sample.obs), bool)
     if sample.action.dtype.kind == "i":
         differing = action != sample.action
-        first, second = np.sort(sample.outputs[differing], 1)[:, ::-1][:, :2].T
+        first, second = np.sort(sample.choosable[differing], 1)[:, ::-1][:, :2].T
         ties = bool((first - second <= 2 * TOLERANCE * largest).all())
         same = ~differing  # after another choice the memory holds another previous action
     else:
@@ -142,11 +158,12 @@ def numpy_runner(file: Path) -> Runner:
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
 
-    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
         count, team = len(obs), module.POLICY.program["team"]
         lead = (count // team, team) if team > 1 else (count,)
         given = [rows.reshape(*lead, rows.shape[1]) for rows in (obs, memory)]
-        results = (*module.POLICY.step(*given), module.POLICY.outputs(*given)[0])
+        allowed = [] if mask is None else [mask.reshape(*lead, mask.shape[1])]
+        results = (*module.POLICY.step(*given, *allowed), module.POLICY.outputs(*given)[0])
         action, after, outputs = (rows.reshape(count, *rows.shape[len(lead) :]) for rows in results)
         return action, outputs, after
 
@@ -158,8 +175,8 @@ def onnx_runner(file: Path) -> Runner:
     session = library("onnxruntime").InferenceSession(str(file), providers=["CPUExecutionProvider"])
     names = [value.name for value in session.get_inputs()]
 
-    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
-        given = {"observation": obs, "memory": memory}
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        given = {"observation": obs, "memory": memory, "action_mask": mask}
         results = session.run(None, {name: given[name] for name in names})
         return results[0], results[1], results[2] if len(results) > 2 else memory
 
@@ -170,10 +187,11 @@ def torch_runner(file: Path) -> Runner:
     """Run a written torch.export archive."""
     module = torch.export.load(file).module()
 
-    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        allowed = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
         given = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
         with torch.no_grad():
-            results = [result.numpy() for result in module(*given)]
+            results = [result.numpy() for result in module(*given, **allowed)]
         return results[0], results[1], results[2] if len(results) > 2 else memory
 
     return run
@@ -202,23 +220,28 @@ def c_runner(file: Path, program: Program) -> Runner:
     act = code.esp_policy_act
     act.restype = ctypes.c_int if choose and team == 1 else None
 
-    def run_team(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
-        obs = np.ascontiguousarray(obs)
+    flags = ctypes.POINTER(ctypes.c_ubyte)
+
+    def run_team(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        obs, bits = np.ascontiguousarray(obs), None if mask is None else mask.astype(np.uint8)
         outputs = np.empty((len(obs), program.num_outputs), np.float32)
         action = np.empty(len(obs), np.intc)
         for k in range(0, len(obs), team):
-            act(obs[k:].ctypes.data_as(pointer), action[k:].ctypes.data_as(ctypes.POINTER(ctypes.c_int)))
+            allowed = [] if bits is None else [bits[k:].ctypes.data_as(flags)]
+            act(obs[k:].ctypes.data_as(pointer), *allowed, action[k:].ctypes.data_as(ctypes.POINTER(ctypes.c_int)))
             for i in range(team):
                 outputs[k + i] = np.ctypeslib.as_array(code.esp_policy_outputs(i), (program.num_outputs,))
         return action, outputs, memory
 
-    def run(obs: Floats, memory: Floats) -> tuple[Numbers, Numbers, Numbers]:
-        obs, after = np.ascontiguousarray(obs), memory.copy()
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        obs, after, bits = np.ascontiguousarray(obs), memory.copy(), None if mask is None else mask.astype(np.uint8)
         outputs = np.empty((len(obs), program.num_outputs), np.float32)
         action: Numbers = np.empty(len(obs), np.int64) if choose else np.empty_like(outputs)
         for k in range(len(obs)):
-            given = [obs[k], *([after[k]] if program.memory_width else []), *([] if choose else [action[k]])]
-            chosen = act(*(array.ctypes.data_as(pointer) for array in given))
+            given = [*([after[k]] if program.memory_width else []), *([] if choose else [action[k]])]
+            allowed = [] if bits is None else [bits[k].ctypes.data_as(flags)]
+            rest = (array.ctypes.data_as(pointer) for array in given)
+            chosen = act(obs[k].ctypes.data_as(pointer), *allowed, *rest)
             if choose:
                 action[k] = chosen
             outputs[k] = np.ctypeslib.as_array(code.esp_policy_outputs(), (program.num_outputs,))

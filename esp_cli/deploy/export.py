@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -85,11 +85,13 @@ class _Job:
 
 def _c(job: _Job) -> Files:
     written, example = c_source(job.program, job.comment), job.description["example"]
-    observation, action = (np.ravel(example[name]).tolist() for name in ("observation", "action"))
+    observation, action, allowed = (
+        np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask")
+    )
     return {
         "policy.h": written.header.encode(),
         "policy.c": written.source.encode(),
-        "policy_example.c": example_source(job.program, observation, action).encode(),
+        "policy_example.c": example_source(job.program, observation, action, allowed).encode(),
     }
 
 
@@ -132,12 +134,7 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
         ValueError: a file exists already, a library is missing, or the format does not support the policy.
     """
     formats = tuple(dict.fromkeys(formats))
-    if alone.spec.masks:
-        raise ValueError(
-            f"{alone.spec.name} says which actions are allowed, and no exported file takes such a mask; "
-            "use load_policy, whose 'act' takes action_mask"
-        )
-    program = program_of(alone.policy)
+    program = replace(program_of(alone.policy), masked=alone.spec.masks)
     sample = take_sample(alone, program)
     job = _Job(alone, program, sample, describe(alone, program, sample))
     written = {name: WRITERS[name](job) for name in formats}

@@ -36,6 +36,7 @@ def numpy_source(program: Program, comment: str, description: str) -> str:
     action = policy.act(obs)                            # [..., D] -> [...] or [..., width]
     memory = policy.initial_memory(num_agents)          # a policy that remembers: begin an episode,
     action, memory = policy.step(obs, memory)           # and hand its memory from step to step
+    action = policy.act(obs, action_mask)               # one with masks: say what is allowed, [..., A]
 
 Run this file to check it on its worked example.
 """
@@ -58,7 +59,7 @@ act, step, initial_memory = POLICY.act, POLICY.step, POLICY.initial_memory
 def check_example() -> bool:
     """Return whether the worked example comes out as it should."""
     example = DESCRIPTION["example"]
-    action, after = step(example["observation"], example["memory"])
+    action, after = step(example["observation"], example["memory"], example.get("action_mask"))
     close = np.allclose(action, example["action"], atol=1e-4) and np.allclose(after, example["memory_after"], atol=1e-4)
     print(f"action {{action.tolist()}}, expected {{example['action']}}")
     return bool(close)

@@ -34,9 +34,9 @@ def library(name: str) -> Any:
 def onnx_model(program: Program, description: str) -> bytes:
     """Write a program as an ONNX model.
 
-    Inputs: `observation` [rows, D] and, of a recurrent policy, `memory` [rows, H]. Outputs: `action` ([rows] int64 or
-    [rows, width] float32), `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand
-    side by side, world after world.
+    Inputs: `observation` [rows, D]; of a recurrent policy `memory` [rows, H]; of one with masks `action_mask` [rows, A]
+    bool. Outputs: `action` ([rows] int64 or [rows, width] float32), `outputs` [rows, outputs] of the last layer, and
+    `memory_out` [rows, H]. A team's rows stand side by side, world after world.
 
     Args:
         program: the policy.
@@ -64,6 +64,9 @@ def onnx_model(program: Program, description: str) -> bytes:
     graph.name(x, "outputs")
     outputs = [value("outputs", float_type, ["rows", program.num_outputs])]
     if program.head == "choose":
+        if program.masked:
+            inputs.append(value("action_mask", onnx.TensorProto.BOOL, ["rows", program.num_outputs]))
+            x = graph.allowed(x, "action_mask")
         done = graph.name(graph.node("ArgMax", [x], axis=-1, keepdims=0), "action")
         outputs.insert(0, value("action", int_type, ["rows"]))
     else:
@@ -194,6 +197,14 @@ class _Graph:
         epsilon = self.constant(np.array(layers.SQUASH_EPSILON, np.float32))
         length = self.node("Sqrt", [self.node("Add", [squares, epsilon])])
         return self.node("Mul", [x, self.node("Div", [self.node("Tanh", [length]), length])])
+
+    def allowed(self, x: str, mask: str) -> str:
+        """Return x with -infinity where the mask forbids; where it forbids everything, x."""
+        types = self.onnx.TensorProto
+        some = self.reduce("ReduceMax", self.node("Cast", [mask], to=types.FLOAT), 1, keepdims=1)
+        nothing = self.node("Not", [self.node("Cast", [some], to=types.BOOL)])
+        allowed = self.node("Or", [mask, nothing])
+        return self.node("Where", [allowed, x, self.constant(np.array(-np.inf, np.float32))])
 
     def encode(self, action: str, program: Program) -> str:
         """Return an action as the memory holds it."""

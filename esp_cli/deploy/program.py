@@ -5,7 +5,7 @@ A program maps a row of observation, and of memory where it has one, to outputs,
     x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
     x = layer(x) for each layer            affine x W + b, activation, layer normalisation, gated recurrent unit;
                                            for pictures a slice, convolutions, global max pooling, message aggregation
-    action = argmax(x)                     head `choose`, or
+    action = argmax(x)                     head `choose`, among the allowed actions where the task has masks; or
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
 The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
@@ -33,6 +33,7 @@ class Program:
         head: how the outputs become an action.
         groups: widths of what is squashed together; empty where the head chooses.
         team: agents that act together, with their rows side by side; 1 where each acts by itself.
+        masked: whether a mask of the allowed actions [A] comes with every observation; one that allows none allows all.
     """
 
     num_inputs: int
@@ -43,6 +44,7 @@ class Program:
     head: Literal["choose", "squash"]
     groups: tuple[int, ...]
     team: int = 1
+    masked: bool = False
 
     @property
     def memory_width(self) -> int:
@@ -75,5 +77,6 @@ class Program:
             "head": self.head,
             "groups": list(self.groups),
             "team": self.team,
+            "masked": self.masked,
             "layers": [describe(layer) for layer in self.layers],
         }

@@ -9,13 +9,15 @@ from torch import Tensor, nn
 
 from esp_cli.deploy import layers
 from esp_cli.deploy.program import Program
+from esp_cli.networks.heads import masked
 
 
 class TorchProgram(nn.Module):
     """The program in torch's own operations.
 
     Shape:
-        observation: [rows, D]; memory: [rows, H], for recurrent policies.
+        observation: [rows, D]; memory: [rows, H], for recurrent policies; action_mask: [rows, A] bool, for those with
+        masks.
         Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
         A team's rows stand side by side, world after world.
     """
@@ -27,7 +29,9 @@ class TorchProgram(nn.Module):
             for i, array in enumerate(layer.arrays):
                 self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
 
-    def forward(self, observation: Tensor, memory: Tensor | None = None) -> tuple[Tensor, ...]:
+    def forward(
+        self, observation: Tensor, memory: Tensor | None = None, action_mask: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """Act."""
         program, x = self.program, observation
         hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
@@ -40,7 +44,7 @@ class TorchProgram(nn.Module):
             else:
                 x = _apply(x, layer, arrays, observation)
         if program.head == "choose":
-            action = x.argmax(-1)
+            action = (x if action_mask is None else masked(x, action_mask)).argmax(-1)
             done = nn.functional.one_hot(action, program.num_outputs).float()
         else:
             action = done = _squash(x, program.groups)
@@ -58,11 +62,14 @@ def torch_archive(program: Program, description: str) -> bytes:
     """
     worlds = torch.export.Dim("worlds", min=1)
     rows = worlds if program.team == 1 else program.team * worlds
-    arguments = [torch.zeros(2 * program.team, program.num_inputs)]
+    given = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
     if program.memory_width:
-        arguments.append(torch.zeros(2 * program.team, program.memory_width))
-    shapes = tuple({0: rows} for _ in arguments)
-    exported = torch.export.export(TorchProgram(program).eval(), tuple(arguments), dynamic_shapes=shapes)
+        given["memory"] = torch.zeros(2 * program.team, program.memory_width)
+    arguments, named = tuple(given.values()), {}
+    if program.masked:
+        named["action_mask"] = torch.ones(2 * program.team, program.num_outputs, dtype=torch.bool)
+    shapes = {name: {0: rows} for name in given | named}
+    exported = torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
     content = BytesIO()
     torch.export.save(exported, content, extra_files={"policy.json": description})
     return content.getvalue()

@@ -71,7 +71,7 @@ def test_a_wrong_weight_is_found(kind: str) -> None:
         weights[5] += spoilt
         policy = NumpyPolicy(json.loads(json.dumps(program.describe())), weights.tobytes())
 
-        def run(obs, memory):
+        def run(obs, memory, mask=None):
             action, after = policy.step(obs, memory)
             return action, policy.outputs(obs, memory)[0], after
 
@@ -87,7 +87,7 @@ def test_another_choice_that_is_no_tie_is_found() -> None:
     sample = take_sample(alone, program_of(alone.policy), 100)
     others = (sample.action + 1) % 5
     with pytest.raises(RuntimeError, match="differs from the policy"):
-        compare(sample, lambda obs, memory: (others, sample.outputs, sample.after))
+        compare(sample, lambda obs, memory, mask: (others, sample.outputs, sample.after))
 
 
 def test_layers_and_costs_of_a_small_policy_by_hand() -> None:

@@ -96,7 +96,7 @@ def runner_of(program: Program) -> check.Runner:
     """Return a runner of an exported Python file's code."""
     policy = numpy_policy(program)
 
-    def run(obs, memory):
+    def run(obs, memory, mask=None):
         worlds = obs.reshape(-1, program.team, program.num_inputs)
         outputs = policy.outputs(worlds, np.zeros((*worlds.shape[:2], 0)))[0].reshape(len(obs), -1)
         return outputs.argmax(1), outputs, memory

@@ -30,21 +30,24 @@ class NumpyPolicy:
         if numbers.size:
             raise ValueError("the weights do not fit the layers; export the policy again")
 
-    def act(self, obs: Any) -> Any:
-        """Return the actions [...] or [..., width] of agents that see obs [..., D], a team's [..., N, D]."""
+    def act(self, obs: Any, action_mask: Any = None) -> Any:
+        """Return the actions [...] or [..., width] of agents that see obs [..., D], a team's [..., N, D].
+
+        A policy with masks needs the allowed actions [..., A], too.
+        """
         if self.hidden:
             raise ValueError("this policy remembers: begin with initial_memory(), and call step(obs, memory)")
-        return self.step(obs, np.zeros((*np.shape(obs)[:-1], 0), np.float32))[0]
+        return self.step(obs, np.zeros((*np.shape(obs)[:-1], 0), np.float32), action_mask)[0]
 
     def initial_memory(self, *lead: int) -> Any:
         """Return the memory with which an episode begins: zeros [*lead, H]."""
         return np.zeros((*lead, self.hidden + self.previous), np.float32)
 
-    def step(self, obs: Any, memory: Any) -> tuple[Any, Any]:
+    def step(self, obs: Any, memory: Any, action_mask: Any = None) -> tuple[Any, Any]:
         """Return actions, and the memory [..., H] after them."""
         outputs, hidden = self.outputs(obs, memory)
         if self.program["head"] == "choose":
-            action = outputs.argmax(-1)
+            action = self._allowed(outputs, action_mask).argmax(-1)
             done = np.eye(outputs.shape[-1], dtype=np.float32)[action]
         else:
             action = done = self._squash(outputs)
@@ -67,6 +70,17 @@ class NumpyPolicy:
             else:
                 x = _apply(x, layer, arrays, obs)
         return x, hidden
+
+    def _allowed(self, outputs: Any, action_mask: Any) -> Any:
+        """Put those of forbidden actions out of reach; where none is allowed, all are."""
+        if not self.program["masked"]:
+            if action_mask is not None:
+                raise ValueError("this policy has no action masks; leave action_mask out")
+            return outputs
+        if np.shape(action_mask) != outputs.shape:
+            raise ValueError(f"the action mask has shape {np.shape(action_mask)}, but {outputs.shape} is needed")
+        mask = np.asarray(action_mask, bool)
+        return np.where(mask | ~mask.any(-1, keepdims=True), outputs, -np.inf)
 
     def _squash(self, outputs: Any) -> Any:
         """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
