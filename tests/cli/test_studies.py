@@ -206,7 +206,7 @@ def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     terminal = console.Console(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
-    monkeypatch.setattr(console, "err", terminal)
+    monkeypatch.setattr(console.progress, "err", terminal)
     folder = StudyFolder.create(tmp_path / "s", small_study())
     runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
     runs[0].status, runs[0].step, runs[0].trained_s = "training", 100, 10.0
