@@ -21,6 +21,7 @@ from esp_cli.deploy.c_source import FLAGS
 from esp_cli.deploy.layers import Floats
 from esp_cli.deploy.onnx_file import library
 from esp_cli.deploy.program import Program
+from esp_cli.networks.heads import masked
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
@@ -50,10 +51,9 @@ class Sample:
 
     @property
     def choosable(self) -> Floats:
-        """Outputs with -infinity for actions that the mask forbids, unless it forbids all."""
-        if self.mask is None:
-            return self.outputs
-        return np.where(self.mask | ~self.mask.any(-1, keepdims=True), self.outputs, -np.inf)
+        """Outputs as the policy chooses among them: those of forbidden actions are out of reach."""
+        mask = None if self.mask is None else torch.from_numpy(self.mask)
+        return masked(torch.from_numpy(self.outputs), mask).numpy()
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ class TorchProgram(nn.Module):
             else:
                 x = _apply(x, layer, arrays, observation)
         if program.head == "choose":
-            action = (x if action_mask is None else masked(x, action_mask)).argmax(-1)
+            action = masked(x, action_mask).argmax(-1)
             done = nn.functional.one_hot(action, program.num_outputs).float()
         else:
             action = done = _squash(x, program.groups)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
-from typing import Any
 
 # read when mlflow is imported or a store is opened; what the user has set stays
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
@@ -14,6 +12,7 @@ os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
+from esp_cli.files.tables import flat
 from esp_cli.trackers.sink import Row, TrackedRun, scalars
 
 _MOST_PARAMS = 100
@@ -36,7 +35,7 @@ class MlFlow:
             self._client.update_run(self._run_id, status="RUNNING")
             return
         self._run_id = self._client.create_run(experiment, run_name=folder.name).info.run_id
-        params = [Param(name, str(value)[:_LONGEST_VALUE]) for name, value in _flat(run.config)]
+        params = [Param(name, str(value)[:_LONGEST_VALUE]) for name, value in flat(run.config)]
         for begin in range(0, len(params), _MOST_PARAMS):
             self._client.log_batch(self._run_id, params=params[begin : begin + _MOST_PARAMS])
         file.parent.mkdir(exist_ok=True)
@@ -55,11 +54,3 @@ class MlFlow:
     def close(self) -> None:
         """Mark the run as ended."""
         self._client.set_terminated(self._run_id)
-
-
-def _flat(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
