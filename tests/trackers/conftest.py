@@ -1,22 +1,5 @@
-"""One tiny run that the tests of trackers share, and copies of it to break."""
+"""The finished run that the tests of the commands share, for the tests of trackers."""
 
-from __future__ import annotations
+from tests.cli.conftest import copied, finished
 
-import shutil
-from pathlib import Path
-
-import pytest
-
-from tests.cli.running import train_tiny
-
-
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run of the seeds 3 and 7 that no test may change."""
-    return train_tiny(tmp_path_factory.mktemp("runs") / "finished", "--seeds", "3,7")
-
-
-@pytest.fixture
-def copied(finished: Path, tmp_path: Path) -> Path:
-    """A copy of the finished run, to be changed."""
-    return Path(shutil.copytree(finished, tmp_path / "copied"))
+__all__ = ["copied", "finished"]
