@@ -7,7 +7,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
-PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope
+PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope --max-worker-restart 0
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check bench docs site torture clean
