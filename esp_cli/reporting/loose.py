@@ -118,6 +118,8 @@ def _returns(material: Material, cell: CellResult) -> JsonValue:
         out["difference"] = {"mean": gap.value, "ci95": _interval(gap.ci95), "paired": found.gap.paired}
         out["probability_of_improvement"] = chance.value if chance else None
         out["probability_of_improvement_ci95"] = _interval(chance.ci95) if chance else None
+        of_all = found.gap.over_all_pairs
+        out["probability_of_improvement_over_all_pairs"] = of_all.value if of_all else None
     return out
 
 

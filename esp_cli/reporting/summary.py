@@ -38,13 +38,15 @@ class Gap:
     Attributes:
         difference: of the means.
         paired: whether both have the same seeds, which are compared one by one.
-        probability: of improvement over the reference; None for fewer than three seeds.
+        probability: of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds.
+        over_all_pairs: the same with every seed against every seed, as Agarwal et al. define it.
         ahead: by whether the interval of the difference holds 0; None where there is no interval.
     """
 
     difference: Estimate
     paired: bool
     probability: Estimate | None
+    over_all_pairs: Estimate | None
     ahead: Side | None
 
 
@@ -55,7 +57,7 @@ class CellSummary:
     Attributes:
         returns: over seeds.
         iqm: interquartile mean.
-        normalised: 0 is the random policy, 1 the heuristic.
+        normalised: 0 is the random policy, 1 the best of the task's heuristics.
         area: mean height of the learning curve.
         gap: to the cell's reference.
         leader: "first" where our mean is higher than the paper's, "second" where the paper's is.
@@ -149,10 +151,11 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
     if other is None or others is None or not (np.isfinite(values).all() and np.isfinite(others).all()):
         return None
     paired = cell.seeds == other.seeds
-    found, chance = difference(values, others, paired), None
+    found, chance, of_all = difference(values, others, paired), None, None
     if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
-        chance = probability_of_improvement(values, others, paired)
-    return Gap(found, paired, chance, _side(found.ci95))
+        of_all = probability_of_improvement(values, others)
+        chance = probability_of_improvement(values, others, paired=True) if paired else of_all
+    return Gap(found, paired, chance, of_all, _side(found.ci95))
 
 
 def _side(interval: tuple[float, float] | None) -> Side | None:
@@ -163,7 +166,7 @@ def _side(interval: tuple[float, float] | None) -> Side | None:
 
 
 def _normalised(cell: CellResult, values: Floats) -> Floats | None:
-    random, heuristic = cell.anchors.get("random"), cell.anchors.get("heuristic")
-    if random is None or heuristic is None or random == heuristic:
+    heuristics = [value for name, value in cell.anchors.items() if name != "random"]
+    if "random" not in cell.anchors or not heuristics or cell.anchors["random"] == max(heuristics):
         return None
-    return normalise(values, random, heuristic)
+    return normalise(values, cell.anchors["random"], max(heuristics))

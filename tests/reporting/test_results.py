@@ -39,11 +39,20 @@ def test_a_cell_by_hand(results):
     # seed by seed +20 +40 0: mean 20; two wins and a tie of three
     assert (esp.gap.difference.value, esp.gap.difference.ci95, esp.gap.paired) == (20.0, (0.0, 40.0), True)
     assert esp.gap.probability.value == pytest.approx(2.5 / 3)
+    # -130 and -120 beat all three of plain, -140 beats two and ties with one: 8.5 of nine pairs
+    assert esp.gap.over_all_pairs.value == pytest.approx(8.5 / 9)
     assert esp.gap.ahead == "level", "the interval begins at 0"
     # three seeds: none is a quarter, so the middle half is all of them
     assert plain.iqm.value == pytest.approx(-150.0)
     # evaluations at 0, 100, 200 are -40, -20, 0 from the end: mean height -20
     assert plain.area.mean == pytest.approx(-170.0)
+
+
+def test_returns_are_normalised_by_the_best_heuristic(results):
+    cell = results.cells[0].model_copy(update={"anchors": {"random": -200.0, "heuristic": -150.0, "straight": -50.0}})
+    assert summarise_cell(results, cell).normalised.mean == pytest.approx(1 / 3), "-150 is a third of -200 to -50"
+    alone = cell.model_copy(update={"anchors": {"random": -200.0}})
+    assert summarise_cell(results, alone).normalised is None
 
 
 def test_steps_to_where_the_reference_ended(results):
