@@ -37,7 +37,7 @@ def worker(tmp_path):
 
 
 def leave(worker):
-    """Clear a worker and let its lease last for ever: where a lease runs out, the process ends, and that is pytest's."""
+    """Clear a worker and let its lease last for ever; a lease that runs out ends the process of the tests."""
     worker._heard = math.inf
     worker._clear()
 
