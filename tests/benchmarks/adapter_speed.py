@@ -1,7 +1,7 @@
 """Measure what foreign environments cost behind the adapters.
 
 PettingZoo: mpe2's simple_spread_v3, 32 copies, in this process and in worker processes. VMAS: a scenario's own steps/s,
-and the task's, with 512 worlds. Rounds alternate, and each ratio is of the best rounds.
+and the task's, with 512 worlds. Rounds alternate, and each ratio is the median over rounds.
 
     python tests/benchmarks/adapter_speed.py
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import sys
 import tempfile
 import time
@@ -37,12 +38,17 @@ def rate(play: Callable[[], None], steps: int, worlds: int) -> float:
     return steps * worlds / (time.perf_counter() - begun)
 
 
-def best_of(plays: dict[str, Callable[[], None]], steps: int, worlds: int, rounds: int) -> dict[str, float]:
-    """Return each best rate; rounds alternate, so that all meet the same machine."""
-    best = dict.fromkeys(plays, 0.0)
+def rates(plays: dict[str, Callable[[], None]], steps: int, worlds: int, rounds: int) -> dict[str, list[float]]:
+    """Return each rate by round; rounds alternate, so that all meet the same machine."""
+    found: dict[str, list[float]] = {name: [] for name in plays}
     for name in [name for _ in range(rounds) for name in plays]:
-        best[name] = max(best[name], rate(plays[name], steps, worlds))
-    return best
+        found[name].append(rate(plays[name], steps, worlds))
+    return found
+
+
+def ratio(over: list[float], under: list[float]) -> float:
+    """Return the median over rounds of one rate over the other."""
+    return statistics.median(a / b for a, b in zip(over, under, strict=True))
 
 
 def stepping(env: Environment) -> Callable[[], None]:
@@ -62,9 +68,10 @@ def copies(rounds: int) -> None:
         name = register("spread:Spread")
         counts = (0, 2) if len(os.sched_getaffinity(0)) < 4 else (0, 2, 4)
         plays = {f"{n} workers": stepping(make(name, COPIES, [0], {"workers": n})) for n in counts}
-        best = best_of(plays, 100, COPIES, rounds)
-        for what, value in best.items():
-            print(f"simple_spread_v3, {COPIES} copies, {what}: {value:7.0f} steps/s, x {value / best['0 workers']:.2f}")
+        found = rates(plays, 100, COPIES, rounds)
+        for what, own in found.items():
+            gain = ratio(own, found["0 workers"])
+            print(f"simple_spread_v3, {COPIES} copies, {what}: {statistics.median(own):7.0f} steps/s, x {gain:.2f}")
         os.chdir(ROOT)
 
 
@@ -88,16 +95,15 @@ def scenarios(rounds: int) -> None:
                 for world in done.nonzero().flatten().tolist():
                     theirs.reset_at(world)
 
-        best = best_of({"alone": alone, "task": stepping(task)}, 100, WORLDS, rounds)
-        overhead = best["alone"] / best["task"] - 1
-        print(
-            f"vmas {name}, {WORLDS} worlds: {best['alone']:7.0f} alone, {best['task']:7.0f} as a task, {overhead:+.0%}"
-        )
+        found = rates({"alone": alone, "task": stepping(task)}, 100, WORLDS, rounds)
+        plain, ours = (statistics.median(own) for own in found.values())
+        overhead = ratio(found["alone"], found["task"]) - 1
+        print(f"vmas {name}, {WORLDS} worlds: {plain:7.0f} alone, {ours:7.0f} as a task, {overhead:+.0%}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=11)
     asked = parser.parse_args()
     torch.set_num_threads(1)
     copies(asked.rounds)

@@ -213,6 +213,8 @@ class VmasTask(Environment):
 
     def _begin(self, s: int, over: Tensor, here: Observation | None) -> Observation:
         """Start the next episode in some worlds [E] of one seed; the others keep what they see."""
+        if here is not None and not over.any():
+            return here
         for episode in self._begun[s][over].unique().tolist():
             start = self._start(s, episode)
             which = (over & (self._begun[s] == episode)).to(self.device)
