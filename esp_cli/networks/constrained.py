@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.networks.layers import GAINS, affine, orthogonal
+from esp_cli.networks.layers import GAINS, orthogonal
+from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
 

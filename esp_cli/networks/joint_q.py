@@ -10,7 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from esp_cli.networks.layers import SeedLinear, SeedMLP, affine
+from esp_cli.networks.layers import SeedLinear, SeedMLP
+from esp_cli.networks.perceptron import affine
 from esp_envs.spec import Spaces
 
 
@@ -37,12 +38,17 @@ class OneValue:
 
     def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
         """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A]."""
-        return torch.cat([seen, action.flatten(-2)], -1)
+        return torch.cat([seen, self.joint_action(action)], -1)
+
+    def joint_action(self, action: Tensor) -> Tensor:
+        """Return encoded joint actions [S, W, N, A] as the critic reads them: [S, ..., N A]."""
+        return action.flatten(-2)
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
-        rows = self.inputs(seen, action)
-        return critic(rows.flatten(1, -2)).unflatten(1, rows.shape[1:-1])
+        return critic.of_parts(seen.flatten(1, -2), self.joint_action(action).flatten(1, -2)).unflatten(
+            1, seen.shape[1:-1]
+        )
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q for its other actions, with the actions of all others fixed.
@@ -77,9 +83,9 @@ class OneValueEach(OneValue):
             return in_a_circle(obs)
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
-    def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return the critic's inputs [S, W, N, D] for encoded joint actions [S, W, N, A]."""
-        return torch.cat([seen, in_a_circle(action)], -1)
+    def joint_action(self, action: Tensor) -> Tensor:
+        """Return encoded joint actions [S, W, N, A] for each agent: [S, W, N, N A]."""
+        return in_a_circle(action)
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""

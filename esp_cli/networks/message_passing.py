@@ -20,7 +20,8 @@ from torch.autograd import Function
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
 from esp_cli.networks.contract import Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.networks.layers import GAINS, affine
+from esp_cli.networks.layers import GAINS
+from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
 from esp_envs.spec import Field, Items, Kind, Layout

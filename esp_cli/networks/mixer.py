@@ -6,9 +6,11 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import elu
+from torch.autograd import Function
+from torch.nn.functional import elu_
 
 from esp_cli.networks.layers import SeedMLP
+from esp_cli.networks.perceptron import CACHED_ROWS
 
 
 class MonotonicMixer(nn.Module):
@@ -38,13 +40,54 @@ class MonotonicMixer(nn.Module):
         Shape:
             values [S, ..., N], state [S, ..., state width] -> [S, ...].
         """
-        num_seeds, lead = values.shape[0], values.shape[:-1]
-        rows = self.hypernetwork(state.reshape(num_seeds, -1, state.shape[-1]))
-        first, bias, second, offset = rows.split((self.num_agents * self.width, self.width, self.width, 1), -1)
-        weights = first.abs().unflatten(-1, (self.num_agents, self.width))
-        own = values.reshape(num_seeds, -1, self.num_agents)
-        hidden = elu((own.unsqueeze(-1) * weights).sum(-2) + bias)
-        return ((hidden * second.abs()).sum(-1) + offset.squeeze(-1)).view(lead)
+        own, seen = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in (values, state))
+        size = max(1, CACHED_ROWS // values.shape[0])
+        pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
+        return torch.cat(pieces, 1).view(values.shape[:-1])
+
+    def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
+        """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
+        rows = self.hypernetwork.of_parts(seen, rows_innermost=True)
+        return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
+
+
+class _Mixed(Function):
+    """What the hypernetwork says, applied: own [S, N, B] and rows [S, N M + M + M + 1, B] to [S, B].
+
+    Autograd through the formula is the reference in the tests.
+    """
+
+    @staticmethod
+    def forward(ctx, own, rows, width):  # type: ignore[no-untyped-def]
+        first, bias, second, offset = _parts(rows, own.shape[1], width)
+        hidden = bias
+        for weight, value in zip(first.unbind(1), own.unsqueeze(2).unbind(1), strict=True):
+            hidden = torch.addcmul(hidden, weight.abs(), value)
+        hidden = elu_(hidden)
+        ctx.save_for_backward(own, rows, hidden)
+        return (hidden * second.abs()).sum(1).add_(offset.squeeze(1))
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        own, rows, hidden = ctx.saved_tensors
+        by_rows, above = torch.empty_like(rows), grad.unsqueeze(1)
+        first, _, second, _ = _parts(rows, own.shape[1], hidden.shape[1])
+        by_first, by_bias, by_second, by_offset = _parts(by_rows, own.shape[1], hidden.shape[1])
+        by_offset.copy_(above)
+        torch.sgn(second, out=by_second).mul_(above)  # of w_2, where the team's value goes by |w_2|
+        inner = by_second * second  # = |w_2| times the gradient above: by the hidden units
+        by_second.mul_(hidden)
+        torch.ops.aten.elu_backward.grad_input(inner, 1.0, 1.0, 1.0, True, hidden, grad_input=by_bias)
+        torch.sgn(first, out=by_first).mul_(by_bias.unsqueeze(1))
+        by_own = (by_first * first).sum(2)
+        by_first.mul_(own.unsqueeze(2))
+        return by_own, by_rows, None
+
+
+def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return W_1 [S, N, M, B], b_1 [S, M, B], w_2 [S, M, B] and b_2 [S, 1, B]."""
+    first, bias, second, offset = rows.split((num_agents * width, width, width, 1), 1)
+    return first.unflatten(1, (num_agents, width)), bias, second, offset
 
 
 HYPER_GAIN = 0.5

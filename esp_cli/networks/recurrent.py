@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 
-from esp_cli.networks.layers import SeedLinear, activate_
+from esp_cli.networks.layers import SeedLinear
+from esp_cli.networks.perceptron import activate_
 
 
 class SeedGRU(nn.Module):

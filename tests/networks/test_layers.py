@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks import layers
+from esp_cli.networks import perceptron
 from esp_cli.networks.build import NETWORKS, build_network
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.recurrent import SeedGRU
@@ -43,7 +43,7 @@ def test_rows_go_through_in_pieces_as_they_do_at_once(activate_output, outputs, 
     weight, inputs = torch.randn(2, 11, outputs), [x, *mlp.parameters()]
     whole = mlp(x)
     expected = torch.autograd.grad(whole, inputs, weight)
-    monkeypatch.setattr(layers, "CACHED_ROWS", 8)  # pieces of four, four and three rows
+    monkeypatch.setattr(perceptron, "CACHED_ROWS", 8)  # pieces of four, four and three rows
     pieces = mlp(x)
     assert pieces.shape == whole.shape
     torch.testing.assert_close(pieces, whole)
@@ -51,6 +51,30 @@ def test_rows_go_through_in_pieces_as_they_do_at_once(activate_output, outputs, 
         torch.testing.assert_close(ours, theirs)
     with torch.no_grad():
         torch.testing.assert_close(mlp(x), whole)
+
+
+@pytest.mark.parametrize("rows_innermost", [False, True])
+def test_parts_side_by_side_equal_whole_rows_and_get_gradients_where_they_ask(rows_innermost, monkeypatch):
+    monkeypatch.setattr(perceptron, "CACHED_ROWS", 8)  # pieces of four, four and three rows
+    mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0)
+    fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
+    ours, theirs = (
+        mlp.of_parts(fixed, moving, rows_innermost=rows_innermost),
+        reference(mlp, torch.cat([fixed, moving], -1)),
+    )
+    torch.testing.assert_close(ours, theirs)
+    assert ours.transpose(1, 2).is_contiguous() == rows_innermost
+    assert_same_gradients(ours, theirs, torch.randn(2, 11, 20), [moving, *mlp.parameters()])
+
+
+def test_frozen_parameters_get_no_gradient_but_pass_one_on():
+    mlp = SeedMLP(generators(0, 1), (7, 16, 1), "relu", 1.0).requires_grad_(False)
+    x = torch.randn(2, 11, 7, requires_grad=True)
+    ours, theirs = mlp(x), reference(mlp, x)
+    assert_same_gradients(ours, theirs, torch.randn(2, 11, 1), [x])
+    mlp(x).sum().backward()
+    assert x.grad is not None
+    assert all(p.grad is None for p in mlp.parameters())
 
 
 def test_bfloat16_products_stay_near_float32_and_keep_float32_gradients():

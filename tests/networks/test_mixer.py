@@ -1,16 +1,26 @@
 """The mixer never falls when an agent's value rises, and what makes it so is its absolute values."""
 
+import pytest
 import torch
 from torch.nn.functional import elu
 
+from esp_cli.networks import mixer as mixing
 from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.training.streams import generators
+from tests.networks.gradients import assert_same_gradients
 
 SEEDS, AGENTS, STATE, WIDTH = (0, 1), 3, 5, 8
 
 
 def mixer(seeds=SEEDS) -> MonotonicMixer:
     return MonotonicMixer(generators(seeds, "mixer"), AGENTS, STATE, WIDTH, 16)
+
+
+def by_formula(mix, values, state, bound=torch.abs):
+    """The team's value by torch's own operations: [S, B]."""
+    first, bias, second, offset = mix.hypernetwork(state).split((AGENTS * WIDTH, WIDTH, WIDTH, 1), -1)
+    hidden = elu((values.unsqueeze(-2) @ bound(first.unflatten(-1, (AGENTS, WIDTH)))).squeeze(-2) + bias)
+    return (hidden * bound(second)).sum(-1) + offset.squeeze(-1)
 
 
 def slopes(function) -> torch.Tensor:
@@ -27,9 +37,22 @@ def test_the_team_value_rises_with_every_agents_value():
     assert (gradient > 0).float().mean() > 0.99
 
 
-def test_without_absolute_values_it_would_not(monkeypatch):
-    monkeypatch.setattr(torch.Tensor, "abs", lambda x: x)
-    assert (slopes(mixer()) < 0).float().mean() > 0.1
+def test_without_absolute_values_it_would_not():
+    mix = mixer()
+    assert (slopes(lambda values, state: by_formula(mix, values, state, lambda x: x)) < 0).float().mean() > 0.1
+
+
+@pytest.mark.parametrize("cached", [4096, 8])  # at once, and in pieces of four, four and two rows
+def test_the_hand_written_backward_equals_autograd_through_the_formula(cached, monkeypatch):
+    monkeypatch.setattr(mixing, "CACHED_ROWS", cached)
+    mix, weight = mixer(), torch.randn(2, 10)
+    values, state = torch.randn(2, 10, AGENTS, requires_grad=True), torch.randn(2, 10, STATE, requires_grad=True)
+    ours, theirs = mix(values, state), by_formula(mix, values, state)
+    torch.testing.assert_close(ours, theirs)
+    assert_same_gradients(ours, theirs, weight, [values, state, *mix.parameters()])
+    unbounded = by_formula(mix, values, state, lambda x: x)
+    with pytest.raises(AssertionError):
+        assert_same_gradients(mix(values, state), unbounded, weight, [values])
 
 
 def test_the_best_joint_action_is_made_of_the_best_own_actions():
