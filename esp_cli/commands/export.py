@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp export formation -f c -o formation-c\n
     esp export runs/cn-mappo -f onnx -f numpy -o cn-export\n
-    esp export formation -f webots -o controllers/esp_epuck_webots\n
+    esp export formation -f webots -o formation-webots\n
     esp export runs/cn-mappo -f policy -o checkpoints"""
 
 FORMATS = ("onnx", "torch", "c", "numpy", "webots", "ros2", "policy")

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from esp_cli.deploy import check
+from esp_cli.deploy import check, epuck
 from esp_cli.deploy.c_source import CSource, c_source, example_source
 from esp_cli.deploy.card import describe, readme, summary
 from esp_cli.deploy.check import Agreement, Sample, take_sample
+from esp_cli.deploy.epuck_c import epuck_sources
 from esp_cli.deploy.numpy_file import numpy_source
 from esp_cli.deploy.onnx_file import onnx_model
 from esp_cli.deploy.program import Program
@@ -39,6 +40,7 @@ class Export:
         size: of them together, bytes.
         agreement: with the policy; None where it could not be run here.
         note: why it could not.
+        seen: largest difference between an observation built from poses and the task's; None where none is built.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Export:
     size: int
     agreement: Agreement | None
     note: str | None = None
+    seen: float | None = None
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class _Job:
     program: Program
     sample: Sample
     description: dict[str, Any]
+    scenes: epuck.Scenes | None
+    """Of a policy that can drive an e-puck."""
 
     @property
     def comment(self) -> str:
@@ -88,26 +93,31 @@ def _c(job: _Job) -> Files:
     observation, action, allowed = (
         np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask")
     )
-    return {
+    files = {
         "policy.h": written.header.encode(),
         "policy.c": written.source.encode(),
         "policy_example.c": example_source(job.program, observation, action, allowed).encode(),
     }
+    return files if job.scenes is None else files | epuck_sources(job.description)
 
 
-def _numpy(job: _Job) -> Files:
+def _policy(job: _Job) -> Files:
     return {"policy.py": numpy_source(job.program, job.comment, job.text).encode()}
 
 
-def _epuck(job: _Job, driver: str) -> Files:
-    """Return the numpy policy with what a robot's program needs beside it."""
+def _numpy(job: _Job) -> Files:
+    beside = {} if job.scenes is None else {"esp_epuck.py": (epuck.RUNTIME / "esp_epuck.py").read_bytes()}
+    return _policy(job) | beside
+
+
+def _epuck(job: _Job, kind: str) -> Files:
+    """Return the numpy policy with what a robot's program needs around it."""
     spec = job.alone.spec
     if "robot" not in job.description:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
     if job.program.memory_width:
         raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
-    runtime = Path(__file__).parent / "runtime"  # read, not imported: it imports what only a robot's machine has
-    return _numpy(job) | {name: (runtime / name).read_bytes() for name in ("esp_epuck.py", driver)}
+    return epuck.controller_files(kind, _policy(job), spec.settings)
 
 
 WRITERS: dict[str, Callable[[_Job], Files]] = {
@@ -115,8 +125,8 @@ WRITERS: dict[str, Callable[[_Job], Files]] = {
     "torch": lambda job: {"policy.pt2": torch_archive(job.program, job.text)},
     "c": _c,
     "numpy": _numpy,
-    "webots": lambda job: _epuck(job, "esp_epuck_webots.py"),
-    "ros2": lambda job: _epuck(job, "esp_epuck_ros2.py"),
+    "webots": lambda job: _epuck(job, "webots"),
+    "ros2": lambda job: _epuck(job, "ros2"),
 }
 """Format -> what writes its files. Adding one is a line here, one in `_runner` and one in `_USE`."""
 
@@ -136,11 +146,13 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
     formats = tuple(dict.fromkeys(formats))
     program = replace(program_of(alone.policy), masked=alone.spec.masks)
     sample = take_sample(alone, program)
-    job = _Job(alone, program, sample, describe(alone, program, sample))
+    description = describe(alone, program, sample)
+    robotic = "robot" in description and not program.memory_width and {"c", "numpy", "webots", "ros2"} & set(formats)
+    job = _Job(alone, program, sample, description, epuck.take_scenes(alone) if robotic else None)
     written = {name: WRITERS[name](job) for name in formats}
     c = c_source(program, "") if "c" in formats else None
     results = tuple(_checked(name, files, job) for name, files in written.items())
-    sections = [_section(result, job, c) for result in results]
+    sections = [_section(result, job, c) for result in results] + ([epuck.told(description)] if robotic else [])
     beside = {
         "policy.json": (json.dumps(job.description, indent=2) + "\n").encode(),
         "README.md": readme(alone, job.description, sections).encode(),
@@ -158,6 +170,7 @@ def _write(files: Files, folder: Path, force: bool) -> None:
         raise ValueError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         replace_file(folder / name, content)
 
 
@@ -169,11 +182,21 @@ def _checked(name: str, files: Files, job: _Job) -> Export:
     with TemporaryDirectory(prefix="esp-export-") as scratch:
         folder = Path(scratch)
         for file, content in files.items():
-            (folder / file).write_bytes(content)
+            (folder / Path(file).name).write_bytes(content)
         agreement = check.compare(job.sample, _runner(name, folder, job.program))
         if name == "c" and not check.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
-    return Export(name, tuple(files), size, agreement)
+        seen = _seen(name, folder, job)
+    return Export(name, tuple(files), size, agreement, seen=seen)
+
+
+def _seen(name: str, folder: Path, job: _Job) -> float | None:
+    """Compare the observations that a format builds from poses with the task's."""
+    if job.scenes is None or name in ("onnx", "torch"):
+        return None
+    c = name == "c"
+    observe = epuck.c_observer(folder, job.program.num_inputs) if c else epuck.python_observer(job.description)
+    return epuck.compare_scenes(job.scenes, observe)
 
 
 def _runner(name: str, folder: Path, program: Program) -> check.Runner:
@@ -200,6 +223,11 @@ def _section(result: Export, job: _Job, c: CSource | None) -> str:
             f"{agreement.max_difference:.1e}"
             + (f", {agreement.other_actions} other choices (ties)." if job.program.head == "choose" else ".")
         )
+    if result.seen is not None:
+        told.append(
+            f"Observations built from poses were compared with the task's in {epuck.STATES} states: largest difference "
+            f"{result.seen:.1e}."
+        )
     if result.name == "c" and c is not None:
         told += ["", *cost_lines(c, job.program)]
     return "\n".join([*told, ""])
@@ -221,8 +249,14 @@ _NUMPY_USE = (
     "worked example."
 )
 _ROBOT_USE = (
-    " Supervisor-given positions in, wheel speeds out. **It was run against a mocked interface over simulated robots, "
-    "and never on hardware**: lift the robots before the first start. The file's head says what it expects."
+    " Positions of all robots in, wheel speeds out; robots stand still where a number is not finite. **It was run "
+    "against a mocked interface over simulated robots, and never on hardware**: lift the robots before the first start."
+    " The controller's head says what it expects."
+)
+_WEBOTS_USE = "A Webots project around the numpy policy: open `worlds/formation.wbt` (untested in Webots)." + _ROBOT_USE
+_ROS2_USE = (
+    "A ROS 2 package around the numpy policy (untested in ROS 2): `colcon build`, then `ros2 launch esp_formation "
+    "formation.launch.py`." + _ROBOT_USE
 )
 _USE = {
     "onnx": (
@@ -243,7 +277,7 @@ _USE = {
         "checks the worked example.",
     ),
     "numpy": (_NUMPY_USE, f"{_NUMPY_USE} It remembers: `action, memory = policy.step(obs, memory)`."),
-    "webots": (f"A Webots controller around the numpy policy.{_ROBOT_USE}",) * 2,
-    "ros2": (f"A ROS 2 node around the numpy policy.{_ROBOT_USE}",) * 2,
+    "webots": (_WEBOTS_USE, _WEBOTS_USE),
+    "ros2": (_ROS2_USE, _ROS2_USE),
 }
 """How a format is used: by a policy that remembers nothing, and by one that does."""

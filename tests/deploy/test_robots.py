@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
 import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from esp_cli.deploy.epuck import take_scenes
 from esp_cli.deploy.export import export
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
@@ -21,6 +23,14 @@ from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.deploy.policies import drawn_policy
 
 STEPS = 40
+EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
+WEBOTS = Path("controllers") / "esp_epuck_webots"
+
+
+@pytest.fixture(autouse=True)
+def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare observations in a few states; test_epuck.py does it in all of them."""
+    monkeypatch.setattr("esp_cli.deploy.epuck.take_scenes", partial(take_scenes, count=50))
 
 
 class Team:
@@ -50,12 +60,10 @@ def imported(folder: Path, name: str, monkeypatch: pytest.MonkeyPatch, **fakes: 
     """Import an exported file as its robot's machine would, with other modules beside it."""
     for other, module in fakes.items():
         monkeypatch.setitem(sys.modules, other, module)
-    for part in ("policy", "esp_epuck", name):
-        spec = importlib.util.spec_from_file_location(part, folder / f"{part}.py")
-        module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, part, module)
-        spec.loader.exec_module(module)
-    return module
+    for other in [known for known in sys.modules if known.split(".")[0] in EXPORTED]:
+        monkeypatch.delitem(sys.modules, other)
+    monkeypatch.syspath_prepend(folder)
+    return importlib.import_module(name)
 
 
 def fake(**members: object) -> ModuleType:
@@ -101,8 +109,8 @@ def policy_for(case: str, monkeypatch: pytest.MonkeyPatch) -> TrainedPolicy:
 def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = policy_for(case, monkeypatch)
     export(alone, ["webots"], tmp_path)
-    module = imported(tmp_path, "esp_epuck", monkeypatch)
-    policy = sys.modules["policy"]
+    module = imported(tmp_path / WEBOTS, "esp_epuck", monkeypatch)
+    policy = importlib.import_module("policy")
     pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(alone)
     for _ in range(5):
         seen = pilot.observations(team.poses, team.goals, team.pillars[0])
@@ -119,8 +127,9 @@ def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: 
 
 def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(drawn_policy("wheels"), ["ros2"], tmp_path)
-    module = imported(tmp_path, "esp_epuck", monkeypatch)
-    pilot = module.Pilot(sys.modules["policy"].DESCRIPTION, sys.modules["policy"].act)
+    module = imported(tmp_path / "esp_formation", "esp_epuck", monkeypatch)
+    policy = importlib.import_module("policy")
+    pilot = module.Pilot(policy.DESCRIPTION, policy.act)
     poses, goals = np.zeros((2, 3)), np.zeros((2, 2))
     with pytest.raises(ValueError, match="needs one; name its position"):
         pilot.observations(poses, goals)
@@ -212,7 +221,7 @@ def test_the_webots_controller_drives_as_the_policy_does(
         return 0 if len(paths) <= STEPS else -1
 
     first = Robot(team, 0, wheels, advance)
-    module = imported(tmp_path, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
     pilot = module.Pilot(sys.modules["policy"].DESCRIPTION, sys.modules["policy"].act)
     # goals are opposite to the posts, from which the start is up to a centimetre away
     goals = [tuple(goal) for goal in team.goals]
@@ -231,7 +240,7 @@ def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: p
     export(alone, ["webots"], tmp_path)
     team = Team(alone)
     robot = Robot(team, 0, np.zeros((8, 2)))
-    module = imported(tmp_path, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
     monkeypatch.setattr(robot, "getBasicTimeStep", lambda: 32.0)
     with pytest.raises(ValueError, match=r"basicTimeStep is 32\.0 ms; take a divisor of 100 ms"):
         module.main()
@@ -288,12 +297,13 @@ def ros_fakes(spin=None) -> dict[str, ModuleType]:
     }
 
 
-def ros_poses(poses: np.ndarray) -> SimpleNamespace:
+def ros_poses(poses: np.ndarray, stamp_s: int = 0) -> SimpleNamespace:
     def pose(x: float, y: float, heading: float) -> SimpleNamespace:
         turn = SimpleNamespace(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2))
         return SimpleNamespace(position=SimpleNamespace(x=x, y=y), orientation=turn)
 
-    return SimpleNamespace(poses=[pose(*row) for row in poses.tolist()])
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp_s, nanosec=0))
+    return SimpleNamespace(header=header, poses=[pose(*row) for row in poses.tolist()])
 
 
 def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,11 +332,26 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
         node.now_s -= 0.6
         node.tick()
         assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        lost = team.poses.copy()
+        lost[3, 1] = math.nan
+        node.callback(ros_poses(lost))
+        node.tick()
+        assert all(node.published[f"epuck{k}/wheel_speeds"].data == [0.0, 0.0] for k in range(8)), "one robot is lost"
+        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        node.now_s += 0.6
+        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data == [0.0, 0.0], "a tracker that repeats itself tells nothing"
+        node.callback(ros_poses(team.poses, stamp_s=2))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
         nodes.append(node)
         raise KeyboardInterrupt
 
     nodes: list[RosNode] = []
-    module = imported(tmp_path, "esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
+    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
     module.main()
     assert nodes[0].published["epuck0/wheel_speeds"].data == [0.0, 0.0], "interrupted robots stand still"
     gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
@@ -337,8 +362,10 @@ def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export(drawn_policy("wheels"), ["ros2"], tmp_path)
-    module = imported(tmp_path, "esp_epuck_ros2", monkeypatch, **ros_fakes())
+    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes())
     driver = module.Driver()
+    driver.see(ros_poses(np.array([[math.nan, -0.5, 1.0], [0.1, 0.2, -3.0]])))
+    assert driver.goals == [], "a start that is not finite tells no goal"
     driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0]])))
     assert driver.goals == [(-0.9, 0.5), (-0.1, -0.2)]
     assert driver.poses[1] == pytest.approx((0.1, 0.2, -3.0))

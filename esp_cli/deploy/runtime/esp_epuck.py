@@ -10,13 +10,19 @@ from typing import Any
 
 import numpy as np
 
+PATIENCE_S = 0.5
+"""Age of poses beyond which robots stand still."""
+
 
 class Pilot:
     """Drives a team: where everybody is in, wheel speeds out.
 
     Args:
-        description: DESCRIPTION of the exported policy.
+        description: DESCRIPTION of the exported policy; an observation follows its layout.
         act: its act(obs).
+
+    Raises:
+        ValueError: the policy sees something that poses do not tell.
     """
 
     def __init__(self, description: dict[str, Any], act: Callable[[Any], Any]) -> None:
@@ -25,8 +31,9 @@ class Pilot:
         self.control_period_s = float(description["task"]["control_period_s"])
         self.nearness = settings["sight"] == "nearness"
         self.pillar_radius_m = settings["obstacle_radius_m"]
-        names = [field["field"] for field in description["observation"]]
-        self.sees_pillar = "obstacle" in names
+        self.fields = [field["field"] for field in description["observation"]]
+        if unknown := set(self.fields) - {"heading", "obstacle", "goal", "robots"}:
+            raise ValueError(f"poses do not tell what this policy sees: {', '.join(sorted(unknown))}")
         self.seen_robots = min(settings["neighbours"], settings["num_agents"] - 1)
         options = description["action"].get("options")
         self.pairs = np.array([option["means"] for option in options]) if options else None
@@ -38,25 +45,41 @@ class Pilot:
             poses: [N, 3] x, y, heading of every robot.
             goals: [N, 2] x, y.
             pillars: [M, 2] x, y of their centres.
+
+        Raises:
+            ValueError: other shapes, or fewer robots or pillars than the policy sees.
         """
         poses, goals = np.asarray(poses, float), np.asarray(goals, float)
         pillars = np.asarray(pillars, float).reshape(-1, 2)
         if poses.ndim != 2 or poses.shape[1] != 3 or goals.shape != (len(poses), 2):
             raise ValueError(f"poses {poses.shape} and goals {goals.shape} should be [N, 3] and [N, 2]")
         position, heading = poses[:, :2], poses[:, 2]
-        parts = [np.stack([np.cos(heading), np.sin(heading)], -1)]
-        if self.sees_pillar:
-            parts.append(self._pillar(position, pillars))
-        parts.append(goals - position)
-        if self.seen_robots:
-            parts.append(self._others(position))
-        return np.concatenate(parts, -1).astype(np.float32)
+        parts: dict[str, Callable[[], Any]] = {
+            "heading": lambda: np.stack([np.cos(heading), np.sin(heading)], -1),
+            "obstacle": lambda: self._pillar(position, pillars),
+            "goal": lambda: goals - position,
+            "robots": lambda: self._others(position),
+        }
+        return np.concatenate([parts[field]() for field in self.fields], -1).astype(np.float32)
 
-    def wheels(self, poses: Any, goals: Any, pillars: Any = ()) -> Any:
-        """Return left and right wheel speed [N, 2] of every robot, rad/s; arguments as of `observations`."""
+    def wheels(self, poses: Any, goals: Any, pillars: Any = (), age_s: float = 0.0) -> Any:
+        """Return left and right wheel speed [N, 2] of every robot, rad/s; zeros where it is not safe to drive.
+
+        The whole team stops when the poses are older than `PATIENCE_S`, and when any number is not finite: a robot
+        whose neighbour is lost does not know what to avoid.
+
+        Args:
+            poses: [N, 3] x, y, heading of every robot.
+            goals: [N, 2] x, y.
+            pillars: [M, 2] x, y of their centres.
+            age_s: of the poses, s; below 0 where clocks differ.
+        """
+        numbers = [np.asarray(given, float).ravel() for given in (poses, goals, pillars)]
+        if not abs(age_s) <= PATIENCE_S or not np.isfinite(np.concatenate(numbers)).all():
+            return np.zeros((len(poses), 2))
         action = self.act(self.observations(poses, goals, pillars))
-        chosen = np.clip(action, -1, 1) if self.pairs is None else self.pairs[action]
-        return np.asarray(chosen, float) * self.robot["max_wheel_speed_rad_s"]
+        chosen = np.asarray(np.clip(action, -1, 1) if self.pairs is None else self.pairs[action], float)
+        return np.where(np.isfinite(chosen).all(), chosen, 0.0) * self.robot["max_wheel_speed_rad_s"]
 
     def twist(self, wheels: Any) -> Any:
         """Return forward speed (m/s) and turning rate (rad/s) [..., 2] of wheel speeds [..., 2]."""

@@ -1,6 +1,6 @@
 """ROS 2 node: drives a team of e-pucks that changes formation by an exported policy. Untested on hardware.
 
-Put this file, esp_epuck.py and policy.py into one folder and run `python3 esp_epuck_ros2.py` in a sourced ROS 2.
+The package around it starts it: `colcon build`, then `ros2 launch esp_formation formation.launch.py`.
 
 Subscribes to
     poses (geometry_msgs/PoseArray): all robots in the order of their numbers, in the arena's frame (metres, z up),
@@ -12,23 +12,22 @@ Parameters
     goals (list of x, y of every robot, m): by default opposite to where each is first seen;
     pillars (list of x, y of each, m): by default none.
 
-Robots stand still until the first poses come, and when none came for half a second.
+Robots stand still until the first poses come, when no new ones came for half a second, and when a number is not
+finite. Poses with the time stamp of those before are not new.
 """
 
 from __future__ import annotations
 
 import math
+from itertools import chain
 from typing import Any
 
-import policy
 import rclpy
-from esp_epuck import Pilot
+from esp_formation import policy
+from esp_formation.esp_epuck import Pilot
 from geometry_msgs.msg import PoseArray, Twist
 from rclpy.node import Node
 from std_msgs.msg import Float32MultiArray
-
-PATIENCE_S = 0.5
-"""Age of poses beyond which robots stand still."""
 
 
 def pose_of(message: Any) -> tuple[float, float, float]:
@@ -47,7 +46,7 @@ class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
         self.goals = self._points("goals")
         self.pillars = self._points("pillars")
         self.poses: list[tuple[float, float, float]] = []
-        self.seen_at_s = -math.inf
+        self.seen_at_s, self.stamp = -math.inf, (0, 0)
         self.outputs: list[tuple[Any, Any]] = []
         self.create_subscription(PoseArray, "poses", self.see, 1)
         self.create_timer(self.pilot.control_period_s, self.act)
@@ -60,10 +59,14 @@ class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
         return list(zip(values[::2], values[1::2], strict=True))
 
     def see(self, message: Any) -> None:
-        """Take in where everybody is."""
+        """Take in where everybody is, unless a tracker repeats itself."""
+        stamp = (message.header.stamp.sec, message.header.stamp.nanosec)
+        if stamp == self.stamp != (0, 0):
+            return
+        self.stamp = stamp
         self.poses = [pose_of(pose) for pose in message.poses]
         self.seen_at_s = self._now_s()
-        if not self.goals:
+        if not self.goals and all(map(math.isfinite, chain.from_iterable(self.poses))):
             self.goals = [(-x, -y) for x, y, _ in self.poses]
         for k in range(len(self.outputs), len(self.poses)):
             wheels = self.create_publisher(Float32MultiArray, f"epuck{k}/wheel_speeds", 1)
@@ -71,10 +74,11 @@ class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
 
     def act(self) -> None:
         """Drive everybody, or stop them where nobody knows where they are."""
-        if self._now_s() - self.seen_at_s > PATIENCE_S or len(self.goals) != len(self.poses):
+        if len(self.goals) != len(self.poses):
             self.send([(0.0, 0.0)] * len(self.outputs))
             return
-        self.send(self.pilot.wheels(self.poses, self.goals, self.pillars))
+        age_s = self._now_s() - self.seen_at_s
+        self.send(self.pilot.wheels(self.poses, self.goals, self.pillars, age_s))
 
     def send(self, wheels: Any) -> None:
         """Publish left and right wheel speed of every robot, rad/s."""
