@@ -4,8 +4,7 @@ A task never says how it transforms under a rotation. It says what each number *
 vector, a pair of wheel speeds, ...); how a group element acts on that kind is known once, elsewhere.
 
 Shape letters, used in every docstring of this project:
-    S seeds, T steps, E worlds (environments) per seed, B batch, N agents, D observation width,
-    A number of discrete actions, G number of group elements.
+    S seeds, T steps, E worlds per seed, B batch, N agents, D observation width, A discrete actions, G group elements.
 
 Axes and signs: x points right, y points up, angles are counter-clockwise in radians.
 """
@@ -31,7 +30,6 @@ class Kind:
     WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
     PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
                   top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
-
     RING          one number for each of n rays around a body, counter-clockwise from the x-axis (a lidar). A turn by
                   360 / n shifts them, a mirror in the x-axis reverses them; other turns are refused.
     RECORD        several numbers of several kinds, as the field's `parts` say (another agent's position and its speed).
@@ -235,6 +233,7 @@ class Spaces:
         action: the action space, the same for every agent.
         symmetry: under what the *dynamics and reward* are invariant: the largest planar group or one element ("d4",
             "o2", "flip-y"), with "*agents" where the agents may also be exchanged ("d4*agents").
+        nearly: a larger symmetry that holds nearly, which a prior may use all the same; empty where there is none.
         masks: whether each observation says which of the discrete actions each agent may take.
     """
 
@@ -243,6 +242,7 @@ class Spaces:
     state: Layout
     action: ActionSpace
     symmetry: str
+    nearly: str = ""
     masks: bool = False
 
     @property

@@ -9,7 +9,7 @@ from esp_envs.spec import Spaces
 
 _TRIED = "d8,rot57,flip23"
 """Turns and mirrors that are tried; the last two stand for all angles."""
-_NAMED = ("c2", "flip-x", "flip-y", "d2", "c4", "d4", "c8", "d8")
+_NAMED = ("c2", "flip-x", "flip-y", "flip-diagonal", "flip-antidiagonal", "d2", "c4", "d4", "c8", "d8")
 """Groups that are named as found, smaller ones first, if all their elements hold."""
 _MOST = 64
 
@@ -65,7 +65,7 @@ def is_declared(element: Element, spaces: Spaces) -> bool:
 def found_group(holding: Collection[str], spaces: Spaces) -> str:
     """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
     plane = "c1"
-    for name in (*_NAMED, _plane(spaces)):
+    for name in sorted((*_NAMED, _plane(spaces)), key=lambda name: len(_elements(name, 1))):
         if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
             plane = name
     if "rot57" in holding:

@@ -59,9 +59,14 @@ def _carries(name: str, spaces: Spaces) -> bool:
     return _reason(found.generators() if isinstance(found, Group) else found, spaces) is None
 
 
+def _usable(spaces: Spaces) -> str:
+    """Return the symmetry that a prior may use: one that holds nearly, else the one that holds."""
+    return spaces.nearly or spaces.symmetry
+
+
 def _declared_plane(spaces: Spaces) -> str:
-    """Return the planar part of the declared symmetry; empty where there is none."""
-    return "*".join(name for name in spaces.symmetry.split("*") if name != "agents")
+    """Return the planar part of the symmetry that a prior may use; empty where there is none."""
+    return "*".join(name for name in _usable(spaces).split("*") if name != "agents")
 
 
 def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
@@ -113,8 +118,8 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         return None
     if any(len(element.permutation or ()) != spaces.num_agents for element in moving):
         return f"the permutation is not one of its {spaces.num_agents} agents"
-    if "agents" not in spaces.symmetry.split("*"):
-        return f"its declared symmetry, {spaces.symmetry}, does not say that agents may be exchanged"
+    if "agents" not in _usable(spaces).split("*"):
+        return f"its declared symmetry, {_usable(spaces)}, does not say that agents may be exchanged"
     joint = spaces.state == joint_layout(spaces.observation, spaces.num_agents)
     if not joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"

@@ -18,7 +18,7 @@ from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
-from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness
+from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness, outside_sector
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
 
@@ -70,7 +70,8 @@ class Formation(LockstepTask):
         turns to the goal and drives.
 
     Symmetry: quarter turns and mirrors (`d4`). A rotation turns headings and vectors and leaves wheels alone, a mirror
-        swaps the wheels. Pillars and goals stand in the state and turn along.
+        swaps the wheels. Pillars and goals stand in the state and turn along. Settings that break it leave: `slope` and
+        `blind_sector_rad` the mirror `flip-x`, `heading_offset_rad` quarter turns, `lame_wheel` these without exchange.
 
     Versions: 1, the first.
     """
@@ -157,7 +158,12 @@ class Formation(LockstepTask):
         if self.settings.action_delay:
             waiting = torch.cat([self._pending, chosen.unsqueeze(0)])
             chosen, self._pending = waiting[0], waiting[1:]
-        return chosen * self._wheel_factor * MAX_WHEEL_SPEED
+        speeds = chosen * self._wheel_factor * MAX_WHEEL_SPEED
+        if self.settings.slope:
+            speeds = speeds * (1 - self.settings.slope * self._heading.cos().unsqueeze(-1) * speeds.sign())
+        if self.settings.lame_wheel:
+            speeds[:, 0, 0] *= 1 - self.settings.lame_wheel
+        return speeds
 
     def _look(self) -> None:
         """Measure where everything is: distances to goals, ways and distances between bodies."""
@@ -187,8 +193,12 @@ class Formation(LockstepTask):
         if self.settings.seen_robots:
             offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
         seen = torch.cat(offsets, 2)
+        if self.settings.blind_sector_rad:
+            seen[:, :, 1:] = outside_sector(seen[:, :, 1:], self.settings.blind_sector_rad)
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(heading, seen)
+        if self.settings.heading_offset_rad:
+            heading = heading + self.settings.heading_offset_rad
         direction = torch.stack([heading.cos(), heading.sin()], -1)
         goal, pillar, others = seen.split([1, min(pillars, 1), self.settings.seen_robots], 2)
         if self.settings.seen_as == "nearness":

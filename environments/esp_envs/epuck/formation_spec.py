@@ -9,6 +9,7 @@ from pydantic import model_validator
 from torch import Tensor
 
 from esp_envs.base import TaskSettings
+from esp_envs.breaking import Breaking, described, remaining
 from esp_envs.epuck.arena import Arena
 from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -72,6 +73,29 @@ class FormationSettings(TaskSettings):
     mass_spread: float = Setting(0.0, ge=0, lt=1, description="masses are drawn from 1 - spread to 1 + spread e-pucks")
     friction_spread: float = Setting(0.0, ge=0, lt=1, description="likewise the grip of the wheels")
 
+    slope: float = Setting(
+        0.0, ge=0, lt=1, description="breaks symmetry: share of a wheel's speed lost uphill, along x, and won downhill"
+    )
+    lame_wheel: float = Setting(
+        0.0, ge=0, le=1, description="breaks mirrors: share of its speed that the first robot's left wheel lacks"
+    )
+    heading_offset_rad: float = Setting(
+        0.0, ge=0, le=3.15, description="breaks mirrors: the seen heading is off by this, rad"
+    )
+    blind_sector_rad: float = Setting(
+        0.0, ge=0, le=6.3, description="breaks symmetry: width of the sector around x in which no body is seen, rad"
+    )
+
+    @property
+    def breakings(self) -> tuple[Breaking, ...]:
+        """What breaks the symmetry, with the group that is left."""
+        return (
+            Breaking("slope", self.slope, "flip-x"),
+            Breaking("lame_wheel", self.lame_wheel, "c4", agents=False),
+            Breaking("heading_offset_rad", self.heading_offset_rad, "c4"),
+            Breaking("blind_sector_rad", self.blind_sector_rad, "flip-x"),
+        )
+
     @property
     def penalty(self) -> float:
         """c_collision with its default filled in."""
@@ -112,7 +136,8 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
     return TaskSpec(
         name="formation",
         version=1,
-        convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}",
+        convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}"
+        + described(settings.breakings),
         num_agents=robots,
         horizon=settings.horizon,
         observation=filled_layout(
@@ -131,7 +156,8 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
             Field("obstacles", Kind.VECTOR, pillars, "m"),
         ),
         action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
-        symmetry="d4*agents",
+        symmetry=remaining("d4*agents", settings.breakings),
+        nearly="d4*agents",
         shared_reward=False,
         control_period_s=settings.control_period_s,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),

@@ -9,6 +9,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
+from esp_envs.breaking import described, remaining
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
@@ -95,7 +96,8 @@ class Navigation(ParticleTask):
     the nearest agent, length), `coverage` (share of landmarks with an agent within 0.1).
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections of the plane; five discrete moves
-    carry those of the square (`d4`), a planar force carries all (`o2`).
+    carry those of the square (`d4`), a planar force carries all (`o2`). Settings that break it leave: `wind` and `mud`
+    the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents.
 
     Heuristics: `greedy` (each agent takes a landmark of its own), `cover` (agents share out all landmarks
     between them, for L > N).
@@ -116,13 +118,13 @@ class Navigation(ParticleTask):
         agents, landmarks = settings.num_agents, settings.landmarks
         bodies = Bodies(
             radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
-            gain=(SENSITIVITY,) * agents,
+            gain=settings.gains(*(SENSITIVITY,) * agents),
             max_speed=None,
             contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
             watched=tuple((a, agents + k) for a in range(agents) for k in range(landmarks)),
         )
         self._extents = (1.0,) * agents + (settings.extent,) * landmarks
-        self._build(_spec(settings), bodies)
+        self._build(_spec(settings), bodies, (SENSITIVITY,) * agents)
         self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
         # [N, pairs]: which agents take part in which pair
         self._takes_part = torch.zeros(agents, len(bodies.contacts), device=self.device)
@@ -183,12 +185,13 @@ class Navigation(ParticleTask):
 def _spec(settings: NavigationSettings) -> TaskSpec:
     agents, landmarks = settings.num_agents, settings.landmarks
     discrete = settings.actions == "discrete"
+    whole = "d4*agents" if discrete else "o2*agents"
     esp = settings.convention == "esp"
     reward = "team sum, self-collision counted" if esp else f"local_ratio {settings.local_ratio:g}"
     return TaskSpec(
         name="navigation",
         version=1,
-        convention=f"{settings.convention}: {reward}",
+        convention=f"{settings.convention}: {reward}{described(settings.breakings)}",
         num_agents=agents,
         horizon=settings.horizon,
         observation=filled_layout(
@@ -203,7 +206,8 @@ def _spec(settings: NavigationSettings) -> TaskSpec:
             Field("landmarks", Kind.VECTOR, landmarks, "length"),
         ),
         action=MOVES if discrete else FORCE,
-        symmetry="d4*agents" if discrete else "o2*agents",
+        symmetry=remaining(whole, settings.breakings),
+        nearly=whole,
         shared_reward=esp,
         settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
     )

@@ -120,16 +120,24 @@ class ParticleWorlds:
         torch.mul(self._offset, self._offset, out=self._square)
         torch.add(self._square[:, 0], self._square[:, 1], out=self._squared_distance)
 
-    def advance(self, control: Tensor) -> None:
+    def advance(self, control: Tensor, push: Tensor | None = None, mud: float = 0.0) -> None:
         """Advance all worlds by DT_S.
 
         Args:
             control: [A, 2, W'] wish of each agent in units of its gain, normally of length <= 1.
+            push: acceleration [A, 2, W' or 1] that nobody wishes for, length / s^2.
+            mud: share of the velocity that a step costs more where x > 0.
         """
+        held = 1 - mud * (self.position[:, :1] > 0).float() if mud else None
         contact = self._contact_impulses()
         if not self.velocity_first:
             self.position.add_(self.velocity, alpha=DT_S)
-        self.velocity.mul_(1 - DAMPING).addcmul_(control, self._gain).add_(contact)
+        self.velocity.mul_(1 - DAMPING)
+        if held is not None:
+            self.velocity.mul_(held)
+        self.velocity.addcmul_(control, self._gain).add_(contact)
+        if push is not None:
+            self.velocity.add_(push, alpha=DT_S)
         if self._max_speed is not None:
             square = self.velocity.square()
             speed = (square[:, 0] + square[:, 1]).sqrt_()

@@ -79,7 +79,8 @@ class PredatorPrey(ParticleTask):
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
     `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`) need not be
-    equivariant: then the symmetry holds for physics and reward, but the prey breaks it.
+    equivariant: then nothing is declared to be left. Other settings that break the symmetry leave: `wind` and `mud` the
+    mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of predators.
 
     Heuristics: `greedy` (predators run at the prey; with `control="prey"`: the fleeing prey).
 
@@ -101,15 +102,17 @@ class PredatorPrey(ParticleTask):
         touches = tuple((a, predators) for a in range(predators))
         shoves = [(a, b) for a in range(predators) for b in range(a + 1, predators)]
         bumps = [(a, agents + k) for a in range(agents) for k in range(obstacles)]
+        full_gain = (PREDATOR_GAIN,) * predators + (PREY_GAIN,)
         bodies = Bodies(
             radius=(PREDATOR_RADIUS,) * predators + (PREY_RADIUS,) + (OBSTACLE_RADIUS,) * obstacles,
-            gain=(PREDATOR_GAIN,) * predators + (PREY_GAIN,),
+            gain=settings.gains(*full_gain),
             max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
             contacts=(*touches, *shoves, *bumps),
         )
         self._extents = (1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles
         self._prey_learns = settings.control == "prey"
-        self._build(predator_prey_spec(settings), bodies, first_learner=predators if self._prey_learns else 0)
+        first_learner = predators if self._prey_learns else 0
+        self._build(predator_prey_spec(settings), bodies, full_gain, first_learner)
         self._prey_plan = torch.zeros(settings.horizon, 2, self.worlds.num_lanes, device=self.device)
         self._frozen: FrozenPrey | None = None
         if settings.prey_policy is not None:

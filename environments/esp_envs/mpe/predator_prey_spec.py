@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field as Setting
 from pydantic import model_validator
 
+from esp_envs.breaking import Breaking, described, remaining
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
@@ -42,16 +43,20 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     order = "velocity first" if settings.convention == "esp" else "position first"
     reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
     opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
+    whole = "d4*agents" if discrete or prey_learns else "o2*agents"
+    learned = Breaking("learned prey", float(settings.prey == "policy"), "c1", agents=False)
+    breakings = (*settings.breakings, learned)
     return TaskSpec(
         name="predator-prey",
         version=1,
-        convention=f"{settings.convention}: {reward}, {opponent}, {order}",
+        convention=f"{settings.convention}: {reward}, {opponent}, {order}{described(settings.breakings)}",
         num_agents=1 if prey_learns else settings.num_predators,
         horizon=settings.horizon,
         observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
         state=_state_layout(settings),
         action=MOVES if discrete else FORCE,
-        symmetry="d4*agents" if discrete or prey_learns else "o2*agents",
+        symmetry=remaining(whole, breakings),
+        nearly=whole,
         shared_reward=True,
         settings=settings.model_dump(),
     )

@@ -14,6 +14,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
+from esp_envs.breaking import Breaking
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
@@ -36,6 +37,36 @@ class ParticleSettings(TaskSettings):
         "discrete", description="five moves, or a planar force in the unit disc"
     )
     horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode (0.1 s each); 25 in MPE")
+    wind: float = Setting(
+        0.0, ge=0, le=10, description="breaks symmetry: a force on every body along x, as a share of its full force"
+    )
+    gust_mean: float = Setting(
+        0.0, ge=0, le=100, description="breaks symmetry: mean of a random force per step and axis, length/s^2"
+    )
+    gust_std: float = Setting(
+        0.0, ge=0, le=100, description="standard deviation of that force; alone it keeps the symmetry in distribution"
+    )
+    mud: float = Setting(
+        0.0, ge=0, le=1, description="breaks symmetry: share of the velocity that a step costs more where x > 0"
+    )
+    weak_agent: float = Setting(
+        0.0, ge=0, lt=1, description="breaks the exchange of agents: share of its force that the first one lacks"
+    )
+
+    @property
+    def breakings(self) -> tuple[Breaking, ...]:
+        """What breaks the symmetry, with the group that is left."""
+        return (
+            Breaking("wind", self.wind, "flip-x"),
+            Breaking("gust_mean", self.gust_mean, "flip-diagonal"),
+            Breaking("gust_std", self.gust_std, None),
+            Breaking("mud", self.mud, "flip-x"),
+            Breaking("weak_agent", self.weak_agent, None, agents=False),
+        )
+
+    def gains(self, *full: float) -> tuple[float, ...]:
+        """Return the accelerations of the agents, given the full ones; the first may be weaker."""
+        return (full[0] * (1 - self.weak_agent), *full[1:])
 
 
 class ParticleTask(LockstepTask):
@@ -47,7 +78,7 @@ class ParticleTask(LockstepTask):
 
     settings: ParticleSettings
 
-    def _build(self, spec: TaskSpec, bodies: Bodies, first_learner: int = 0) -> None:
+    def _build(self, spec: TaskSpec, bodies: Bodies, full_gain: Sequence[float], first_learner: int = 0) -> None:
         """Make the worlds; `spec.num_agents` agents from `first_learner` on learn, the task drives the others."""
         self.spec = spec
         velocity_first = self.settings.convention == "esp"
@@ -59,6 +90,11 @@ class ParticleTask(LockstepTask):
         directions = [MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP)]
         self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
         self._points = torch.tensor(MOVES.points, device=self.device)
+        settings, gain = self.settings, torch.tensor(full_gain, device=self.device).view(-1, 1, 1)
+        push = torch.cat([gain * settings.wind, torch.zeros_like(gain)], 1) + settings.gust_mean
+        self._push = push if settings.wind or settings.gust_mean else None
+        gusts = (spec.horizon, bodies.num_agents, 2, lanes) if settings.gust_std else (0,)
+        self._gusts = torch.zeros(gusts, device=self.device)
         self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
 
     @abstractmethod
@@ -86,13 +122,21 @@ class ParticleTask(LockstepTask):
     def _begin(self) -> None:
         self.worlds.velocity.zero_()
         for seed in range(self.num_seeds):
-            self._start(seed, slice(seed * self.num_envs, (seed + 1) * self.num_envs))
+            lanes = slice(seed * self.num_envs, (seed + 1) * self.num_envs)
+            self._start(seed, lanes)
+            if self.settings.gust_std:
+                shape = (*self._gusts.shape[:3], self.num_envs)
+                self._gusts[..., lanes] = torch.randn(shape, generator=self.generators[seed], device=self.device)
         self.worlds.measure()
 
     def _play(self, action: Tensor) -> Outcome:
         self._act(action)
         self._drive()
-        self.worlds.advance(self._control)
+        push = self._push
+        if self.settings.gust_std:
+            gust = self._gusts[self._time] * self.settings.gust_std
+            push = gust if push is None else gust + push
+        self.worlds.advance(self._control, push, self.settings.mud)
         reward, metrics = self._outcome()
         per_agent = self._per_world(reward.expand(self.spec.num_agents, -1).t())
         return per_agent, {name: self._per_world(value) for name, value in metrics.items()}
@@ -102,12 +146,12 @@ class ParticleTask(LockstepTask):
         self.worlds.measure()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return physics, clock and generators."""
+        """Return physics, clock, generators and the episode's gusts, if any."""
         return {
             "physics": self.worlds.rows().clone(memory_format=torch.contiguous_format),
             "time": torch.tensor(self._time),
             "generators": generator_states(self.generators),
-        }
+        } | ({"gusts": self._gusts.clone()} if self.settings.gust_std else {})
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned.
@@ -120,6 +164,8 @@ class ParticleTask(LockstepTask):
             raise ValueError(OTHER_SIZE)
         self.worlds.rows().copy_(physics)
         self._time = int(tensors["time"])
+        if self.settings.gust_std:
+            self._gusts.copy_(tensors["gusts"])
         restore_generators(self.generators, states)
         self.worlds.measure()
 

@@ -63,7 +63,7 @@ class Wildlife(Environment):
     a drone alone above the poacher), `collisions` (drones sent back to their cells), `steps` (its length).
 
     Symmetry: all turns and mirrors of the square (`d4`) where the grid is one, else half turns and mirrors in the axes
-    (`d2`); in both conventions.
+    (`d2`); in both conventions. A `wind`, which carries the poacher to the right, leaves the mirror `flip-x`.
 
     Heuristics: `surround` (all fly to the poacher; the nearest lands when another is beside it in the same step).
 
@@ -230,7 +230,9 @@ class Wildlife(Environment):
         agents, (rows, _, worlds) = self.settings.num_agents, self.plan.shape[:3]
         shape = (rows + 1, worlds, agents + 3)
         drawn = torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self.generators], 1)
-        move = self._points[1 + (4 * drawn[:-1, ..., 1]).long().clamp_(max=3)]
+        wind, way = self.settings.wind, drawn[:-1, ..., 1]
+        direction = 1 + (4 * (way - wind) / max(1 - wind, 1e-9)).long().clamp_(max=3)
+        move = self._points[torch.where(way < wind, MOVES.points.index(RIGHT), direction)]
         self.plan[..., 0, :] = torch.where(drawn[:-1, ..., :1] < self.settings.poacher_moves, move, 0)
         starts = self._different_cells(drawn[..., 2:])
         self.plan[..., 1:, :] = starts[:-1]

@@ -8,6 +8,7 @@ from pydantic import Field as Setting
 from pydantic import model_validator
 
 from esp_envs.base import TaskSettings
+from esp_envs.breaking import Breaking, described, remaining
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
 from esp_envs.wildlife.pictures import PIXELS
 
@@ -31,6 +32,15 @@ class WildlifeSettings(TaskSettings):
     horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode, at most")
     poacher_moves: float = Setting(0.8, ge=0, le=1, description="probability that the poacher moves in a step")
 
+    wind: float = Setting(
+        0.0, ge=0, le=1, description="breaks symmetry: probability that a moving poacher is carried to the right"
+    )
+
+    @property
+    def breakings(self) -> tuple[Breaking, ...]:
+        """What breaks the symmetry, with the group that is left."""
+        return (Breaking("wind", self.wind, "flip-x"),)
+
     @model_validator(mode="after")
     def _fits(self) -> WildlifeSettings:
         if self.width % 2 == 0 or self.height % 2 == 0:
@@ -47,10 +57,12 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
     """Return the spec that follows from the settings."""
     agents, width, height = settings.num_agents, settings.width, settings.height
     before = "before its move, no way round the torus" if settings.convention == "esp" else "after its move"
+    whole = "d4*agents" if width == height else "d2*agents"
     return TaskSpec(
         name="wildlife",
         version=1,
-        convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}",
+        convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}"
+        + described(settings.breakings),
         num_agents=agents,
         horizon=settings.horizon,
         observation=layout(
@@ -62,7 +74,8 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
             Field("poacher", Kind.VECTOR, 1, "cell"),
         ),
         action=MOVES,
-        symmetry="d4*agents" if width == height else "d2*agents",
+        symmetry=remaining(whole, settings.breakings),
+        nearly=whole,
         control_period_s=0.25,
         totals=("captures", "lone_landings", "collisions", "steps"),
         terminates=True,

@@ -1,0 +1,185 @@
+"""Settings that break a task's symmetry: what they do, which group is left, and that 0 changes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from esp_cli.checking import check_symmetry
+from esp_cli.symmetry import Group
+from esp_cli.symmetry.admission import admitted_elements
+from esp_envs import make
+from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.spec import Spaces
+from tests.envs.test_frozen_prey import write
+
+SMALL = {"horizon": 40, "num_agents": 4, "num_obstacles": 2}
+BROKEN = [
+    ("navigation", {"wind": 0.3}, "flip-x*agents"),
+    ("navigation", {"wind": 0.3, "actions": "continuous"}, "flip-x*agents"),
+    ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal*agents"),
+    ("navigation", {"gust_std": 1.0}, "d4*agents"),
+    ("navigation", {"mud": 0.5}, "flip-x*agents"),
+    ("navigation", {"weak_agent": 0.5}, "d4"),
+    ("navigation", {"wind": 0.3, "gust_mean": 1.0}, "c1*agents"),
+    ("predator-prey", {"wind": 0.3}, "flip-x*agents"),
+    ("predator-prey", {"gust_mean": 1.0}, "flip-diagonal*agents"),
+    ("predator-prey", {"mud": 0.5, "prey": "still"}, "flip-x*agents"),
+    ("predator-prey", {"weak_agent": 0.5, "prey": "still"}, "d4"),
+    ("formation", {"slope": 0.3}, "flip-x*agents"),
+    ("formation", {"lame_wheel": 0.5}, "c4"),
+    ("formation", {"heading_offset_rad": 0.3}, "c4*agents"),
+    ("formation", {"blind_sector_rad": 2.0}, "flip-x*agents"),
+    ("wildlife", {"wind": 0.8, "width": 5, "height": 5, "horizon": 30}, "flip-x*agents"),
+]
+
+
+def carried(spec: Spaces) -> set[str]:
+    """Return the elements that a prior with d4*agents may draw."""
+    elements = admitted_elements("d4*agents", spec)
+    return {element.name for element in (elements.generators() if isinstance(elements, Group) else elements)}
+
+
+@pytest.mark.parametrize(("task", "settings", "left"), BROKEN, ids=str)
+def test_the_check_finds_the_group_that_is_declared_to_be_left(task: str, settings, left: str) -> None:
+    settings = settings | (SMALL if task == "formation" else {})
+    spec = make(task, 1, [0], settings).spec
+    swap = "agents-" + "-".join(map(str, [1, 0, *range(2, spec.num_agents)]))
+    report = check_symmetry(lambda n, seeds: make(task, n, seeds, settings), f"d4,{swap}")
+    assert spec.symmetry == left.replace("d4", "d4" if settings.get("actions") != "continuous" else "o2")
+    assert report.holds, "what is declared to be left holds"
+    assert report.found == left, "and nothing more does"
+    assert {"rot90", swap} <= carried(spec), "a prior may use the whole group all the same"
+
+
+def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path) -> None:
+    settings = {"prey": "policy", "prey_policy": write(tmp_path / "prey.safetensors"), "prey_policy_seed": 1}
+    report = check_symmetry(lambda n, seeds: make("predator-prey", n, seeds, settings), "d4")
+    assert report.declared == "c1"
+    outcomes = {element.element: element.outcome for element in report.elements}
+    assert outcomes["rot90"] == outcomes["flip-diagonal"] == "broken"
+
+
+def test_what_several_breakings_leave() -> None:
+    wind, mud, gust = Breaking("wind", 1, "flip-x"), Breaking("mud", 1, "flip-x"), Breaking("gust", 1, "flip-diagonal")
+    weak = Breaking("weak", 1, None, agents=False)
+    assert remaining("d4*agents", []) == "d4*agents"
+    assert remaining("d4*agents", [Breaking("wind", 0, "flip-x")]) == "d4*agents"
+    assert remaining("o2*agents", [wind, mud]) == "flip-x*agents"
+    assert remaining("d4*agents", [wind, gust, weak]) == "c1"
+    assert remaining("d4", [weak]) == "d4"
+    assert described([wind, Breaking("mud", 0.0, "flip-x")]) == ", wind 1"
+
+
+def still(task: str, **settings: object):
+    """Return a step of do-nothing from rest, every body far from the others: agents on x = 2, 4, ... and one on -2."""
+    env = make(task, 1, [0], settings)
+    names = env.spec.state.slices()
+    state = torch.zeros(env.state_shape)
+    places = torch.tensor([[2.0, 0.0], [4.0, 0.0], [-2.0, 0.0]])
+    state[..., names["position"]] = places.flatten()
+    state[..., names["velocity"]] = torch.ones(6) if settings.get("mud") else torch.zeros(6)
+    env.reset()
+    env.set_state(state)
+    after = env.step(torch.zeros(env.action_shape, dtype=torch.int64)).next.state
+    return after[0, 0, names["velocity"]].view(3, 2)
+
+
+def test_a_wind_is_a_share_of_the_full_force() -> None:
+    assert still("navigation", wind=0.3) == pytest.approx(torch.tensor([[0.15, 0.0]] * 3))  # 0.3 x 5 x 0.1 s
+
+
+def test_a_gust_with_a_mean_pushes_along_both_axes() -> None:
+    assert still("navigation", gust_mean=2.0) == pytest.approx(torch.tensor([[0.2, 0.2]] * 3))
+
+
+def test_mud_slows_on_one_side_alone() -> None:
+    assert still("navigation", mud=0.5) == pytest.approx(torch.tensor([[0.375] * 2, [0.375] * 2, [0.75] * 2]))
+
+
+def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() -> None:
+    settings = {"gust_std": 1.0, "num_landmarks": 1, "num_agents": 1}
+    env = make("navigation", 4, [0, 1], settings)
+    env.reset()
+    alone = make("navigation", 4, [1], settings)
+    alone.reset()
+    nothing = torch.zeros(2, 4, 1, dtype=torch.int64)
+    saved = env.state_dict()
+    first = [env.step(nothing).next.state for _ in range(3)]
+    assert torch.equal(alone.step(nothing[1:]).next.state[0], first[0][1])
+    env.load_state_dict(saved)
+    assert all(torch.equal(env.step(nothing).next.state, state) for state in first)
+    speed = first[0][..., :2]
+    assert speed.unique().numel() == speed.numel()
+
+
+def test_the_first_agent_is_weak() -> None:
+    env = make("navigation", 1, [0], {"weak_agent": 0.5, "num_landmarks": 1})
+    state = torch.zeros(env.state_shape)
+    state[..., env.spec.state.slices()["position"]] = torch.tensor([0.0, 0.0, 3.0, 3.0, 6.0, 6.0])
+    env.set_state(state)
+    moved = env.step(torch.full(env.action_shape, 2)).next.state[0, 0, :6].view(3, 2)
+    assert moved == pytest.approx(torch.tensor([[0.25, 0.0], [0.5, 0.0], [0.5, 0.0]]))
+
+
+def driven(heading: float, speed: float, **settings: object) -> float:
+    """Return by how far a robot in the middle drives in one step, m."""
+    env = make("formation", 1, [0], {"num_agents": 1, "num_obstacles": 0, **settings})
+    state = torch.zeros(env.state_shape)
+    names = env.spec.state.slices()
+    state[..., names["heading"]] = torch.tensor([heading, 0.0])
+    env.set_state(state)
+    after = env.step(torch.full(env.action_shape, speed)).next.state
+    return float(after[0, 0, names["position"]][0])
+
+
+def test_a_slope_is_slow_upwards_and_fast_downwards_forwards_and_backwards() -> None:
+    level = driven(1.0, 0.5)
+    assert driven(1.0, 0.5, slope=0.2) == pytest.approx(0.8 * level, rel=0.02)
+    assert driven(-1.0, 0.5, slope=0.2) == pytest.approx(-1.2 * level, rel=0.02)
+    assert driven(-1.0, -0.5, slope=0.2) == pytest.approx(0.8 * level, rel=0.02)
+    assert driven(1.0, -0.5, slope=0.2) == pytest.approx(-1.2 * level, rel=0.02)
+
+
+def test_a_sensor_with_an_offset_turns_the_seen_heading_alone() -> None:
+    env = make("formation", 2, [0], SMALL | {"heading_offset_rad": 0.5})
+    seen = env.reset()
+    heading = seen.state[..., env.spec.state.slices()["heading"]].unflatten(-1, (-1, 2))
+    turned = torch.atan2(*seen.obs[..., :2].flip(-1).unbind(-1)) - torch.atan2(*heading.flip(-1).unbind(-1))
+    assert torch.remainder(turned, 2 * torch.pi) == pytest.approx(torch.full((1, 2, 4), 0.5), abs=1e-5)
+
+
+def test_a_blind_sector_hides_bodies_towards_x_and_never_the_goal() -> None:
+    plain, blind = (make("formation", 8, [0], SMALL | {"blind_sector_rad": width}).reset().obs for width in (0.0, 2.0))
+    names = make("formation", 1, [0], SMALL).spec.observation.slices()
+    assert torch.equal(plain[..., names["goal"]], blind[..., names["goal"]])
+    for name in ("robots", "obstacle"):
+        body = plain[..., names[name]]
+        hidden = torch.atan2(body[..., 1], body[..., 0]).abs() < 1.0
+        assert hidden.any()
+        assert not hidden.all()
+        assert torch.equal(blind[..., names[name]], torch.where(hidden.unsqueeze(-1), 0.0, body))
+
+
+def test_a_full_wind_carries_every_moving_poacher_to_the_right() -> None:
+    def moves(**settings: object) -> torch.Tensor:
+        env = make("wildlife", 16, [0], {"poacher_moves": 1.0, **settings})
+        env.reset()
+        return env.plan[..., 0, :]
+
+    assert (moves(wind=1.0) == torch.tensor([1, 0])).all()
+    share = (moves(wind=0.5) == torch.tensor([1, 0])).all(-1).float().mean()
+    assert share == pytest.approx(0.5 + 0.5 / 4, abs=0.06)
+    assert (moves() == torch.tensor([1, 0])).all(-1).float().mean() == pytest.approx(0.25, abs=0.05)
+
+
+@pytest.mark.parametrize("task", ["navigation", "predator-prey", "formation", "wildlife"])
+def test_breakings_are_off_by_default_and_named_in_the_convention_when_on(task: str) -> None:
+    env = make(task, 1, [0])
+    assert all(breaking.size == 0 for breaking in env.settings.breakings)
+    name = env.settings.breakings[0].name
+    assert make(task, 1, [0], {name: 0.25}).spec.convention == f"{env.spec.convention}, {name} 0.25"
+    with pytest.raises(ValueError, match=name):
+        make(task, 1, [0], {name: -0.1})
