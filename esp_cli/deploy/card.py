@@ -30,7 +30,8 @@ def describe(alone: TrainedPolicy, program: Program, sample: Sample) -> dict[str
     """
     config, spec = alone.config, alone.spec
     first = slice(program.team) if program.team > 1 else 0
-    robot = task_class(config.task).robot
+    # What builds observations from poses knows no compass.
+    robot = {} if config.prior.effective().compass else task_class(config.task).robot
     std = {}
     if isinstance(alone.policy.head, BoundedGaussian):
         head = alone.policy.head

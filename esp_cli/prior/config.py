@@ -38,6 +38,16 @@ class PriorConfig(BaseModel):
         "none", description="which side of the consistency losses is held fixed; authors' code: none"
     )
 
+    fade: float = Field(
+        0.0, ge=0, le=1, description="share of the run over which copies and c fall to 0, linearly; 0: they stay"
+    )
+    compass: float = Field(
+        0.0,
+        ge=0,
+        le=1000,
+        description="length of axes that policy and critic see too, and that turn with every transform; 0: none",
+    )
+
     @property
     def augments(self) -> bool:
         """Whether copies of transitions enter the learner's own loss."""

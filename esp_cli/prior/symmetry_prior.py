@@ -37,6 +37,7 @@ class SymmetryPrior:
         config: what the user chose.
         augments: whether copies of a batch enter the learner's own loss.
         transforms: the elements that copies are made with; None without a prior.
+        strength: the probability with which a drawn element is used, 0 to 1; see `begin`.
 
     Raises:
         ValueError: the task cannot carry an element, or all copies of an infinite group are asked for.
@@ -53,6 +54,18 @@ class SymmetryPrior:
         if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
         self._probe = _probe(spaces, device)
+        self.strength = 1.0
+
+    def begin(self, progress: float) -> None:
+        """Set how strong the prior is from here on: 1 - progress / fade, or 1 where it does not fade.
+
+        With probability 1 - strength the identity takes the place of a drawn element. Such a copy adds nothing to a
+        mean loss, and its consistency terms are 0: the share of copies and c both fall, in expectation, in proportion.
+
+        Args:
+            progress: share of the run that is done, 0 to 1.
+        """
+        self.strength = max(0.0, 1.0 - progress / self.config.fade) if self.config.fade else 1.0
 
     @property
     def num_copies(self) -> int:
@@ -69,7 +82,7 @@ class SymmetryPrior:
     @property
     def augmented_share(self) -> float:
         """Share of the rows in a learner's own loss that are copies."""
-        return self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
+        return self.strength * self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
 
     @property
     def recomputes(self) -> bool:
@@ -83,7 +96,7 @@ class SymmetryPrior:
 
         Args:
             batch: the originals.
-            generators: one per seed; only `copies` "draw" uses them, and only if there is something to draw.
+            generators: one per seed; used only if there is something to draw.
             adapt: what the learner changes in a copy that transforming alone leaves wrong.
         """
         used = self.augments or self.config.coefficient > 0
@@ -112,11 +125,14 @@ class SymmetryPrior:
 
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         """Return one transform per copy, each one element per seed."""
-        if self.transforms is None:
+        if self.transforms is None or self.strength == 0:
             return []
-        if self.config.copies == "all" or self.transforms.size == 1:
-            return self.transforms.each()
-        return [self.transforms.draw(generators)]
+        everyone = self.config.copies == "all" or self.transforms.size == 1
+        if self.strength == 1:
+            return self.transforms.each() if everyone else [self.transforms.draw(generators)]
+        if not everyone:
+            return [self.transforms.draw(generators, self.strength)]
+        return [self.transforms.kept(index, self.strength, generators) for index in range(self.transforms.size)]
 
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:

@@ -206,12 +206,12 @@ class TransformSet:
         self.is_finite = self._group is None
         self.size = len(self._elements)
         self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
-        # Built once where it fits: a draw is then a selection.
+        # Built once where it fits, with the identity at the end: a draw is then a selection.
         stacked = 0 < self.size <= _STACK_LIMIT
-        self._stack = self._build(self._elements) if stacked else None
+        self._stack = self._build([*self._elements, identity_of(self._elements[0])]) if stacked else None
         self._singles: dict[int, Transform] = {}
 
-    def draw(self, generators: Sequence[torch.Generator]) -> Transform:
+    def draw(self, generators: Sequence[torch.Generator], strength: float = 1.0) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
 
         The identity is left out because a copy of the batch that equals the batch adds nothing: a consistency loss of
@@ -220,12 +220,23 @@ class TransformSet:
 
         Args:
             generators: one per seed, on the CPU.
+            strength: probability with which a drawn element stays; otherwise the identity takes its place.
         """
         if self._group is not None:
-            return self._build([_draw_moving(self._group, g) for g in generators])
+            drawn = ((_draw_moving(self._group, g), g) for g in generators)
+            return self._build([e if _stays(strength, g) else identity_of(e) for e, g in drawn])
         picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
+        return self._picked([i if _stays(strength, g) else self.size for i, g in zip(picks, generators, strict=True)])
+
+    def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:
+        """Return one of the listed elements, for each seed with probability `strength`, else the identity."""
+        return self._picked([index if _stays(strength, g) else self.size for g in generators])
+
+    def _picked(self, picks: Sequence[int]) -> Transform:
+        """Return the elements at these places, one per seed; the place behind the last is the identity."""
         if self._stack is None:
-            return self._build([self._elements[i] for i in picks])
+            elements = (*self._elements, identity_of(self._elements[0]))
+            return self._build([elements[i] for i in picks])
         return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
 
     def each(self) -> list[Transform]:
@@ -266,6 +277,16 @@ def transform_set(
         ValueError: the text means nothing, or the task cannot carry what it means.
     """
     return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
+
+
+def identity_of(element: Element) -> Element:
+    """Return the identity of an element's kind."""
+    return element @ element.inverse()
+
+
+def _stays(strength: float, generator: torch.Generator) -> bool:
+    """Draw whether an element stays; nothing is drawn where it is certain."""
+    return strength >= 1 or float(torch.rand((), generator=generator)) < strength
 
 
 def _draw_moving(group: Group, generator: torch.Generator) -> Element:

@@ -8,12 +8,15 @@ from esp_cli.training.config import RunConfig
 from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
+from esp_envs.compass import Compass
 from esp_envs.registry import make
 
 
 def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
-    """Make `num_envs` worlds per seed whose draws come from the named random stream."""
-    return make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
+    """Make `num_envs` worlds per seed whose draws come from the named random stream, with the prior's compass."""
+    env = make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
+    prior = config.prior.effective()
+    return Compass(env, prior.compass, labels="agents" in prior.transforms) if prior.compass else env
 
 
 def build_learner(config: RunConfig) -> Learner:

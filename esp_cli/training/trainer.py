@@ -169,7 +169,9 @@ class Trainer:
         """Collect, learn, freeze broken seeds, evaluate where it is time; return metrics and seconds of learning."""
         begun = time.monotonic()
         before = self.step // self.config.evaluation.every_steps
-        result = self.learner.iterate(self.iteration / self.total_iterations)
+        progress = self.iteration / self.total_iterations
+        self.learner.prior.begin(progress)
+        result = self.learner.iterate(progress)
         self.iteration += 1
         row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}
         self._stop_broken_seeds(result.finite)

@@ -1,0 +1,201 @@
+"""A prior that fades, and the compass under which every problem is exactly symmetric."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
+from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.config import resolve_config
+from esp_cli.training.loading import load_policy
+from esp_cli.training.policy_file import read_policy
+from esp_envs import make
+from esp_envs.compass import Compass, framed
+from esp_envs.spec import joint_layout
+from tests.cli.running import esp
+from tests.learning.golden import digest
+from tests.prior.test_copies import SPACES, Squared, rows
+
+_OFF_POLICY = "--set maddpg.num_envs=2 --set maddpg.warmup_episodes=2 --set maddpg.batch_episodes=4 --steps 500"
+SMALL = {
+    "mappo": "--set mappo.num_envs=8 --set mappo.num_epochs=3 --steps 2400",
+    "maddpg": f"--algo maddpg {_OFF_POLICY}",
+    "qmix": f"--algo qmix {_OFF_POLICY.replace('maddpg', 'qmix')}",
+}
+
+
+def faded(progress: float, **choice: object) -> SymmetryPrior:
+    prior = SymmetryPrior(PriorConfig(**{"transforms": "d4", "fade": 0.5, "consistency_coef": 0.5, **choice}), SPACES)
+    prior.begin(progress)
+    return prior
+
+
+def generators(count: int = 2) -> list[torch.Generator]:
+    return [torch.Generator().manual_seed(seed) for seed in range(count)]
+
+
+@pytest.mark.parametrize(("progress", "strength"), [(0.0, 1.0), (0.125, 0.75), (0.25, 0.5), (0.5, 0.0), (0.9, 0.0)])
+def test_the_strength_falls_linearly_to_0(progress: float, strength: float) -> None:
+    assert faded(progress).strength == pytest.approx(strength)
+    assert faded(progress, fade=0.0).strength == 1
+    assert faded(progress).augmented_share == pytest.approx(strength / 2)
+
+
+@pytest.mark.parametrize("choice", [{}, {"copies": "all"}, {"transforms": "rot90"}, {"transforms": "o2"}], ids=str)
+def test_elements_stay_with_the_probability_that_the_strength_says(choice) -> None:
+    spaces = make("navigation", 1, [0], {"actions": "continuous"}).spec
+    prior = SymmetryPrior(PriorConfig(**{"transforms": "d4", "fade": 1.0, **choice}), spaces)
+    prior.begin(0.7)
+    own = generators()
+    drawn = [g.elements for _ in range(150) for g in prior._draw(own)]
+    moving = torch.tensor([[not element.is_identity for element in pair] for pair in drawn]).float()
+    error = (0.3 * 0.7 / len(moving)) ** 0.5
+    assert moving.mean(0) == pytest.approx(torch.full((2,), 0.3), abs=4 * error)
+
+
+def test_a_prior_of_no_strength_makes_no_copies_and_draws_nothing() -> None:
+    own = generators()
+    made = faded(0.5).copies(rows(), own)
+    assert made.transforms == []
+    assert made.batch is made.originals
+    assert made.penalty(value=torch.randn(2, 3, 1, 1)) == 0
+    assert all(torch.equal(g.get_state(), new.get_state()) for g, new in zip(own, generators(), strict=True))
+
+
+def test_a_copy_by_the_identity_equals_its_original_and_costs_no_penalty() -> None:
+    """Half strength, with a generator whose draws are known: seed 0 keeps rot90, seed 1 gets the identity."""
+    prior = faded(0.25, transforms="rot90", copies="draw")
+    own = generators(40)
+    stays = [float(torch.rand((), generator=g)) < 0.5 for g in generators(40)]
+    (transform,) = prior._draw(own)
+    assert [not element.is_identity for element in transform.elements] == stays
+    kept, gone = stays.index(True), stays.index(False)
+    made = faded(0.25, transforms="rot90").copies(rows(), [generators(40)[kept], generators(40)[gone]])
+    here, there = made.rows.obs.split(3, 1)
+    assert not torch.equal(here[0], there[0])
+    assert torch.equal(here[1], there[1])
+    logits = torch.tensor([1.0, 0, 0, 0]).expand(2, 6, 1, 2, 4)
+    values = torch.tensor([3.0, 3, 3, 3, 3, 3]).view(1, 6, 1, 1).expand(2, 6, 1, 1)
+    assert made.penalty(policy=(Squared(), logits), value=values).tolist() == [0.5 * 2, 0.0]
+
+
+@pytest.mark.parametrize("algorithm", SMALL)
+def test_a_prior_that_never_fades_trains_as_ever_and_one_that_does_trains_otherwise(algorithm: str, tmp_path) -> None:
+    def weights(name: str, *more: str) -> str:
+        return train_small(tmp_path / name, algorithm, *more)
+
+    plain = weights("plain")
+    assert weights("fade-0", "--set", "prior.fade=0") == plain
+    assert weights("fade-1", "--set", "prior.fade=1") != plain
+    assert weights("compass", "--set", "prior.compass=1") != plain
+
+
+def train_small(folder: Path, algorithm: str, *more: str) -> str:
+    esp("train", "--task", "navigation", *SMALL[algorithm].split(), "--seeds", "2", "--out", folder, *more)
+    return digest(read_policy(folder / "policy.safetensors")[0])
+
+
+def worlds(num_envs: int = 16, **settings: object) -> Compass:
+    return Compass(make("navigation", num_envs, [0, 1], settings), 0.5)
+
+
+def test_the_compass_is_the_last_of_what_agents_and_critic_see() -> None:
+    env, bare = worlds(), make("navigation", 16, [0, 1])
+    seen, plain = env.reset(), bare.reset()
+    assert torch.equal(seen.obs[..., :-4], plain.obs)
+    assert torch.equal(seen.state[..., :-4], plain.state)
+    for part in (seen.obs[..., -4:], seen.state[..., -4:]):
+        assert torch.equal(part, torch.tensor([0.5, 0, 0, 0.5]).expand(part.shape))
+    while (step := env.step(env.random_action())).final is None:
+        pass
+    assert step.final.obs.shape == step.next.obs.shape == seen.obs.shape
+    assert env.spec.observation.fields[-1].name == "compass"
+
+
+def test_the_compass_turns_with_every_element_and_no_two_elements_show_the_same() -> None:
+    spec = framed(make("navigation", 1, [0], {"actions": "continuous"}).spec)
+    frame = torch.zeros(1, 3, spec.observation.width)
+    frame[..., -4:] = torch.tensor([1.0, 0, 0, 1])
+    turned = build_transform([rotation(90)], spec).obs(frame)[0, 0, -4:]
+    assert turned.tolist() == [0, 1, -1, 0]
+    assert build_transform([mirror(0)], spec).obs(frame)[0, 0, -4:].tolist() == [1, 0, 0, -1]
+    images = [tuple(build_transform([e], spec).obs(frame)[0, 0, -4:].tolist()) for e in parse_elements("d16", 3)]
+    assert len(set(images)) == len(images) == 31
+
+
+BROKEN = [{"wind": 0.3}, {"gust_mean": 1.0}, {"wind": 0.3, "gust_mean": 2.0}]
+
+
+@pytest.mark.parametrize("settings", BROKEN, ids=str)
+def test_with_the_compass_the_dynamics_commute_with_every_element_and_without_they_do_not(settings) -> None:
+    """Fit the change of velocity, linear in what an agent sees and does; hold the fit to transformed transitions."""
+    env = Compass(make("navigation", 64, [0], {"actions": "continuous", "num_agents": 1, **settings}), 1.0)
+    here = env.reset().obs
+    action = env.random_action()
+    there = env.step(action).next.obs
+    for compass, width in ((True, None), (False, -4)):
+        spec = env.spec if compass else env.inner.spec
+        seen, then = here[..., :width], there[..., :width]
+        force = action / action.norm(dim=-1, keepdim=True).clamp_min(1.0)
+        # the map that is equivariant where it can be: a constant force is a combination of the frame's axes
+        constant = torch.tensor([[settings.get("wind", 0.0) * 5 + settings.get("gust_mean", 0.0)],
+                                 [settings.get("gust_mean", 0.0)]])  # fmt: skip
+
+        def predicted(obs, force, compass=compass, constant=constant):
+            axes = obs[..., -4:].unflatten(-1, (2, 2)) if compass else torch.eye(2)
+            return 0.75 * obs[..., :2] + 0.1 * (5 * force + (axes * constant).sum(-2))
+
+        torch.testing.assert_close(predicted(seen, force), then[..., :2])
+        worst = 0.0
+        for element in transform_set("d8", spec).each():
+            gap = predicted(element.obs(seen), element.action(force)) - element.obs(then)[..., :2]
+            worst = max(worst, float(gap.abs().max()))
+        assert worst < 1e-5 if compass else worst > 0.05
+
+
+def test_exchanged_agents_keep_a_number_of_their_own() -> None:
+    env = Compass(make("navigation", 2, [0], {"weak_agent": 0.5}), 1.0, labels=True)
+    seen = env.reset()
+    assert seen.obs[0, 0, :, -1].tolist() == [-1, 0, 1]
+    assert seen.state[0, 0, -3:].tolist() == [-1, 0, 1]
+    (swap,) = transform_set("agents-1-0-2", env.spec).each()
+    assert swap.obs(seen.obs)[0, 0, :, -1].tolist() == [0, -1, 1]
+    assert swap.state(seen.state)[0, 0, -3:].tolist() == [0, -1, 1]
+    config = {"prior.compass": 1.0}
+    labelled = resolve_config("navigation", overrides=config | {"prior.transforms": "d4*agents"})
+    assert [f.name for f in build_environment(labelled, 1, "x").spec.observation.fields][-2:] == ["compass", "label"]
+    unlabelled = resolve_config("navigation", overrides=config)
+    assert [f.name for f in build_environment(unlabelled, 1, "x").spec.observation.fields][-1] == "compass"
+
+
+def test_a_state_of_all_observations_stays_one() -> None:
+    spec = make("navigation", 1, [0]).spec
+    joint = framed(type(spec)(**{**vars(spec), "state": joint_layout(spec.observation, 3)}))
+    assert joint.state == joint_layout(joint.observation, 3)
+
+
+def test_without_a_prior_there_is_no_compass() -> None:
+    for overrides in ({"prior.kind": "none"}, {"prior.kind": "consistency", "prior.consistency_coef": 0}):
+        config = resolve_config("navigation", overrides={"prior.compass": 1.0, **overrides})
+        assert build_environment(config, 1, "x").spec == make("navigation", 1, [0]).spec
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_learner_sees_the_compass(algorithm: str) -> None:
+    config = resolve_config("navigation", algorithm, overrides={"prior.compass": 1.0})
+    learner = build_learner(config)
+    assert learner.spec.observation.width == 18
+    assert learner.spec == build_environment(config, 1, "x").spec
+
+
+def test_a_policy_with_a_compass_is_evaluated_drawn_and_exported_as_any_other(tmp_path: Path) -> None:
+    train_small(tmp_path / "run", "mappo", "--set", "prior.compass=1")
+    assert load_policy(tmp_path / "run").spec.observation.width == 18
+    esp("eval", tmp_path / "run", "--episodes", "4")
+    esp("export", tmp_path / "run", "-f", "numpy", "-o", tmp_path / "out")
+    assert "compass" in (tmp_path / "out" / "policy.json").read_text()
