@@ -102,47 +102,45 @@ def policy_gradient(
     """
     maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
     action, old_log_prob, advantage = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
-    parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1)).unbind(2)
-    pulled = _reordered(parts, [m.back for m in maps])
-    log_prob = torch.log_softmax(torch.stack(pulled, 1), 2)  # [S, 1 + K, A, R]
+    parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1))
+    log_prob = torch.log_softmax(reordered(parts, [m.back for m in maps]), 1)  # [S, A, 1 + K, R]
     prob = log_prob.exp()
     gradient = _objective_gradient(log_prob, prob, action, old_log_prob, advantage, weights)
     if weights.policy_gap and maps:
         _add_divergence(gradient, log_prob, prob, weights)
-    by_logits = torch._log_softmax_backward_data(gradient, log_prob, 2, gradient.dtype)
-    back = torch.stack(_reordered(by_logits.unbind(1), [m.source for m in maps]), 2)
-    return back.flatten(2).transpose(1, 2).view(logits.shape)
+    by_logits = torch._log_softmax_backward_data(gradient, log_prob, 1, gradient.dtype)
+    return reordered(by_logits, [m.source for m in maps]).flatten(2).transpose(1, 2).view(logits.shape)
 
 
 def _objective_gradient(
     log_prob: Tensor, prob: Tensor, action: Tensor, old_log_prob: Tensor, advantage: Tensor, weights: Weights
 ) -> Tensor:
-    """Return the gradient of -(J_pi + entropy) by the log-probabilities [S, 1 + K, A, R]; rows [S, R] of originals.
+    """Return the gradient of -(J_pi + entropy) by the log-probabilities [S, A, 1 + K, R]; rows [S, R] of originals.
 
     What is the same for all actions is left out, as the 1 in the entropy's (log p + 1) p: the gradient by the logits
     does not depend on it.
     """
-    if not weights.augments and log_prob.shape[1] > 1:
-        own = _objective_gradient(log_prob[:, :1], prob[:, :1], action, old_log_prob, advantage, weights)
-        return torch.cat([own, torch.zeros_like(log_prob[:, 1:])], 1)
-    share = 1.0 / (log_prob.shape[1] * log_prob.shape[3])
-    taken, advantage = action[:, None, None].expand(-1, log_prob.shape[1], 1, -1), advantage[:, None, None]
-    ratio = (log_prob.gather(2, taken) - old_log_prob[:, None, None]).exp_()
+    if not weights.augments and log_prob.shape[2] > 1:
+        own = _objective_gradient(log_prob[:, :, :1], prob[:, :, :1], action, old_log_prob, advantage, weights)
+        return torch.cat([own, torch.zeros_like(log_prob[:, :, 1:])], 2)
+    share = 1.0 / (log_prob.shape[2] * log_prob.shape[3])
+    taken, advantage = action[:, None, None].expand(-1, 1, log_prob.shape[2], -1), advantage[:, None, None]
+    ratio = (log_prob.gather(1, taken) - old_log_prob[:, None, None]).exp_()
     gain = ratio * advantage
     bound = ratio.clamp_(1 - weights.clip_epsilon, 1 + weights.clip_epsilon).mul_(advantage)
     slope = gain.masked_fill_(gain > bound, 0.0)  # of the objective by log pi: rho A, or 0 where it is clipped
     gradient = (log_prob * prob).mul_(weights.entropy_coef * share)
-    return gradient.scatter_add_(2, taken, slope.mul_(-share))
+    return gradient.scatter_add_(1, taken, slope.mul_(-share))
 
 
 def _add_divergence(gradient: Tensor, log_prob: Tensor, prob: Tensor, weights: Weights) -> None:
     """Add the gradient of c KL[copy || original], averaged over copies and rows."""
-    weight = weights.policy_gap / ((log_prob.shape[1] - 1) * log_prob.shape[3])
-    moved = prob[:, 1:]
+    weight = weights.policy_gap / ((log_prob.shape[2] - 1) * log_prob.shape[3])
+    moved = prob[:, :, 1:]
     if weights.stop_gradient != "transformed":
-        gradient[:, 1:].addcmul_(log_prob[:, 1:] - log_prob[:, :1], moved, value=weight)
+        gradient[:, :, 1:].addcmul_(log_prob[:, :, 1:] - log_prob[:, :, :1], moved, value=weight)
     if weights.stop_gradient != "original":
-        gradient[:, :1].sub_(moved if moved.shape[1] == 1 else moved.sum(1, keepdim=True), alpha=weight)
+        gradient[:, :, :1].sub_(moved if moved.shape[2] == 1 else moved.sum(2, keepdim=True), alpha=weight)
 
 
 @torch.no_grad()
@@ -170,7 +168,16 @@ def critic_gradient(values: Tensor, target: Tensor, weights: Weights) -> Tensor:
     return gradient.view(values.shape)
 
 
-def _reordered(parts: Sequence[Tensor], orders: Sequence[Tensor]) -> list[Tensor]:
-    """Give the actions of every copy [S, A, R] another order [S or 1, A]; the originals', the first part, stays."""
-    here, *copies = parts
-    return [here, *(x.gather(1, order.unsqueeze(2).expand(x.shape)) for x, order in zip(copies, orders, strict=True))]
+def reordered(x: Tensor, orders: Sequence[Tensor]) -> Tensor:
+    """Give the actions of every copy another order.
+
+    Args:
+        x: [S, A, ..., 1 + K, R], whose first part, the originals, stays as it is.
+        orders: K, [S or 1, A] each: which action comes to each place.
+    """
+    num_seeds, num_actions, parts = x.shape[0], x.shape[1], x.shape[-2]
+    places = torch.arange(x[..., 0].numel(), device=x.device).view(x.shape[:-1])
+    for k, order in enumerate(orders):
+        index = order.view(-1, num_actions, *[1] * (x.dim() - 4)).expand(num_seeds, *x.shape[1:-2])
+        places[..., 1 + k] = places[..., 1 + k].gather(1, index)
+    return x.reshape(-1, x.shape[-1]).index_select(0, places.flatten()).view(x.shape) if parts > 1 else x

@@ -84,8 +84,7 @@ class Categorical(Head):
         The result lies in memory with the action axis outermost: over so few actions, softmax along the contiguous
         axis is 25 times slower on a CPU than over vectors of rows.
         """
-        rows = outputs.flatten(1, -2).transpose(1, 2).contiguous()
-        return torch.log_softmax(rows, 1).transpose(1, 2).view(outputs.shape)
+        return torch.log_softmax(outputs.movedim(-1, 1).contiguous(), 1).movedim(1, -1)
 
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
         """Draw an action by inverting the cumulative distribution at `noise`."""

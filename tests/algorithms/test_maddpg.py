@@ -133,7 +133,7 @@ def test_the_actor_climbs_the_critic_and_leaves_it_alone(rule):
     trained, episodes = prepared(prior__kind="none", algo__output_penalty=0.0, algo__actor_gradient=rule)
     linear_critic(trained, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0] * 3))  # every agent should move right
     before = [p.clone() for p in trained.critic.parameters()]
-    seen = trained._critic_rows(episodes)
+    seen = trained._critic_rows(episodes)[:, :, :-1]
     for _ in range(150):
         trained._learn_actor(trained.prior.copies(episodes, []), seen)
     probability = trained.policy.unroll(episodes.obs[:, :, :-1], episodes.action).exp()[..., 2]
