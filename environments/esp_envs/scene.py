@@ -22,6 +22,8 @@ class Body:
         heading: direction of a nose mark in radians, or None.
         trail: whether a renderer may draw its path.
         model: what a renderer in space builds of it ("robot", "pillar", "goal"); flat pictures ignore it.
+        label: what a legend calls it, or None for no entry.
+        reach: distance within which a body that leaves a trail covers it, in world units; None for what nobody covers.
     """
 
     position: tuple[float, float]
@@ -31,6 +33,8 @@ class Body:
     heading: float | None = None
     trail: bool = False
     model: str | None = None
+    label: str | None = None
+    reach: float | None = None
 
 
 GRID_SPACING = 0.5
@@ -41,12 +45,14 @@ GRID_SPACING = 0.5
 class Scene:
     """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order.
 
-    `grid` is the distance of the lines behind them and where one of them lies, along either axis.
+    `grid` is the distance of the lines behind them and where one of them lies, along either axis; `unit` is that of
+    positions.
     """
 
     bodies: tuple[Body, ...]
     window: tuple[float, float, float, float]
     grid: tuple[float, float] = (GRID_SPACING, 0.0)
+    unit: str = ""
 
 
 class Painter(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -17,7 +18,6 @@ from esp_cli.commands.options import (
     OwnNetworkOption,
     OwnTaskOption,
     PhysicsOption,
-    PolicyArgument,
     TaskSetOption,
     parse_task_settings,
     register_learners,
@@ -29,7 +29,11 @@ EPILOG = """Examples:\n
     esp render runs/cn-mappo -o cn.gif\n
     esp render runs/cn-mappo -o cn.gif --episodes 5 --size 320 --speed 0.5\n
     esp render runs/fc-mappo -o formation.gif --speed 4x\n
-    esp render runs/fc-mappo -o formation.png --view top"""
+    esp render runs/fc-mappo -o formation.png --view top\n
+    esp render formation-mappo-plain formation-mappo-esp -o both.gif"""
+
+
+_MOST_POLICIES = 2
 
 
 def parse_speed(value: str | float) -> float:
@@ -48,7 +52,14 @@ def parse_speed(value: str | float) -> float:
 
 
 def render(
-    policy: PolicyArgument,
+    policies: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Run folder, policy file, or bundled policy by its task or its name (`esp policies`). "
+            "Two play the same episodes side by side.",
+            metavar="RUN|POLICY [RUN|POLICY]",
+        ),
+    ],
     out: OutOption,
     task: OwnTaskOption = None,
     view: Annotated[
@@ -57,10 +68,17 @@ def render(
     ] = "auto",
     episodes: Annotated[
         int | None,
-        typer.Option("--episodes", "-e", min=1, max=100, help="Episodes of a film; by default 3, of long tasks 1."),
+        typer.Option(
+            "--episodes", "-e", min=1, max=100, help="Episodes of a film; by default as many as last about 8 s."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Which seed's policy acts; by default the first.")] = None,
-    size: Annotated[int, typer.Option("--size", min=32, max=2048, help="Longer side in pixels.")] = 480,
+    size: Annotated[
+        int,
+        typer.Option(
+            "--size", min=32, max=2048, help="Longer side of a scene in pixels; caption, axes and legend come on top."
+        ),
+    ] = 480,
     speed: Annotated[
         float, typer.Option("--speed", parser=parse_speed, metavar="TIMES", help="Times real time, as 0.5 or 4x.")
     ] = 1.0,
@@ -75,21 +93,29 @@ def render(
     network: OwnNetworkOption = None,
     prior: BundledPriorOption = None,
 ) -> None:
-    """Play episodes and draw them off-screen: a film (.gif, .mp4), or the trajectories of one episode (.png)."""
+    """Play episodes and draw them off-screen: a film (.gif, .mp4), or a picture of one episode (.png).
+
+    The picture shows paths; of navigation also who covers which landmark when, of wildlife the last steps.
+    """
     from esp_cli.deploy.bundled import open_policy
     from esp_cli.drawing.draw import check_target, draw
     from esp_cli.training.loading import transfer
 
     kind = check_target(out, episodes)
+    if len(policies) > _MOST_POLICIES:
+        raise ValueError(f"{len(policies)} policies do not fit side by side; name one or two")
     register_tasks(task)
     register_learners([algo], network or [])
-    trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
-    for text in trained.notes:
+    changed = parse_task_settings(settings or [], physics)
+    opened = [transfer(open_policy(policy, algo, prior), changed) for policy in policies]
+    for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
     with _progress() as watch:
         drawing = draw(
-            trained,
+            opened[0],
             out,
+            other=opened[1] if len(opened) > 1 else None,
+            names=(policies[0].name, policies[-1].name),
             seed=seed,
             episodes=episodes,
             view=view,

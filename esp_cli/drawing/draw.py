@@ -1,16 +1,23 @@
-"""Drawing a trained policy at work into a file: a film, or the trajectories of one episode."""
+"""Drawing a trained policy at work into a file: a film, or a picture of one episode."""
 
 from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from esp_cli.drawing import films, rendering
+from esp_cli.drawing.figures import summary
+from esp_cli.drawing.recording import Episode, framed, record, record_both
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
+from esp_envs.base import Environment
+from esp_envs.drawing import TopPainter
+from esp_envs.scene import Painter
 
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
 
@@ -53,6 +60,8 @@ def draw(
     trained: TrainedPolicy,
     out: Path,
     *,
+    other: TrainedPolicy | None = None,
+    names: tuple[str, str] = ("first", "second"),
     seed: int | None = None,
     episodes: int | None = None,
     view: rendering.View = "auto",
@@ -62,38 +71,44 @@ def draw(
     greedy: bool = True,
     watch: Callable[[int, int], None] | None = None,
 ) -> Drawing:
-    """Play episodes of one seed's policy and draw them off-screen.
+    """Play episodes of one seed's policy and draw them off-screen, alone or beside those of another policy.
 
     Args:
         trained: the policies of a run.
-        out: a .gif or .mp4 for a film, a .png for the trajectories of one episode.
+        out: a .gif or .mp4 for a film, a .png for a picture of one episode.
+        other: a policy of the same task that plays the same episodes.
+        names: of the two policies, where there are two.
         seed: whose policy acts; by default the first.
-        episodes: of a film; by default 3, of long tasks 1.
+        episodes: of a film; by default as many as last about 8 s.
         view: see `open_painter`.
-        size: of the longer side, pixels.
+        size: of the longer side of a scene, pixels; caption, axes and legend come on top.
         speed: times real time.
         fps: most frames per second; by default 25.
         greedy: whether the policy takes its most probable actions, or draws them.
         watch: told how many frames of how many are drawn.
 
     Raises:
-        ValueError: another ending, no such seed, or a view that cannot be drawn.
+        ValueError: another ending, no such seed, a view that cannot be drawn, or policies that cannot be compared.
     """
     kind = check_target(out, episodes)
-    seed = trained.config.seeds[0] if seed is None else seed
+    count = 1 if kind == PICTURE else episodes
     env = build_environment(trained.config, 1, "film")
-    count = 1 if kind == PICTURE else episodes or rendering.default_episodes(trained.spec)
+    recorded = _recorded(trained, other, env, seed, count, greedy)
+    called = [None] if other is None else list(names)
+    period = trained.spec.control_period_s
     with rendering.open_painter(env, view, size) as painter:
-        recorded = rendering.record(trained, env, seed, count, greedy)
-        steps = sum(len(scenes) - 1 for scenes in recorded)
-        if kind == PICTURE:
-            rendering.write_picture(out, painter, recorded[0], f"{trained.config.task}, seed {seed}", size)
-            return Drawing(out, 1, steps, painter.note)
+        if isinstance(painter, TopPainter):
+            episodes_of = len(recorded[0])
+            together = framed([episode for own in recorded for episode in own])
+            recorded = [together[k : k + episodes_of] for k in range(0, len(together), episodes_of)]
+        steps = sum(episode.steps for episode in recorded[0])
         rate = fps or rendering.FRAMES_PER_SECOND
         if kind == ".gif":
             rate = min(rate, films.GIF_FRAMES_PER_SECOND)
-        period = trained.spec.control_period_s
-        taken = rendering.shots(recorded, rendering.stride(period, speed, rate))
+        taken = rendering.shots(recorded, rendering.stride(period, speed, rate), period, trained.spec.name, called)
+        if kind == PICTURE:
+            films.write_png(out, _picture(trained, recorded, called, painter, taken[-1], size))
+            return Drawing(out, 1, steps, painter.note)
 
         def drawn(done: int) -> None:
             if watch is not None:
@@ -101,3 +116,44 @@ def draw(
 
         rendering.write_film(out, painter, taken, period / speed, drawn)
         return Drawing(out, len(taken), steps, painter.note)
+
+
+def _recorded(
+    trained: TrainedPolicy,
+    other: TrainedPolicy | None,
+    env: Environment,
+    seed: int | None,
+    count: int | None,
+    greedy: bool,
+) -> list[list[Episode]]:
+    """Play one policy, or both."""
+    own = trained.config.seeds[0] if seed is None else seed
+    if other is None:
+        return [record(trained, env, own, count, greedy)]
+    if other.config.task != trained.config.task:
+        raise ValueError(
+            f"{trained.source} is a policy of {trained.config.task}, {other.source} of {other.config.task}; "
+            "compare two policies of one task"
+        )
+    theirs = other.config.seeds[0] if seed not in other.config.seeds else own
+    return list(record_both(trained, other, (own, theirs), count, greedy))
+
+
+def _picture(
+    trained: TrainedPolicy,
+    recorded: Sequence[Sequence[Episode]],
+    names: Sequence[str | None],
+    painter: Painter,
+    last: rendering.Shot,
+    size: int,
+) -> films.Frame:
+    """Draw an episode: from above a figure, in space its end with the trails."""
+    if not isinstance(painter, TopPainter):
+        return last.draw(painter)
+    figures = [
+        summary(own[0], name or trained.spec.name, size, trained.spec.control_period_s)
+        for own, name in zip(recorded, names, strict=True)
+    ]
+    height = max(map(len, figures))  # a strip is as high as its episode is long
+    padded = [np.pad(f, ((0, height - len(f)), (0, 0), (0, 0)), constant_values=255) for f in figures]
+    return np.concatenate(padded, axis=1)

@@ -1,96 +1,27 @@
-"""Pictures of a policy at work, off-screen: what happens is recorded first, then drawn as a film or a still picture."""
+"""Films and pictures of recorded episodes, off-screen."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-import torch
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
-
-from esp_cli.drawing.films import Frame, write_gif, write_mp4, write_png
-from esp_cli.files.writing import write_file
-from esp_cli.training.loading import TrainedPolicy
-from esp_cli.training.play import PolicyController
-from esp_cli.training.streams import generators
+from esp_cli.drawing.films import Frame, write_gif, write_mp4
+from esp_cli.drawing.frames import Moment, frame
+from esp_cli.drawing.recording import HOLD_SECONDS, Episode
 from esp_envs.base import Environment
-from esp_envs.drawing import GRID, TopPainter, trails
-from esp_envs.scene import Body, Painter, Scene
-from esp_envs.spec import TaskSpec
+from esp_envs.drawing import TopPainter
+from esp_envs.scene import Painter
 
 View = Literal["auto", "top", "3d"]
 
 FRAMES_PER_SECOND = 25
 """Of a film, at most, unless more are asked for."""
-_DEFAULT_EPISODES, _DEFAULT_SECONDS = 3, 30.0
-"""A film shows three episodes, or as many as last half a minute, but at least one."""
-_FIGURE_INCHES = 4.8
-_OPACITY = (0.15, 1.0)
-"""Of a way at its beginning and at its end."""
-_MARKS = ((5, "start"), (9, "end"))
-"""Marker size in points, and what it marks."""
 _SAMPLED_FRAMES = 8
 """Frames that the palette of a GIF is made for."""
-
-
-def default_episodes(spec: TaskSpec) -> int:
-    """Return how many episodes a film of this task shows."""
-    fitting = int(_DEFAULT_SECONDS / (spec.horizon * spec.control_period_s) + 1e-9)
-    return max(1, min(_DEFAULT_EPISODES, fitting))
-
-
-@torch.no_grad()
-def record(
-    trained: TrainedPolicy, env: Environment, seed: int, episodes: int, greedy: bool = True
-) -> list[list[Scene]]:
-    """Play episodes of one seed's policy and keep what there is to draw.
-
-    Args:
-        trained: the policies of a run.
-        env: one world per seed of the run.
-        seed: which of the run's seeds acts.
-        episodes: played one after the other.
-        greedy: act greedily, or draw actions.
-
-    Returns:
-        The scenes of each episode: its start and every step, up to the one that ends it.
-
-    Raises:
-        ValueError: the run has no such seed.
-    """
-    seeds = trained.config.seeds
-    if seed not in seeds:
-        raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-    world = (seeds.index(seed), 0)
-    noise = None if greedy else generators(seeds, "film", "noise")
-    controller = PolicyController(trained.policy, noise)
-    recorded = []
-    for _ in range(episodes):
-        observation = env.reset()
-        controller.begin(env, observation)
-        scenes = [env.scene(world)]
-        for _ in range(env.spec.horizon):
-            step = env.step(controller.act(env, observation))
-            observation = step.next
-            ended = bool((step.terminated | step.truncated)[world])
-            if ended and step.final is not None:
-                env.set_state(step.final.state)  # the world has reset itself; show how the episode ended
-            scenes.append(env.scene(world))
-            if ended:
-                break
-        recorded.append(scenes)
-    return recorded
 
 
 @contextmanager
@@ -123,14 +54,23 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame to draw: a scene after those that its trails come from, and how many steps it stays in view."""
+    """One frame to draw.
 
-    scenes: Sequence[Scene]
+    Attributes:
+        moments: what is side by side.
+        caption: what stands before the time.
+        time_s: since the episode began, s.
+        steps: how many it stays in view.
+    """
+
+    moments: tuple[Moment, ...]
+    caption: str
+    time_s: float
     steps: int
 
     def draw(self, painter: Painter) -> Frame:
-        """Draw the last scene with the trails of all."""
-        return painter.draw(self.scenes[-1], self.scenes[:-1])
+        """Draw the moments with caption, axes and legend."""
+        return frame(painter, self.moments, self.caption, self.time_s)
 
 
 def stride(control_period_s: float, speed: float, frames_per_second: float) -> int:
@@ -138,13 +78,34 @@ def stride(control_period_s: float, speed: float, frames_per_second: float) -> i
     return max(1, math.ceil(speed / (control_period_s * frames_per_second) - 1e-9))
 
 
-def shots(episodes: Iterable[Sequence[Scene]], every: int) -> list[Shot]:
-    """Choose every so-many-th scene of each episode, its first and its last among them."""
+def shots(
+    recorded: Sequence[Sequence[Episode]],
+    every: int,
+    period_s: float,
+    title: str,
+    names: Sequence[str | None] = (None,),
+) -> list[Shot]:
+    """Choose every so-many-th scene of each episode, its first and its last among them.
+
+    Args:
+        recorded: episodes of each policy that is shown; the one that ends first waits for the other.
+        every: steps from one frame to the next.
+        period_s: of a step, s.
+        title: the task.
+        names: of the policies.
+    """
     chosen = []
-    for scenes in episodes:
-        shown = sorted({*range(0, len(scenes), every), len(scenes) - 1})
-        following = [*shown[1:], len(scenes)]
-        chosen += [Shot(scenes[: k + 1], after - k) for k, after in zip(shown, following, strict=True)]
+    count = len(recorded[0])
+    for k, together in enumerate(zip(*recorded, strict=True), start=1):
+        caption = f"{title}, episode {k} of {count}"
+        end = max(episode.steps for episode in together)
+        shown = sorted({*range(0, end + 1, every), end})
+        for step, following in zip(shown, [*shown[1:], end + 1], strict=True):
+            moments = []
+            for episode, name in zip(together, names, strict=True):
+                own = min(step, episode.steps)
+                moments.append(Moment(episode.scenes[: own + 1], episode.returns[own], name))
+            chosen.append(Shot(tuple(moments), caption, step * period_s, following - step))
     return chosen
 
 
@@ -157,78 +118,21 @@ def write_film(
         path: where to.
         painter: draws the shots.
         taken: the shots, in their order.
-        step_s: how long one step is in view, s.
+        step_s: how long one step is in view, s; the last of an episode is in view for longer.
         watch: told how many frames are drawn, after each.
     """
+    ends = [*(after.time_s == 0 for after in taken[1:]), True]
+    seconds = [shot.steps * step_s + HOLD_SECONDS * end for shot, end in zip(taken, ends, strict=True)]
+    usual = taken[0].steps * step_s
 
-    def draw() -> Iterator[Frame]:
-        for done, shot in enumerate(taken, 1):
-            yield shot.draw(painter)
+    def draw(repeated: bool) -> Iterator[Frame]:
+        for done, (shot, shown) in enumerate(zip(taken, seconds, strict=True), 1):
+            drawn = shot.draw(painter)
+            yield from [drawn] * (max(1, round(shown / usual)) if repeated else 1)
             watch(done)
 
     if path.suffix.lower() == ".mp4":
-        write_mp4(path, draw(), 1 / (taken[0].steps * step_s))
+        write_mp4(path, draw(repeated=True), 1 / usual)
     else:
         sample = [shot.draw(painter) for shot in taken[:: math.ceil(len(taken) / _SAMPLED_FRAMES)]]
-        write_gif(path, draw(), [shot.steps * step_s for shot in taken], sample)
-
-
-def write_picture(path: Path, painter: Painter, scenes: Sequence[Scene], title: str, size: int) -> None:
-    """Write one episode as a PNG: from above a figure of its trajectories, in space its end with the trails.
-
-    Args:
-        path: where to.
-        painter: as `open_painter` chose it.
-        scenes: of the episode.
-        title: above a figure.
-        size: of the longer side, pixels.
-    """
-    if isinstance(painter, TopPainter):
-        content = BytesIO()
-        trajectories(scenes, title, size).savefig(content, format="png", metadata={"Software": None})
-        write_file(path, content.getvalue())
-    else:
-        write_png(path, painter.draw(scenes[-1], scenes[:-1]))
-
-
-def trajectories(scenes: Sequence[Scene], title: str, size: int) -> Figure:
-    """Draw the ways of a whole episode as in figure 6c of the paper: a colour for each body, more opaque with time.
-
-    Args:
-        scenes: of one episode.
-        title: above the axes.
-        size: width of the figure, pixels.
-    """
-    last = scenes[-1]
-    figure = Figure(figsize=(_FIGURE_INCHES, _FIGURE_INCHES), dpi=size / _FIGURE_INCHES, layout="constrained")
-    axes = figure.add_subplot(aspect="equal", xlim=last.window[:2], ylim=last.window[2:], xlabel="x", ylabel="y")
-    axes.set_title(title, loc="left", fontsize="medium", fontweight="bold", parse_math=False)
-    axes.grid(color=GRID)
-    axes.set_axisbelow(True)
-    for body in last.bodies:
-        _add_body(axes, body)
-    for body, path in trails(last, scenes[:-1]):
-        strength = np.linspace(*_OPACITY, len(path) - 1)
-        ways = LineCollection(list(pairwise(path)), colors=body.color, alpha=strength, linewidths=2.5, zorder=2)
-        ways.set_capstyle("butt")  # others overlap where pieces meet, which shows as dots
-        axes.add_collection(ways)
-        axes.plot(*path[0], "o", color=body.color, markeredgecolor="white", markersize=7, zorder=4)
-    entries = [Line2D([], [], ls="", marker="o", color="#606060", ms=ms, label=text) for ms, text in _MARKS]
-    if any(body.model == "goal" for body in last.bodies):
-        entries.append(Line2D([], [], ls="", marker="o", color="#606060", mfc="none", mew=2, ms=9, label="goal"))
-    figure.legend(handles=entries, loc="outside lower center", ncols=len(entries), frameon=False)
-    return figure
-
-
-def _add_body(axes: Axes, body: Body) -> None:
-    """Add a body as it is at the end of the episode, in the shapes of `esp_envs.drawing`."""
-    (x, y), r = body.position, body.radius
-    if body.shape == "cross":
-        axes.plot([x - r, x + r, np.nan, x - r, x + r], [y - r, y + r, np.nan, y + r, y - r], color=body.color, lw=2.5)
-    elif body.shape == "square":
-        axes.add_patch(Rectangle((x - r, y - r), 2 * r, 2 * r, facecolor=body.color, zorder=3))
-    else:
-        filled = body.shape == "disc"
-        axes.add_patch(
-            Circle((x, y), r, fill=filled, facecolor=body.color, edgecolor=body.color, linewidth=2, zorder=3)
-        )
+        write_gif(path, draw(repeated=False), seconds, sample)

@@ -142,12 +142,12 @@ class Run:
         greedy: bool = True,
         settings: Mapping[str, object] | None = None,
     ) -> Drawing:
-        """Draw episodes of one seed's policy as a film (.gif, .mp4), or the trajectories of one episode (.png).
+        """Draw episodes of one seed's policy as a film (.gif, .mp4), or a picture of one episode (.png).
 
         Args:
             out: the file.
             seed: whose policy acts; by default the first.
-            episodes: of a film.
+            episodes: of a film; by default they last about 8 s.
             view: "top" from above, "3d" in space, "auto" the latter where the task has it.
             size: of the longer side, pixels.
             speed: times real time.

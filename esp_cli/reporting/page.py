@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from jinja2 import Environment, FileSystemLoader
 
 from esp_cli import __version__
-from esp_cli.drawing.rendering import default_episodes, open_painter, record, shots, stride, write_film
+from esp_cli.drawing.draw import draw
 from esp_cli.files.documents import encode
 from esp_cli.files.writing import replace_file
 from esp_cli.reporting.charts import chart, stroke
@@ -25,7 +25,6 @@ from esp_cli.reporting.results import RESULTS_FORMAT, CellResult
 from esp_cli.reporting.summary import floats
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import KINDS
-from esp_cli.training.build import build_environment
 from esp_cli.training.loading import load_policy
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
@@ -102,15 +101,11 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
     for count, run in enumerate(runs.values(), start=1):
         if (run / "policy.safetensors").is_file() and not (run / FILM).is_file():
             trained = load_policy(run / "policy.safetensors")
-            env = build_environment(trained.config, 1, "film")
-            period = trained.spec.control_period_s
-            episodes = default_episodes(trained.spec)
-            speed = max(1.0, episodes * trained.spec.horizon * period / _FILM_SECONDS)
-            with open_painter(env, "top", _FILM_PIXELS) as painter, TemporaryDirectory() as scratch:
-                recorded = record(trained, env, trained.config.seeds[0], episodes)
-                taken = shots(recorded, stride(period, speed, _FILM_FRAMES_PER_SECOND))
-                write_film(Path(scratch) / FILM, painter, taken, period / speed, lambda _: None)
-                replace_file(run / FILM, (Path(scratch) / FILM).read_bytes())
+            speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
+            with TemporaryDirectory() as scratch:
+                film = Path(scratch) / FILM
+                draw(trained, film, view="top", size=_FILM_PIXELS, speed=speed, fps=_FILM_FRAMES_PER_SECOND)
+                replace_file(run / FILM, film.read_bytes())
         watch(count)
 
 

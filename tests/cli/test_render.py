@@ -66,11 +66,37 @@ def test_frames_are_skipped_at_high_speed(
         assert (film.n_frames, film.info["duration"]) == (frames, duration)
 
 
-def test_a_png_is_a_figure_of_the_trajectories(finished: Path, tmp_path: Path) -> None:
+def test_films_of_readable_size_have_caption_axes_and_legend(finished: Path, tmp_path: Path) -> None:
+    esp("render", finished, "-o", tmp_path / "film.gif", "--episodes", 1, "--size", 240)
+    with Image.open(tmp_path / "film.gif") as film:
+        width, height = film.size
+        assert 240 < width < 300
+        assert 280 < height < 340
+
+
+def test_two_policies_play_side_by_side(finished: Path, tmp_path: Path) -> None:
+    told = esp("render", finished, "navigation", "-o", tmp_path / "both.gif", "--episodes", 1, "--size", 100)
+    assert f"{FRAMES} frames -> " in told.stderr
+    with Image.open(tmp_path / "both.gif") as film:
+        assert film.size == (200, 100)
+    esp("render", finished, "navigation", "-o", tmp_path / "both.png", "--size", 200)
+    esp("render", finished, "-o", tmp_path / "one.png", "--size", 200)
+    with Image.open(tmp_path / "both.png") as both, Image.open(tmp_path / "one.png") as one:
+        assert both.size == (400, one.height)
+        assert both.crop((0, 0, 200, one.height)).tobytes() != both.crop((200, 0, 400, one.height)).tobytes()
+    sentence = refused("render", finished, "wildlife-mappo-esp", "-o", tmp_path / "other.gif")
+    assert "is a policy of navigation, " in sentence
+    assert sentence.endswith(" of wildlife; compare two policies of one task")
+    assert "3 policies do not fit side by side" in refused("render", *[finished] * 3, "-o", tmp_path / "other.gif")
+    assert not (tmp_path / "other.gif").exists()
+
+
+def test_a_png_is_a_figure_of_the_episode(finished: Path, tmp_path: Path) -> None:
     told = esp("render", finished, "-o", tmp_path / "ways.PNG", "--size", 200)
     assert f"episode of {FRAMES - 1} steps -> {tmp_path / 'ways.PNG'}" in told.stderr
     with Image.open(tmp_path / "ways.PNG") as figure:
-        assert (figure.format, figure.size) == ("PNG", (200, 200))
+        assert (figure.format, figure.width) == ("PNG", 200)
+        assert figure.height > 220, "a coverage map stands below the paths"
     other = tmp_path / "other.png"
     esp("render", finished, "-o", other, "--size", 200, "--view", "top", "--seed", 7, "--episodes", 1)
     assert other.read_bytes() != (tmp_path / "ways.PNG").read_bytes()

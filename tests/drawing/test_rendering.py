@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from io import BytesIO
 
 import imageio.v3 as iio
 import numpy as np
@@ -12,16 +11,8 @@ import torch
 from PIL import Image
 
 from esp_cli.drawing.films import write_gif, write_mp4
-from esp_cli.drawing.rendering import (
-    default_episodes,
-    open_painter,
-    record,
-    shots,
-    stride,
-    trajectories,
-    write_film,
-    write_picture,
-)
+from esp_cli.drawing.recording import Episode, framed, record, record_both
+from esp_cli.drawing.rendering import HOLD_SECONDS, open_painter, shots, stride, write_film
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
@@ -60,15 +51,35 @@ def line(count=9, trail=True):
     return [Scene((still, Body(tuple(place), 0.1, RED, trail=trail)), (-1.0, 1.0, -1.0, 1.0)) for place in places]
 
 
+def episode(scenes):
+    """Return an episode that earns 1 a step."""
+    return Episode(scenes, [float(k) for k in range(len(scenes))])
+
+
 def test_the_start_and_every_step_of_every_episode_are_recorded(trained, env):
     episodes = record(trained, env, 3, 2)
-    assert [len(scenes) for scenes in episodes] == [6 + 1, 6 + 1]
-    flat = [scene for scenes in episodes for scene in scenes]
+    assert [len(episode.scenes) for episode in episodes] == [6 + 1, 6 + 1]
+    assert [episode.steps for episode in episodes] == [6, 6]
+    flat = [scene for episode in episodes for scene in episode.scenes]
     assert len(set(flat)) == len(flat), "something moves in each"
 
 
+def test_returns_are_what_the_agents_got_so_far(trained, env):
+    (recorded,) = record(trained, env, 7, 1)
+    fresh = build_environment(trained.config, 1, "film")
+    controller, observation = PolicyController(trained.policy), fresh.reset()
+    controller.begin(fresh, observation)
+    expected = [0.0]
+    for _ in range(6):
+        step = fresh.step(controller.act(fresh, observation))
+        observation = step.next
+        expected.append(expected[-1] + float(step.reward[1, 0].mean()))
+    assert recorded.returns == pytest.approx(expected)
+    assert len(set(expected)) == 7
+
+
 def test_a_recording_ends_where_the_episode_ended_not_where_the_next_begins(trained, env):
-    recorded = filmed(trained, 7, 1)[0]
+    recorded = filmed(trained, 7, 1)[0].scenes
     controller = PolicyController(trained.policy)
     observation = env.reset()
     controller.begin(env, observation)
@@ -107,14 +118,52 @@ def test_an_episode_that_ends_early_ends_the_recording(trained, monkeypatch):
         return type(result)(result.next, result.reward, ended, result.truncated, result.next, result.metrics)
 
     monkeypatch.setattr(kind, "step", ending)
-    assert [len(scenes) for scenes in filmed(trained, 3, 1)] == [1 + 2]
-    assert [len(scenes) for scenes in filmed(trained, 7, 2)] == [1 + 3, 1 + 3]
+    assert [episode.steps for episode in filmed(trained, 3, 1)] == [2]
+    assert [episode.steps for episode in filmed(trained, 7, 2)] == [3, 3]
 
 
-@pytest.mark.parametrize(("horizon", "episodes"), [(25, 3), (100, 3), (101, 2), (150, 2), (151, 1), (300, 1), (999, 1)])
-def test_a_film_is_three_episodes_or_half_a_minute(horizon, episodes):
-    spec = build_environment(tiny_config(task__horizon=horizon), 1, "shape").spec
-    assert default_episodes(spec) == episodes
+@pytest.mark.parametrize(("horizon", "episodes"), [(2, 10), (10, 5), (25, 3), (40, 2), (60, 1), (150, 1)])
+def test_episodes_follow_each_other_until_a_film_lasts_about_eight_seconds(trained, horizon, episodes):
+    config = tiny_config(seeds=SEEDS, task__horizon=horizon)
+    recorded = record(trained, build_environment(config, 1, "film"), 3)
+    assert len(recorded) == episodes
+    seconds = episodes * (0.1 * horizon + HOLD_SECONDS)
+    assert episodes == 1 or abs(seconds - 8) <= (0.1 * horizon + HOLD_SECONDS) / 2
+
+
+def test_two_policies_play_the_same_episodes(trained, tmp_path):
+    other = TrainedPolicy(
+        trained.config,
+        StochasticPolicy(trained.spec, trained.config.network, generators((8, 9), "weights")),
+        trained.spec,
+        0,
+        tmp_path / "other",
+    )
+    first, second = record_both(trained, other, (3, 7), 2, True)
+    assert first == filmed(trained, 3, 2), "the first plays what it plays alone"
+    for one, another in zip(first, second, strict=True):
+        assert one.scenes[0] == another.scenes[0]
+        assert one.scenes[-1] != another.scenes[-1]
+    assert record_both(trained, other, (7, 7), 1, True)[0] != first[:1]
+    crowded = tiny_config(seeds=SEEDS, task__horizon=6, task__num_landmarks=2)
+    spec = build_environment(crowded, 1, "shape").spec
+    fewer = TrainedPolicy(
+        crowded, StochasticPolicy(spec, crowded.network, generators(SEEDS, "weights")), spec, 0, tmp_path / "fewer"
+    )
+    with pytest.raises(ValueError, match=r"begin differently; compare policies whose task has the same settings"):
+        record_both(trained, fewer, (3, 3), 1, True)
+
+
+def test_a_window_grows_until_everything_stays_in_it():
+    inside = [episode(line(3))]
+    assert framed(inside) == inside
+    leaving = Scene((Body((1.4, 0.0), 0.1, RED),), (-1.0, 1.0, -1.0, 1.0))
+    near = Scene((Body((0.92, 0.0), 0.1, RED),), (-1.0, 1.0, -1.0, 1.0))
+    assert framed([episode([near])]) == [episode([near])], "what sticks out by a hair moves no window"
+    wide = framed([*inside, episode([leaving, near])])
+    windows = {scene.window for one in wide for scene in one.scenes}
+    assert windows == {(-1.5, 1.5, -1.5, 1.5)}, "one for all episodes"
+    assert wide[0].scenes[0].bodies == inside[0].scenes[0].bodies
 
 
 @pytest.mark.parametrize(
@@ -135,20 +184,25 @@ def test_frames_are_skipped_where_the_rate_asks_for_it(period, speed, rate, step
 
 def test_shots_keep_the_first_and_last_scene_and_the_time_of_all():
     scenes = line(6)
-    taken = shots([scenes, scenes[:5]], 2)
-    assert [shot.scenes[-1] for shot in taken] == [scenes[k] for k in (0, 2, 4, 5, 0, 2, 4)]
+    taken = shots([[episode(scenes), episode(scenes[:5])]], 2, 0.1, "task")
+    (moments,) = zip(*(shot.moments for shot in taken), strict=True)
+    assert [moment.scene for moment in moments] == [scenes[k] for k in (0, 2, 4, 5, 0, 2, 4)]
+    assert [moment.total for moment in moments] == [0, 2, 4, 5, 0, 2, 4]
     assert [shot.steps for shot in taken] == [2, 2, 1, 1, 2, 2, 1]
-    assert [len(shot.scenes) for shot in taken] == [1, 3, 5, 6, 1, 3, 5], "trails come from every step of the episode"
+    assert [shot.time_s for shot in taken] == pytest.approx([0, 0.2, 0.4, 0.5, 0, 0.2, 0.4])
+    assert [shot.caption for shot in taken] == ["task, episode 1 of 2"] * 4 + ["task, episode 2 of 2"] * 3
+    assert [len(moment.scenes) for moment in moments] == [1, 3, 5, 6, 1, 3, 5], "trails come from every step"
     assert np.array_equal(taken[2].draw(TopPainter(40)), draw(scenes[4], 40, trail=scenes[:4]))
 
 
 def test_a_film_is_drawn_in_order_and_watched(tmp_path):
     scenes, told = line(5), []
-    write_film(tmp_path / "film.gif", TopPainter(60), shots([scenes], 2), 0.05, told.append)
+    taken = shots([[episode(scenes)]], 2, 0.1, "task")
+    write_film(tmp_path / "film.gif", TopPainter(60), taken, 0.05, told.append)
     assert told == [1, 2, 3]
     with Image.open(tmp_path / "film.gif") as gif:
         assert gif.n_frames == 3
-        for k, duration in ((0, 100), (1, 100), (2, 50)):
+        for k, duration in ((0, 100), (1, 100), (2, 650)):  # the end stays in view
             gif.seek(k)
             assert gif.info["duration"] == duration
             drawn = draw(scenes[2 * k], 60, trail=scenes[: 2 * k])
@@ -269,53 +323,18 @@ def test_a_picture_comes_out_where_space_cannot_be_drawn(env, monkeypatch):
         pass
 
 
-def test_a_picture_in_space_is_the_end_with_its_trails_and_one_from_above_a_figure(tmp_path):
-    write_picture(tmp_path / "new" / "space.png", Space(), line(9), "title", 200)
-    with Image.open(tmp_path / "new" / "space.png") as picture:
-        assert (np.asarray(picture) == 108).all()
-    write_picture(tmp_path / "top.png", TopPainter(200), line(9), "title", 200)
-    with Image.open(tmp_path / "top.png") as picture:
-        assert picture.size == (200, 200)
-        assert picture.info.get("Software") is None
+def test_the_end_of_every_episode_stays_in_view(tmp_path):
+    taken = shots([[episode(line(3)), episode(line(3))]], 1, 0.1, "task")
+    write_film(tmp_path / "film.gif", TopPainter(60), taken, 0.1, lambda _: None)
+    assert durations(tmp_path / "film.gif") == [100, 100, 700, 100, 100, 700]
+    write_film(tmp_path / "film.mp4", TopPainter(64), taken, 0.1, lambda _: None)
+    assert len(list(iio.imiter(tmp_path / "film.mp4"))) == 2 + 7 + 2 + 7
 
 
-def drawn(figure):
-    """Return the picture of a figure and a function from a point of the world to its colour."""
-    content = BytesIO()
-    figure.savefig(content, format="png")
-    picture = np.asarray(Image.open(content).convert("RGB")).astype(int)
-
-    def color(x, y):
-        column, above = figure.axes[0].transData.transform((x, y))
-        return picture[len(picture) - 1 - int(above), int(column)].tolist()
-
-    return picture, color
-
-
-def test_trajectories_are_drawn_where_they_went_more_opaque_with_time():
-    picture, color = drawn(trajectories(line(), "title", 600))
-    assert picture.shape == (600, 600, 3)
-    early, middle, late = (color(x, -0.6) for x in (-0.65, 0.05, 0.62))
-    assert all(found[0] == 255 and found[1] == found[2] for found in (early, middle, late)), "red on white"
-    assert 235 > early[1] > middle[1] + 40 > late[1] + 80
-    assert color(0.1, -0.3) == [255, 255, 255]
-    _, color = drawn(trajectories(line(trail=False), "title", 600))
-    assert color(0.05, -0.6) == [255, 255, 255], "a body that leaves no trail has none"
-
-
-def test_trajectories_show_the_start_the_end_and_what_stands():
-    _, color = drawn(trajectories(line(), "title", 600))
-    assert color(-0.8, -0.6) == [255, 0, 0], "the mark of the start is opaque"
-    assert color(0.87, -0.6) == [255, 0, 0], "the end is as large as the body"
-    assert color(0.07, 0.5) == [0, 0, 255]
-    shapes = [Body((-0.5, 0.0), 0.2, RED, "ring", model="goal"), Body((0.5, 0.0), 0.2, BLUE, "cross")]
-    shapes.append(Body((0.0, 0.6), 0.2, RED, "square"))
-    figure = trajectories([Scene(tuple(shapes), (-1.0, 1.0, -1.0, 1.0))], "title", 600)
-    _, color = drawn(figure)
-    assert color(-0.3, 0.0) == [255, 0, 0]
-    assert color(-0.5, 0.01) != [255, 0, 0]
-    assert color(0.5, 0.0) == color(0.6, 0.1) == [0, 0, 255]
-    assert color(0.6, 0.02) != [0, 0, 255]
-    assert color(0.15, 0.75) == [255, 0, 0]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["start", "end", "goal"]
-    assert figure.axes[0].get_title(loc="left") == "title"
+def test_the_policy_that_ends_first_waits_for_the_other():
+    scenes = line(6)
+    taken = shots([[episode(scenes)], [episode(scenes[:3])]], 2, 0.1, "task", ("long", "short"))
+    pairs = [[moment.scene for moment in shot.moments] for shot in taken]
+    assert pairs == [[scenes[k], scenes[min(k, 2)]] for k in (0, 2, 4, 5)]
+    assert [moment.name for moment in taken[0].moments] == ["long", "short"]
+    assert [moment.total for moment in taken[-1].moments] == [5, 2]

@@ -261,4 +261,5 @@ def _body(entity: Any, world: int, is_agent: bool) -> Body:
     x, y = entity.state.pos[world].tolist()
     shape = "square" if type(entity.shape).__name__ == "Box" else "disc"
     radius = float(entity.shape.circumscribed_radius()) * (0.7071 if shape == "square" else 1.0)
-    return Body((x, y), max(radius, 0.01), f"#{red:02x}{green:02x}{blue:02x}", shape, trail=is_agent)
+    color, label = f"#{red:02x}{green:02x}{blue:02x}", "agent" if is_agent else "landmark"
+    return Body((x, y), max(radius, 0.01), color, shape, trail=is_agent, label=label)

@@ -50,11 +50,11 @@ def formation_scene(
     """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
     bodies = []
     for i, goal in enumerate(goals.tolist()):
-        bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal"))
+        bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal", label="goal"))
     radius = settings.obstacle_radius_m
-    bodies += [Body(tuple(place), radius, _PILLAR_COLOR, model="pillar") for place in pillars.tolist()]
+    bodies += [Body(tuple(place), radius, _PILLAR_COLOR, model="pillar", label="pillar") for place in pillars.tolist()]
     for i, (place, turn) in enumerate(zip(position.tolist(), heading.tolist(), strict=True)):
         color = _COLORS[i % len(_COLORS)]
-        bodies.append(Body(tuple(place), BODY_RADIUS_M, color, "disc", turn, trail=True, model="robot"))
+        bodies.append(Body(tuple(place), BODY_RADIUS_M, color, "disc", turn, trail=True, model="robot", label="robot"))
     half = settings.arena.side_m / 2
-    return Scene(tuple(bodies), (-half, half, -half, half))
+    return Scene(tuple(bodies), (-half, half, -half, half), unit="m")

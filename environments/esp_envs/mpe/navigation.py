@@ -157,11 +157,14 @@ class Navigation(ParticleTask):
         places = self.worlds.entity[:, :, lane].tolist()
         agents = self.settings.num_agents
         bodies = [
-            Body((x, y), AGENT_RADIUS, color, trail=True)
+            Body((x, y), AGENT_RADIUS, color, trail=True, label="agent")
             for (x, y), color in zip(places[:agents], _AGENT_COLORS, strict=False)
         ]
-        bodies += [Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, shape="cross") for x, y in places[agents:]]
-        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4))
+        bodies += [
+            Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, "cross", label="landmark", reach=OCCUPIED_WITHIN)
+            for x, y in places[agents:]
+        ]
+        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
     def _start(self, seed: int, lanes: slice) -> None:
         place(self.worlds, lanes, self._extents, self.generators[seed])

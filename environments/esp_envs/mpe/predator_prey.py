@@ -160,11 +160,13 @@ class PredatorPrey(ParticleTask):
         lane = world[0] * self.num_envs + world[1]
         places = self.worlds.entity[:, :, lane].tolist()
         predators = self.settings.num_predators
-        bodies = [Body((x, y), OBSTACLE_RADIUS, "#808890") for x, y in places[predators + 1 :]]
-        bodies += [Body((x, y), PREDATOR_RADIUS, "#d84a3f", trail=True) for x, y in places[:predators]]
+        bodies = [Body((x, y), OBSTACLE_RADIUS, "#808890", label="obstacle") for x, y in places[predators + 1 :]]
+        bodies += [
+            Body((x, y), PREDATOR_RADIUS, "#d84a3f", trail=True, label="predator") for x, y in places[:predators]
+        ]
         (x, y) = places[predators]
-        bodies.append(Body((x, y), PREY_RADIUS, "#3fa86a", trail=True))
-        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4))
+        bodies.append(Body((x, y), PREY_RADIUS, "#3fa86a", trail=True, label="prey"))
+        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock, generators and the random prey's plan."""

@@ -197,10 +197,10 @@ class Wildlife(Environment):
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return the drones of one world and the poacher on top of them, on the lines between the cells."""
         *drones, poacher = [(float(x), float(y)) for x, y in self._cells[world].tolist()]
-        bodies = [Body(place, 0.4, _COLORS[i % len(_COLORS)]) for i, place in enumerate(drones)]
-        bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross"))
+        bodies = [Body(place, 0.4, _COLORS[i % len(_COLORS)], label="drone") for i, place in enumerate(drones)]
+        bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross", label="poacher"))
         right, top = self.settings.width / 2, self.settings.height / 2
-        return Scene(tuple(bodies), (-right, right, -top, top), grid=(1.0, 0.5))
+        return Scene(tuple(bodies), (-right, right, -top, top), grid=(1.0, 0.5), unit="cells")
 
     def _wrap(self, cells: Tensor) -> Tensor:
         """Return coordinates [..., 2] brought round the torus into the grid, whose middle cell is (0, 0)."""

@@ -1,0 +1,183 @@
+"""Frames: pictures with a caption above, numbers along the axes, and a legend below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from esp_cli.drawing.films import Frame
+from esp_envs.drawing import TopPainter
+from esp_envs.scene import Painter, Scene
+
+LEAST_WIDTH = 200
+"""Pixels; narrower pictures have no room for text."""
+_PAPER, _TEXT, _FAINT = "#ffffff", "#202020", "#606060"
+_FONT_SHARE, _LEAST_FONT = 1 / 37, 10
+"""Height of letters against the width of a picture, and the smallest, pixels."""
+_BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6
+"""Height of a bar of text, height of the numbers below and width of those beside a picture, in letters."""
+_OVERSAMPLING = 3
+_GAP = 8
+"""Pixels between two pictures."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One world at one time: a scene after those that its trails come from, and what it is called.
+
+    Attributes:
+        scenes: of the episode until now.
+        total: return until now.
+        name: of the policy where two are compared, else None.
+    """
+
+    scenes: Sequence[Scene]
+    total: float
+    name: str | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """What there is now."""
+        return self.scenes[-1]
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An entry of a legend; bodies of several colours have two of them in their mark."""
+
+    label: str
+    shape: str
+    colors: tuple[str, ...]
+
+
+def marks(scene: Scene) -> tuple[Mark, ...]:
+    """Return what the bodies of a scene are called, in their order."""
+    found: dict[str, Mark] = {}
+    for body in scene.bodies:
+        if body.label is not None:
+            known = found.get(body.label, Mark(body.label, body.shape, (body.color,)))
+            colors = tuple(dict.fromkeys((*known.colors, body.color)))[:2]
+            found[body.label] = Mark(body.label, known.shape, colors)
+    return tuple(found.values())
+
+
+def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float) -> Frame:
+    """Draw one world, or two side by side, with caption, axes and legend.
+
+    Args:
+        painter: draws the scenes.
+        moments: one for each world.
+        left: what the caption says before the time.
+        time_s: since the episode began, s.
+    """
+    pictures = [painter.draw(moment.scene, moment.scenes[:-1]) for moment in moments]
+    width = pictures[0].shape[1]
+    if width < LEAST_WIDTH:
+        return _beside(pictures, 0)
+    size, flat = max(_LEAST_FONT, round(width * _FONT_SHARE)), isinstance(painter, TopPainter)
+    if flat:
+        pictures = [_with_axes(picture, moment.scene, size) for picture, moment in zip(pictures, moments, strict=True)]
+    time = f"{time_s:.1f} s"
+    if len(moments) > 1:
+        named = [_bar(p.shape[1], size, str(m.name), _total(m)) for p, m in zip(pictures, moments, strict=True)]
+        pictures = [np.concatenate(parts) for parts in zip(named, pictures, strict=True)]
+    else:
+        time = f"{time}, {_total(moments[0])}"
+    body = _beside(pictures, _GAP)
+    scene = moments[0].scene
+    legend = _legend(marks(scene), body.shape[1], size, _scale(scene, flat))
+    return np.concatenate([_bar(body.shape[1], size, left, time), body, legend])
+
+
+def _total(moment: Moment) -> str:
+    return f"return {moment.total:.1f}"
+
+
+def _scale(scene: Scene, flat: bool) -> str:
+    if flat:
+        return f"axes in {scene.unit}" if scene.unit else ""
+    x_min, x_max, y_min, y_max = scene.window
+    return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
+
+
+def _beside(pictures: Sequence[Frame], gap: int) -> Frame:
+    parts = [pictures[0]]
+    for picture in pictures[1:]:
+        parts += [np.full((len(picture), gap, 3), 255, dtype=np.uint8), picture]
+    return np.concatenate(parts, axis=1)
+
+
+@lru_cache(maxsize=8)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _bar(width: int, size: int, left: str, right: str) -> Frame:
+    """Draw a line of text with its ends at both sides."""
+    image = Image.new("RGB", (width, round(_BAR * size)), _PAPER)
+    draw, middle = ImageDraw.Draw(image), image.height / 2
+    draw.text((size / 2, middle), left, _TEXT, _font(size), anchor="lm")
+    draw.text((width - size / 2, middle), right, _TEXT, _font(size), anchor="rm")
+    return np.asarray(image)
+
+
+@lru_cache(maxsize=8)
+def _legend(entries: tuple[Mark, ...], width: int, size: int, note: str) -> Frame:
+    """Draw marks with their labels, and a note at the right."""
+    fine = size * _OVERSAMPLING
+    image = Image.new("RGB", (width * _OVERSAMPLING, round(_BAR * size) * _OVERSAMPLING), _PAPER)
+    draw, font = ImageDraw.Draw(image), _font(fine)
+    x, y, r = fine / 2, image.height / 2, 0.4 * fine
+    for mark in entries:
+        _draw_mark(draw, mark, (x, y - r, x + 2 * r, y + r))
+        draw.text((x + 2.6 * r, y), mark.label, _TEXT, font, anchor="lm")
+        x += 2.6 * r + draw.textlength(mark.label, font) + fine
+    draw.text((image.width - fine / 2, y), note, _FAINT, font, anchor="rm")
+    return np.asarray(image.resize((width, image.height // _OVERSAMPLING), Image.Resampling.BOX))
+
+
+def _draw_mark(draw: ImageDraw.ImageDraw, mark: Mark, box: tuple[float, float, float, float]) -> None:
+    """Draw a mark into a box; two colours share a disc or a ring."""
+    left, top, right, bottom = box
+    first, second, thick = mark.colors[0], mark.colors[-1], round(0.18 * (right - left))
+    if mark.shape == "disc":
+        draw.pieslice(box, 90, 270, fill=first)
+        draw.pieslice(box, -90, 90, fill=second)
+    elif mark.shape == "ring":
+        draw.arc(box, 90, 270, fill=first, width=thick)
+        draw.arc(box, -90, 90, fill=second, width=thick)
+    elif mark.shape == "square":
+        draw.rectangle(box, fill=first)
+    else:
+        draw.line([(left, top), (right, bottom)], fill=first, width=thick)
+        draw.line([(left, bottom), (right, top)], fill=first, width=thick)
+
+
+def _with_axes(picture: Frame, scene: Scene, size: int) -> Frame:
+    """Add numbers at the left and below, where lines of the grid are or, of cells, their middles."""
+    x_min, x_max, y_min, y_max = scene.window
+    height, width = picture.shape[:2]
+    side, below = round(_SIDE * size), round(_TICKS * size)
+    image = Image.new("RGB", (width + side, height + below), _PAPER)
+    image.paste(Image.fromarray(picture), (side, 0))
+    draw, font, scale = ImageDraw.Draw(image), _font(size), width / (x_max - x_min)
+    for x in _ticks(x_min, x_max, scene.grid[0], scale, size):
+        place = min(side + (x - x_min) * scale, side + width - 0.8 * size)
+        draw.text((place, height + below / 2), f"{x:g}", _FAINT, font, anchor="mm")
+    for y in _ticks(y_min, y_max, scene.grid[0], scale, size):
+        place = min(max((y_max - y) * scale, 0.6 * size), height - 0.6 * size)
+        draw.text((side - 0.4 * size, place), f"{y:g}", _FAINT, font, anchor="rm")
+    return np.asarray(image)
+
+
+def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> list[float]:
+    """Return multiples of the spacing in a range, as dense as numbers fit."""
+    step = spacing
+    while step * scale < 3 * size:
+        step *= 2
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    return [k * step for k in range(first, last + 1)]

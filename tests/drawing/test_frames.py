@@ -1,0 +1,120 @@
+"""Frames: caption, axes and legend stand around the picture, which stays as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from esp_cli.drawing import frames
+from esp_cli.drawing.frames import Mark, Moment, frame, marks
+from esp_envs import Body, Scene
+from esp_envs.drawing import TopPainter, draw
+
+RED, BLUE, GREEN = "#ff0000", "#0000ff", "#00ff00"
+WINDOW = (-1.0, 1.0, -1.0, 1.0)
+
+
+def scene(*bodies: Body, unit: str = "m") -> Scene:
+    return Scene(bodies, WINDOW, unit=unit)
+
+
+TEAM = scene(Body((0.0, 0.5), 0.1, RED, label="robot"), Body((0.5, 0.0), 0.1, GREEN, "ring", label="goal"))
+
+
+@pytest.fixture
+def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return every text that is drawn from now on."""
+    texts: list[str] = []
+    write = frames.ImageDraw.ImageDraw.text
+    frames._legend.cache_clear()
+
+    def remember(self, place, said, *rest, **options) -> None:
+        texts.append(said)
+        write(self, place, said, *rest, **options)
+
+    monkeypatch.setattr(frames.ImageDraw.ImageDraw, "text", remember)
+    return texts
+
+
+def test_the_caption_says_task_episode_time_and_return(written: list[str]) -> None:
+    frame(TopPainter(240), [Moment([TEAM], -3.14)], "task, episode 1 of 2", 1.25)
+    assert "task, episode 1 of 2" in written
+    assert "1.2 s, return -3.1" in written
+
+
+def test_the_legend_names_what_has_a_label_and_the_axes_their_unit(written: list[str]) -> None:
+    frame(TopPainter(240), [Moment([TEAM], 0.0)], "", 0.0)
+    assert {"robot", "goal", "axes in m"} <= set(written)
+    assert {"-1", "-0.5", "0", "0.5", "1"} <= set(written)
+    written.clear()
+    frames._legend.cache_clear()
+    frame(TopPainter(240), [Moment([scene(Body((0.0, 0.0), 0.1, RED), unit="")], 0.0)], "", 0.0)
+    assert "robot" not in written
+    assert not [text for text in written if text.startswith("axes")]
+
+
+def test_the_picture_itself_stays_as_it_is() -> None:
+    shown = frame(TopPainter(240), [Moment([TEAM], 0.0)], "task", 0.0)
+    picture = draw(TEAM, 240)
+    assert shown.shape[0] > 240 + 30
+    assert shown.shape[1] > 240
+    corners = [
+        (row, column)
+        for row in range(shown.shape[0] - 239)
+        for column in range(shown.shape[1] - 239)
+        if np.array_equal(shown[row : row + 240, column : column + 240], picture)
+    ]
+    assert len(corners) == 1
+
+
+def test_two_worlds_stand_side_by_side_with_their_names(written: list[str]) -> None:
+    other = scene(Body((-0.5, -0.5), 0.1, BLUE, label="robot"))
+    moments = [Moment([TEAM], 1.0, "plain"), Moment([other], 2.0, "esp")]
+    shown = frame(TopPainter(240), moments, "task", 0.5)
+    assert {"plain", "esp", "return 1.0", "return 2.0", "0.5 s"} <= set(written)
+    alone = frame(TopPainter(240), moments[:1], "task", 0.5)
+    assert shown.shape[1] == 2 * alone.shape[1] + 8
+
+
+def test_a_view_in_space_tells_the_size_of_its_floor(written: list[str]) -> None:
+    class Space:
+        note = None
+
+        def draw(self, scene, trail=()):
+            return np.full((180, 240, 3), 100, dtype=np.uint8)
+
+    shown = frame(Space(), [Moment([TEAM], 0.0)], "task", 0.0)
+    assert "floor 2 x 2 m" in written
+    assert "0.5" not in written, "perspective has no axes"
+    assert shown.shape[1] == 240
+
+
+def test_a_picture_too_narrow_for_text_has_none(written: list[str]) -> None:
+    shown = frame(TopPainter(100), [Moment([TEAM], 0.0)], "task", 0.0)
+    assert np.array_equal(shown, draw(TEAM, 100))
+    assert written == []
+
+
+def test_marks_have_the_colours_of_their_bodies() -> None:
+    bodies = [Body((0.0, 0.1 * k), 0.1, color, label="robot") for k, color in enumerate((RED, BLUE, GREEN))]
+    found = marks(scene(*bodies, Body((0.5, 0.5), 0.1, BLUE, "cross", label="landmark"), Body((0.9, 0.9), 0.1, RED)))
+    assert found == (Mark("robot", "disc", (RED, BLUE)), Mark("landmark", "cross", (BLUE,)))
+
+
+def test_marks_in_the_legend_have_their_shapes_and_colours() -> None:
+    def shades(shape: str, *colors: str) -> set[tuple[int, ...]]:
+        legend = frames._legend((Mark("", shape, colors),), 120, 20, "")
+        return {tuple(color) for color in legend.reshape(-1, 3).tolist()}
+
+    assert {(255, 0, 0), (0, 0, 255)} <= shades("disc", RED, BLUE)
+    assert (0, 0, 255) not in shades("disc", RED)
+    disc, ring = (frames._legend((Mark("", shape, (RED,)),), 120, 20, "") for shape in ("disc", "ring"))
+    assert (ring == (255, 0, 0)).all(-1).sum() < (disc == (255, 0, 0)).all(-1).sum()
+    for shape in ("square", "cross"):
+        assert (255, 0, 0) in shades(shape, RED)
+
+
+def test_numbers_along_an_axis_keep_apart() -> None:
+    assert frames._ticks(-1.0, 1.0, 0.5, 100, 13) == [-1, -0.5, 0, 0.5, 1]
+    assert frames._ticks(-1.0, 1.0, 0.5, 40, 13) == [-1, 0, 1]
+    assert frames._ticks(-3.5, 3.5, 1.0, 60, 13) == [-3, -2, -1, 0, 1, 2, 3]
