@@ -103,7 +103,5 @@ class GRU(Network):
         """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
         batch, num_steps = x.shape[1:3]
         in_time_order = x.transpose(1, 2).flatten(1, 2)
-        projected = self.gru.input(self.body(in_time_order)).unflatten(1, (num_steps, batch))
-        memories = self.gru.unroll(projected.transpose(0, 1).contiguous(), truncation)
-        rows = memories.transpose(0, 1).flatten(1, 2)
+        rows = self.gru.unroll(self.body(in_time_order).unflatten(1, (num_steps, batch)), truncation).flatten(1, 2)
         return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)

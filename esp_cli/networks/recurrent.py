@@ -36,64 +36,113 @@ class SeedGRU(nn.Module):
         candidate = torch.tanh(torch.addcmul(xn, reset, hn))
         return torch.lerp(candidate, h, update)
 
-    def unroll(self, projected: Tensor, truncation: int = 0) -> Tensor:
-        """Advance through whole episodes from empty memory: [T, S, B, 3H] -> every memory [T, S, B, H].
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Advance through whole episodes from empty memory: x [S, T, B, in] -> every memory [S, T, B, H].
 
-        The same as `advance` step by step, with a backward written by hand that works in place and makes one product
-        for the gradient of the weights of all steps; gradients through time are cut every `truncation` steps (0:
-        never).
+        The same as `forward` step by step, with a backward written by hand that works in place on what fits a cache;
+        gradients through time are cut every `truncation` steps (0: never).
         """
-        weight, bias = self.recurrent.weight, self.recurrent.bias
-        return _Unrolled.apply(projected, weight, bias, truncation)  # type: ignore[no-untyped-call]
+        layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
+        if torch.is_grad_enabled():
+            return _Unrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
+        return _advanced(x, *layers)[0][:, 1:]
+
+
+def _gates(weight: Tensor) -> Tensor:
+    """Return what belongs to r, z and n of a weight or bias [S, ..., 3H] by itself: [3, S, ..., H]."""
+    return weight.unflatten(2, (3, -1)).permute(2, 0, 1, 3).contiguous()
+
+
+def _advanced(
+    x: Tensor, weight: Tensor, bias: Tensor, recurrent: Tensor, inner_bias: Tensor, keep: bool = False
+) -> tuple[Tensor, list[Tensor], list[Tensor]]:
+    """Return all memories [S, 1 + T, B, H], and if kept r, z, n [3, S, B, H] and h U_n + b_n [S, B, H] of every step.
+
+    The memory of t = 0 is empty.
+    """
+    num_seeds, num_steps, batch = x.shape[:3]
+    (w_r, w_z, w_n), (u_r, u_z, u_n) = _gates(weight), _gates(recurrent)
+    (b_r, b_z, _), (_, _, c_n), (_, _, b_n) = _gates(bias + inner_bias), _gates(inner_bias), _gates(bias)
+    memories = x.new_empty(num_seeds, 1 + num_steps, batch, recurrent.shape[1])
+    memories[:, 0] = 0
+    gates, inner = x.new_empty(3, *memories[:, 0].shape), torch.empty_like(memories[:, 0])
+    every: tuple[list[Tensor], list[Tensor]] = ([], [])
+    for t in range(num_steps):
+        if keep and t:
+            gates, inner = torch.empty_like(gates), torch.empty_like(inner)
+        now, memory, (reset, update, candidate) = x[:, t], memories[:, t], gates
+        torch.baddbmm(b_r, now, w_r, out=reset).baddbmm_(memory, u_r)
+        torch.baddbmm(b_z, now, w_z, out=update).baddbmm_(memory, u_z)
+        gates[:2].sigmoid_()
+        torch.baddbmm(c_n, memory, u_n, out=inner)
+        torch.baddbmm(b_n, now, w_n, out=candidate).addcmul_(reset, inner)
+        activate_(candidate, "tanh")
+        torch.lerp(candidate, memory, update, out=memories[:, t + 1])
+        every[0].append(gates)
+        every[1].append(inner)
+    return memories, *every
 
 
 class _Unrolled(Function):
-    """All steps of a gated recurrent unit; `SeedGRU.advance` under autograd is the reference in the tests."""
+    """All steps of a gated recurrent unit; `SeedGRU.forward` under autograd is the reference in the tests."""
 
     @staticmethod
-    def forward(ctx, projected, weight, bias, truncation):  # type: ignore[no-untyped-def]
-        num_steps, num_seeds, batch, width = projected.shape
-        hidden = width // 3
-        memories = projected.new_zeros(num_steps + 1, num_seeds, batch, hidden)
-        gates = torch.empty_like(projected, memory_format=torch.contiguous_format)  # r, z, n of every step
-        inner = torch.empty_like(memories[1:])  # h U_n + b_n of every step
-        recurrent = torch.empty_like(gates[0])  # h U + b
-        for t in range(num_steps):
-            memory, x, gate = memories[t], projected[t], gates[t]
-            opened, candidate = gate[..., : 2 * hidden], gate[..., 2 * hidden :]
-            torch.baddbmm(bias, memory, weight, out=recurrent)
-            torch.add(x[..., : 2 * hidden], recurrent[..., : 2 * hidden], out=opened).sigmoid_()
-            inner[t].copy_(recurrent[..., 2 * hidden :])
-            reset, update = opened.chunk(2, -1)
-            torch.addcmul(x[..., 2 * hidden :], reset, inner[t], out=candidate)
-            activate_(candidate, "tanh")
-            torch.lerp(candidate, memory, update, out=memories[t + 1])
-        ctx.save_for_backward(memories, gates, inner, weight)
+    def forward(ctx, x, truncation, weight, bias, recurrent, inner_bias):  # type: ignore[no-untyped-def]
+        memories, gates, inner = _advanced(x, weight, bias, recurrent, inner_bias, keep=True)
+        ctx.save_for_backward(x, weight, recurrent, memories, *gates, *inner)
         ctx.truncation = truncation
-        return memories[1:]
+        return memories[:, 1:]
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        memories, gates, inner, weight = ctx.saved_tensors
-        num_steps, hidden = grad.shape[0], grad.shape[3]
-        into, back = torch.empty_like(gates), torch.empty_like(gates)  # of x W and of h U + b
-        backwards, carry = weight.transpose(1, 2), torch.zeros_like(memories[0])
-        passed, gap = torch.empty_like(carry), torch.empty_like(carry)
+        x, weight, recurrent, memories, *kept = ctx.saved_tensors
+        num_steps = len(kept) // 2
+        learned = _Learned(weight, recurrent)
+        by_x, carry = torch.empty_like(x), torch.zeros_like(memories[:, 0])
+        d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
+        gap = torch.empty_like(carry)
         for t in reversed(range(num_steps)):
-            reset, update, candidate = gates[t].chunk(3, -1)
-            opening, inward = into[t, ..., : 2 * hidden], into[t, ..., 2 * hidden :]
-            carry += grad[t]
-            torch.mul(carry, update, out=passed)
-            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=inward)
-            torch.mul(inward, inner[t], out=opening[..., :hidden])
-            torch.mul(torch.sub(memories[t], candidate, out=gap), carry, out=opening[..., hidden:])
-            torch.ops.aten.sigmoid_backward.grad_input(opening, gates[t, ..., : 2 * hidden], grad_input=opening)
-            back[t, ..., : 2 * hidden].copy_(opening)
-            torch.mul(inward, reset, out=back[t, ..., 2 * hidden :])
+            (reset, update, candidate), inner, before = kept[t], kept[num_steps + t], memories[:, t]
+            carry += grad[:, t]
+            passed = carry * update
+            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=d[2])
+            torch.mul(d[2], inner, out=d[0])
+            torch.mul(torch.sub(before, candidate, out=gap), carry, out=d[1])
+            torch.ops.aten.sigmoid_backward.grad_input(d[:2], kept[t][:2], grad_input=d[:2])
+            torch.mul(d[2], reset, out=d[3])
+            by_x[:, t] = learned.add(d, x[:, t], before)
             if ctx.truncation and t % ctx.truncation == 0:
                 carry.zero_()
             else:
-                torch.baddbmm(passed, back[t], backwards, out=carry)
-        rows = back.transpose(0, 1).flatten(1, 2)
-        before = memories[:-1].transpose(0, 1).flatten(1, 2)
-        return into, torch.bmm(before.transpose(1, 2), rows), rows.sum(1, keepdim=True), None
+                carry = learned.through_time(d, passed)
+        return by_x, None, *learned.gradients()
+
+
+class _Learned:
+    """The weights of a gated recurrent unit by gates, and the gradients by them, a sum over the steps."""
+
+    def __init__(self, weight: Tensor, recurrent: Tensor) -> None:
+        self.inputs, self.memories = _gates(weight), _gates(recurrent)
+        self.by_inputs, self.by_memories = torch.zeros_like(self.inputs), torch.zeros_like(self.memories)
+        self.by_sums = weight.new_zeros(4, weight.shape[0], 1, self.inputs.shape[-1])
+
+    def add(self, d: Tensor, x: Tensor, memory: Tensor) -> Tensor:
+        """Add a step's gradients, known those by its sums [4, S, B, H], and return that by its input [S, B, in]."""
+        x, memory = x.transpose(1, 2), memory.transpose(1, 2)
+        self.by_sums += d.sum(2, keepdim=True)
+        for k, (by_input, by_memory) in enumerate(zip(self.by_inputs, self.by_memories, strict=True)):
+            by_input.baddbmm_(x, d[k])
+            by_memory.baddbmm_(memory, d[k if k < 2 else 3])
+        w_r, w_z, w_n = self.inputs.transpose(2, 3)
+        return torch.bmm(d[0], w_r).baddbmm_(d[1], w_z).baddbmm_(d[2], w_n)
+
+    def through_time(self, d: Tensor, passed: Tensor) -> Tensor:
+        """Return the gradient by the memory before a step, added to what passes it by; in place."""
+        u_r, u_z, u_n = self.memories.transpose(2, 3)
+        return passed.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
+
+    def gradients(self) -> list[Tensor]:
+        """Return those by W, its bias, U and its bias."""
+        r, z, n, inner = self.by_sums
+        parts = ((*self.by_inputs,), (r, z, n), (*self.by_memories,), (r, z, inner))
+        return [torch.cat(gates, -1) for gates in parts]

@@ -160,15 +160,17 @@ def test_truncation_cuts_gradients_but_not_values():
 @pytest.mark.parametrize("truncation", [0, 3])
 def test_the_hand_written_unrolling_equals_autograd_through_single_steps(truncation):
     gru = SeedGRU(generators(0, 1), 5, 6).double()
-    x = torch.randn(7, 2, 4, 18, dtype=torch.float64, requires_grad=True)  # seven steps, four episodes
+    x = torch.randn(2, 7, 4, 5, dtype=torch.float64, requires_grad=True)  # seven steps, four episodes
     memory, history = torch.zeros(2, 4, 6, dtype=torch.float64), []
     for t in range(7):
         if truncation and t % truncation == 0:
             memory = memory.detach()
-        memory = gru.advance(x[t], memory)
+        memory = gru(x[:, t], memory)
         history.append(memory)
-    reference, ours = torch.stack(history), gru.unroll(x, truncation)
+    reference, ours = torch.stack(history, 1), gru.unroll(x, truncation)
     torch.testing.assert_close(ours, reference)
+    with torch.no_grad():
+        assert torch.equal(gru.unroll(x, truncation), ours)
     weight = torch.randn_like(reference)
-    inputs = [x, gru.recurrent.weight, gru.recurrent.bias]
+    inputs = [x, *gru.parameters()]
     assert_same_gradients(ours, reference, weight, inputs, rtol=None, atol=None)
