@@ -1,4 +1,4 @@
-"""What a task gives to whoever draws it: bodies in a window, and nothing about how they are painted."""
+"""What a task tells a renderer: the bodies in a window, not how to paint them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judge symmetry from anybody's transitions alone: no state can be set, and nothing is known of the noise.
+"""Measure symmetry from transitions alone: no state can be set, and the noise is unknown.
 
 If the starts, the policy, the dynamics and the reward are symmetric, a transition and its transformed copy have one
 distribution. So every expectation of (input, residual) agrees, where the residual is what a regression of change and

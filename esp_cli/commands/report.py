@@ -58,7 +58,7 @@ AtOption = Annotated[
 ]
 ReferenceOption = Annotated[
     list[str] | None,
-    typer.Option("--reference", help="Runs: draw a line at somebody else's number.", metavar="NAME=VALUE"),
+    typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE"),
 ]
 ThresholdOption = Annotated[
     list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")

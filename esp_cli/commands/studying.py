@@ -38,7 +38,7 @@ def run_study(
 
     Args:
         kind: of `studies.kinds`.
-        request: what is asked of the study.
+        request: what the user asks for.
         choices: how it is run.
         mode: which evaluations the tables state; by default those of this kind of study.
         thresholds: returns whose first passing the tables state, likewise.

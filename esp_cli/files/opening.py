@@ -1,4 +1,4 @@
-"""Opening of files where somebody else may have planted a link, a pipe or a device."""
+"""Opening of files where another user may have put a link, a pipe or a device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Suggestions for names that nobody knows: the nearest name that exists."""
+"""Suggestions for unknown names: the nearest name that exists."""
 
 from __future__ import annotations
 

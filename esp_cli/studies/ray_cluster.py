@@ -1,4 +1,4 @@
-"""The connection to a Ray cluster: refused where nobody answers, or where a node has other versions."""
+"""The connection to a Ray cluster: refused where nothing answers, or where a node has other versions."""
 
 from __future__ import annotations
 
@@ -83,10 +83,10 @@ def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Seque
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where nobody answers, for which Ray would wait for minutes.
+    """Refuse an address where nothing answers; Ray would wait for minutes.
 
     Raises:
-        OSError: nobody answers.
+        OSError: nothing answers.
         ValueError: it is that of a server for Ray's client.
     """
     if address.startswith("ray://"):

@@ -20,7 +20,7 @@ TRACKERS = {
 
 
 def require(names: Sequence[str]) -> None:
-    """Refuse trackers that nobody knows, or whose package is not installed.
+    """Refuse unknown trackers, and those whose package is not installed.
 
     Raises:
         ValueError: with what to install.

@@ -40,7 +40,7 @@ def read_config_file(path: Path) -> ConfigFile:
     beside choices such as {"task": "navigation", "steps": "500k"}.
 
     Raises:
-        ValueError: it is missing or damaged, or names a choice that nobody knows.
+        ValueError: it is missing or damaged, or names a choice that does not exist.
     """
     if path.is_dir():
         return _of_run(path, parse_config(RunFolder.open(path).config, path))

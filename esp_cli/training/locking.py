@@ -13,7 +13,7 @@ from esp_cli.files.opening import open_own
 
 
 class LockError(ValueError):
-    """A lock is held by somebody else, or cannot be taken; the text is one sentence for the user."""
+    """Another process holds the lock, or it cannot be taken; the text is one sentence for the user."""
 
 
 def acquire(file: Path) -> int:

@@ -179,7 +179,7 @@ class CopyStepper:
             reward.get(name, 0.0) if name in acting else self._passive_reward(reward) for name in copy.learners
         ]
         board.metrics[k] = [found[name] for name in task.metrics]
-        ended = {name: terminated.get(name, True) for name in acting}  # an agent of whom nothing is said has left
+        ended = {name: terminated.get(name, True) for name in acting}  # an agent that is not mentioned has left
         over = [name for name in acting if ended[name] or truncated.get(name, False)]
         if over and len(over) < len(acting) and not task.agents_end:
             raise ValueError(

@@ -33,7 +33,7 @@ class NavigationSettings(VmasSettings):
 
 
 class Navigation(VmasTask):
-    """VMAS navigation: every agent drives to a goal of its own on the unbounded plane, and touches nobody."""
+    """VMAS navigation: every agent drives to a goal of its own on the unbounded plane, and touches no other agent."""
 
     Settings: ClassVar[type[TaskSettings]] = NavigationSettings
     settings: NavigationSettings

@@ -1,4 +1,4 @@
-"""The task that a promise is asked of, the two ways of not keeping it, and how results are compared."""
+"""The task under test, the two ways to break a promise, and how results are compared."""
 
 from __future__ import annotations
 
