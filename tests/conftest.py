@@ -38,6 +38,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
 
 
+@pytest.fixture(scope="module")
+def forked_jobs() -> Iterator[None]:
+    """Let the jobs of a module's studies be forks of this process, which import nothing again."""
+    from esp_cli.studies import engine_local
+    from tests.forks import ForkEngine
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engine_local, "LocalEngine", ForkEngine)
+        yield
+
+
 @pytest.fixture
 def full_disk() -> Callable[[], AbstractContextManager[None]]:
     """Return a context in which files of this process can grow no further, as on a full disk."""

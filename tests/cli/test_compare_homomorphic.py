@@ -27,6 +27,7 @@ TINY = {
 OPTIONS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> None:
     out, file = tmp_path / "study", tmp_path / "results.json"
     board = ("--grid", 3, "--drones", 2)

@@ -44,7 +44,7 @@ def resumed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def study(forked_jobs: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The half-done study, done."""
     folder = tmp_path_factory.mktemp("old") / "study"
     shutil.copytree(OLD / "study", folder)
@@ -129,7 +129,6 @@ def test_a_half_done_study_is_planned_and_reported(tmp_path: Path) -> None:
     assert (folder / "report" / "report.html").is_file()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("like_machine")
 def test_a_finished_study_has_the_numbers_of_the_old_one(study: Path, tmp_path: Path) -> None:
     esp("report", study, "--results", tmp_path / "new.json")

@@ -1,4 +1,4 @@
-"""A task of one's own through the application, from training to a study, in a fresh process where paths matter."""
+"""A task of one's own through the application, from training to a study, in processes that know nothing of it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from esp_cli import load_policy
+from tests.forks import forked_esp
 from tests.own_tasks import save_page_files
 
-pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 TASK = "rendezvous:Rendezvous"
 SHORT = ["--steps", "200", "--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2"]
@@ -22,20 +22,18 @@ SHORT = ["--steps", "200", "--set", "mappo.num_envs=4", "--set", "evaluation.epi
 
 def esp(folder: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
     """Run the application as a user does, in a folder."""
-    path = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
-    boot = "from esp_cli.app import main; main()"
-    result = subprocess.run(
-        [sys.executable, "-c", boot, *words],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    result = forked_esp(folder, *words)
     assert result.returncode == code, result.stdout + result.stderr
     assert "Traceback" not in result.stderr
     return result
+
+
+def esp_anew(folder: Path, *words: str) -> None:
+    """Run the application in a process that has to import everything."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
+    boot = "from esp_cli.app import main; main()"
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
+    subprocess.run([sys.executable, "-c", boot, *words], cwd=folder, env=environment, timeout=300, check=True)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A working directory with the task and a finished run of it."""
     folder = tmp_path_factory.mktemp("own")
     save_page_files(folder)
-    esp(folder, "train", "--task", TASK, "--out", "run", *SHORT)
+    esp_anew(folder, "train", "--task", TASK, "--out", "run", *SHORT)
     return folder
 
 

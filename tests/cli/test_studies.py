@@ -67,6 +67,7 @@ def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> Non
     assert "MiB when done" in told.stdout
 
 
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) -> None:
     out = tmp_path / "s"
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--jobs", 1)

@@ -58,7 +58,7 @@ def test_without_optuna_tuning_is_refused_in_one_sentence(
     assert not (tmp_path / "t").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
     command: list[object], tmp_path: Path
 ) -> None:

@@ -9,7 +9,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from tests.torture.forks import Job, fork, wait
+from tests.forks import Job, fork, wait
 
 WHY_NOT = "file systems cannot be mounted here: that takes root and Linux"
 _NEW_NAMESPACE = 0x20000

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from esp_cli.files import faults
+from tests.forks import Job, fork, said, wait
 from tests.torture.disks import WHY_NOT, can_mount, start_on_full_disk, start_on_read_only_disk
-from tests.torture.forks import Job, fork, said, wait
 from tests.torture.runs import all_configs, newest_step, run_job, run_state
 from tests.torture.studies import forked_study, kill_some, real_study, study_state
 

@@ -8,20 +8,18 @@ import os
 import random
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-from esp_cli import app
-from esp_cli.files import faults
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.engine import Engine
-from esp_cli.studies.engine_local import LocalEngine, follow_parent
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
 from tests.benchmarks.growth import family
+from tests.forks import PATIENCE_S, ForkEngine, Job, fork, wait
 from tests.studies.small_studies import request
-from tests.torture.forks import PATIENCE_S, Job, fork, wait
 from tests.torture.runs import run_state
 
 TARGETS = ("parent", "job", "all")
@@ -92,48 +90,3 @@ def study_state(path: Path) -> str:
         text = folder.evaluation_path(cell).read_text().replace(str(path), "")
         digest.update(text.encode())
     return digest.hexdigest()
-
-
-class ForkEngine:
-    """Starts the jobs of a study as forks of its process."""
-
-    def start(self, arguments: Sequence[str], log: Path) -> ForkJob:
-        """Start one; it is told to stop when its parent ends."""
-        os.environ["ESP_PARENT_PROCESS"] = str(os.getpid())
-
-        def job() -> None:
-            os.closerange(3, 256)  # the lock of the study is not theirs
-            follow_parent()
-            faults.planned = None
-            app.app(list(arguments))
-
-        return ForkJob(fork(job, log.parent, log), log)
-
-
-class ForkJob:
-    """A fork that runs one command line; see `LocalJob`."""
-
-    def __init__(self, pid: int, log: Path) -> None:
-        self.pid, self.log, self._code = pid, log, None
-
-    def poll(self) -> int | None:
-        """Return the exit code, or None while it runs."""
-        if self._code is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            self._code = os.waitstatus_to_exitcode(status) if pid else None
-        return self._code
-
-    def ask_to_stop(self) -> None:
-        """Ask it to end after its iteration."""
-        if self.poll() is None:
-            os.kill(self.pid, signal.SIGTERM)
-
-    def kill(self) -> None:
-        """End it at once."""
-        if self.poll() is None:
-            os.kill(self.pid, signal.SIGKILL)
-            self._code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
-
-    def last_words(self) -> str:
-        """Return the end of its log."""
-        return self.log.read_text(errors="replace")[-300:]

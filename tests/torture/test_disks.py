@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from esp_cli.training.build import build_learner
+from tests.forks import fork, said, wait
 from tests.torture.disks import WHY_NOT, can_mount, start_on_full_disk, start_on_read_only_disk
-from tests.torture.forks import fork, said, wait
 from tests.torture.runs import newest_step, run_job, run_state
 from tests.training.runs import tiny_config
 

@@ -6,8 +6,8 @@ import pytest
 
 from esp_cli.files import writing
 from esp_cli.training import run_folder
+from tests.forks import fork, wait
 from tests.torture.files import KINDS, Files
-from tests.torture.forks import fork, wait
 from tests.torture.kills import Kills
 from tests.torture.lines import Lines
 from tests.torture.record import Record
