@@ -1,4 +1,4 @@
-"""Draw the dot figures of the measurement pages from the tables of these pages: python docs/make_figures.py."""
+"""Draw the dot figures of the measurement pages, from their tables and from results: python docs/make_figures.py."""
 
 from __future__ import annotations
 
@@ -11,8 +11,19 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from esp_cli.reporting.plots import Group, dots
+from esp_cli.reporting.results import read_results
+from esp_cli.reporting.summary import floats
+
 DOCS = Path(__file__).parent
+MEASURED = DOCS / "measured"
 COLOUR = "#0072B2"
+RESULTS = {
+    "ablate-modules": "ablate-modules",
+    "ablate-transforms": "ablate-transforms",
+    "ablate-transforms-mappo": "ablate-transforms",
+}
+"""Results in docs/measured -> their figures, of which each learner has one."""
 Row = dict[str, str]
 
 
@@ -101,8 +112,22 @@ def draw(ax: Axes, panel: Panel) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
+def draw_results() -> None:
+    """Draw the returns of the ablations from their results."""
+    for name, picture in RESULTS.items():
+        results = read_results(MEASURED / f"{name}.json")
+        for panel in dict.fromkeys(cell.panel for cell in results.cells):
+            cells = [cell for cell in results.cells if cell.panel == panel]
+            groups = [Group(cell.variant, floats(cell.returns[results.mode])) for cell in cells]
+            anchors = {key: round(value, 1) for key, value in cells[0].anchors.items()}
+            learner = cells[0].name.split("-")[1]
+            _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
+            svg.unlink()  # the pages show PNGs
+
+
 def main() -> None:
     """Draw every figure."""
+    draw_results()
     mpl.rcParams.update({"font.size": 9, "svg.hashsalt": "esp"})
     for name, panels in FIGURES.items():
         heights = [len(table(panel)) + 2 for panel in panels]
@@ -112,7 +137,7 @@ def main() -> None:
             draw(ax, panel)
         if name != "speed":
             axes[-1].set_xlabel("mean and standard error over seeds")
-        figure.savefig(DOCS / "measured" / f"{name}.png", dpi=150, metadata={"Software": None})
+        figure.savefig(MEASURED / f"{name}.png", dpi=150, metadata={"Software": None})
 
 
 if __name__ == "__main__":

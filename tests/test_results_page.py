@@ -111,6 +111,16 @@ def test_every_figure_of_a_table_can_be_drawn_again_and_is_on_its_page() -> None
         assert (DOCS / "measured" / f"{name}.png").is_file()
 
 
+def test_every_figure_of_results_can_be_drawn_again_and_is_on_a_page() -> None:
+    drawing = runpy.run_path(str(DOCS / "make_figures.py"))
+    pages = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "measurements").glob("*.md"))
+    for name, picture in drawing["RESULTS"].items():
+        for cell in drawing["read_results"](DOCS / "measured" / f"{name}.json").cells:
+            figure = f"{picture}-{cell.name.split('-')[1]}.png"
+            assert f"../measured/{figure}" in pages
+            assert (DOCS / "measured" / figure).is_file()
+
+
 def test_a_table_that_is_gone_is_noticed() -> None:
     drawing = runpy.run_path(str(DOCS / "make_figures.py"))
     with pytest.raises(ValueError, match="no table with the column 'gone'"):

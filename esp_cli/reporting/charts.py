@@ -16,7 +16,7 @@ from esp_cli.reporting.panels import Panel
 from esp_cli.reporting.plots import appearance
 
 WIDTH, HEIGHT = 640, 320
-_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 12, 12, 36
+_LEFT, _RIGHT, _TOP, _BOTTOM = 72, 12, 12, 46
 _DASHES, _LONG_DASHES = {"-": "", "--": "7 4", "-.": "7 3 2 3"}, "7 3 2 3 2 3"
 Floats = NDArray[np.float64]
 _MAX_POINTS = 200
@@ -66,6 +66,8 @@ class Chart:
     y_ticks: list[Tick]
     anchors: list[Tick]
     curves: list[ChartCurve]
+    y_title: str
+    x_title: str = "environment steps per seed"
     width: int = WIDTH
     height: int = HEIGHT
     left: int = _LEFT
@@ -74,12 +76,13 @@ class Chart:
     bottom: int = HEIGHT - _BOTTOM
 
 
-def chart(panel: Panel, labels: Sequence[str]) -> Chart:
+def chart(panel: Panel, labels: Sequence[str], y_title: str) -> Chart:
     """Return one panel as the template draws it.
 
     Args:
         panel: at least one curve with a finite value.
         labels: of all panels; the place of a label is its colour.
+        y_title: what is plotted.
     """
     drawn = [(curve.label, _thinned(curve.steps, curve.values)) for curve in panel.curves]
     edges = np.concatenate([np.concatenate([low, high]) for _, (_, _, low, high) in drawn])
@@ -100,6 +103,7 @@ def chart(panel: Panel, labels: Sequence[str]) -> Chart:
             if bottom <= value <= top
         ],
         curves=[_curve(label, labels.index(label), numbers, x, y) for label, numbers in drawn],
+        y_title=y_title,
     )
 
 

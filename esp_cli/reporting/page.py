@@ -20,7 +20,7 @@ from esp_cli.reporting.charts import chart, stroke
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.marl_eval import marl_eval
 from esp_cli.reporting.panels import Panel, Sensitivity, curve_panels, sensitivity
-from esp_cli.reporting.plots import Bar, Curve, bars
+from esp_cli.reporting.plots import Curve, Group, dots
 from esp_cli.reporting.results import RESULTS_FORMAT, CellResult
 from esp_cli.reporting.summary import floats
 from esp_cli.reporting.tables import all_tables, markdown_text
@@ -79,7 +79,7 @@ def write_report(material: Material, out: Path) -> list[Path]:
         "version": __version__,
         "command": material.study.command,
         "tables": all_tables(material.results),
-        "charts": [chart(panel, labels) for panel in panels],
+        "charts": [chart(panel, labels, f"{material.results.mode} return") for panel in panels],
         "legend": [(label, *stroke(index)) for index, label in enumerate(labels)],
         "pictures": [(png.stem, _data_uri(svg, "image/svg+xml")) for png, svg in pictures[1:]],  # curves are charts
         "films": [(name, _data_uri(path, "image/gif")) for path, name in _films(material).items()],
@@ -133,7 +133,7 @@ def _panels(material: Material) -> list[Panel]:
 
 
 def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Pictures:
-    """Draw the curves, and for variants their bars, or the returns over their coefficient."""
+    """Draw the curves, and for variants their returns, or the returns over their coefficient."""
     results = material.results
     label = f"{results.mode} return"
     pictures = [curve_panels(panels, out / "curves", label)]
@@ -158,9 +158,9 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
             *([sensitivity(lines, out / "coefficient", title, "weight", label, weights)] if lines else []),
         ]
     for k, (panel, own) in enumerate(finished.items()):
-        groups = [Bar(variant, numbers) for variant, numbers in values[panel].items()]
+        groups = [Group(variant, numbers) for variant, numbers in values[panel].items()]
         anchors = {key: round(value, 1) for key, value in next(iter(own.values())).anchors.items()}
-        pictures.append(bars(groups, out / f"bars-{k + 1}", panel, label, anchors.get("random", 0.0), anchors))
+        pictures.append(dots(groups, out / f"returns-{k + 1}", panel, label, anchors))
     return pictures
 
 

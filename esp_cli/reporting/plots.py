@@ -1,4 +1,4 @@
-"""Figures of the studies: learning curves with bands over seeds, and bars with every seed shown.
+"""Figures of the studies: learning curves with bands over seeds, and means with their intervals and every seed.
 
 Each figure is written as PNG and as SVG, the same bytes for the same numbers. Colours are those of Okabe and Ito, which
 people with any common colour blindness can tell apart; curves differ in their line style too.
@@ -20,7 +20,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
 from esp_cli.evaluation.curve_statistics import curve_band
@@ -72,8 +72,8 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Bar:
-    """One bar.
+class Group:
+    """What one run or one variant of a study brought.
 
     Attributes:
         label: its name on the axis.
@@ -156,56 +156,60 @@ def appearance(index: int) -> tuple[str, LineStyle]:
     return PALETTE[index % len(PALETTE)], _LINE_STYLES[index % len(_LINE_STYLES)]
 
 
-def bars(
-    groups: Sequence[Bar],
+def dots(
+    groups: Sequence[Group],
     path: str | os.PathLike[str],
     title: str,
     xlabel: str,
-    baseline: float = 0.0,
     anchors: Mapping[str, float] | None = None,
 ) -> tuple[Path, Path]:
-    """Draw a horizontal bar per group with its interval and every seed as a dot.
+    """Draw the mean of each group as a dot with its interval, and every seed as a small one.
+
+    The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise.
 
     Args:
         groups: at least one, drawn from top to bottom.
         path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         title: heading.
         xlabel: what is plotted, with its convention.
-        baseline: where bars begin. The random policy's return makes a bar's length what was learned.
-        anchors: dotted lines: name -> value.
+        anchors: lines where they are in view: name -> value; the legend names the others.
 
     Returns:
         The PNG and the SVG file.
 
     Raises:
-        ValueError: no bar, a value that is not finite, or a file that cannot be written.
+        ValueError: no group, a value that is not finite, or a file that cannot be written.
     """
     if not groups:
-        raise ValueError("there is no bar to draw")
-    height = 1.8 + 0.5 * len(groups)
-    with _figure(path, title, height) as (_, axes, files):
+        raise ValueError("there is no group to draw")
+    with _figure(path, title, 2.1 + 0.5 * len(groups)) as (figure, axes, files):
         for index, group in enumerate(groups):
             colour = PALETTE[index % len(PALETTE)]
             mean, _ = mean_and_sem(group.values)
             values = np.asarray(group.values, dtype=np.float64)
-            axes.barh(index, mean - baseline, left=baseline, height=0.6, color=colour, alpha=0.55)
-            # a fixed spread instead of a random one keeps the dots apart and the file the same
+            # a fixed spread instead of a random one keeps the seeds apart and the file the same
             spread = np.linspace(-0.18, 0.18, values.size) if values.size > 1 else np.zeros(1)
-            axes.plot(values, index + spread, "o", color=colour, markersize=3.5, markeredgewidth=0)
+            axes.plot(values, index + spread, "o", color=colour, markersize=3.5, markeredgewidth=0, alpha=0.45)
             interval = bootstrap_interval(values)
             if interval is not None:
-                axes.plot(interval, [index, index], color="black", linewidth=1.6, marker="|", markersize=9)
+                axes.plot(interval, [index, index], color=colour, linewidth=1.8, marker="|", markersize=10)
+            axes.plot([mean], [index], "o", color=colour, markersize=8)
         axes.set_yticks(range(len(groups)), [f"{group.label}\n({_seeds(np.size(group.values))})" for group in groups])
-        axes.invert_yaxis()
+        axes.set_ylim(len(groups) - 0.4, -0.6)
         axes.grid(visible=False, axis="y")
-        for name, value in (anchors or {}).items():
-            axes.axvline(value, linestyle=":", color="#777777", linewidth=1.2, label=f"{name} {value:g}")
-        if baseline:
-            axes.axvline(baseline, color="black", linewidth=0.8)
+        low, high = axes.get_xlim()
+        for index, (name, value) in enumerate((anchors or {}).items()):
+            if low <= value <= high:
+                style = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
+                axes.axvline(value, linestyle=style, color="#777777", linewidth=1.2, label=f"{name} {value:g}")
+            else:
+                axes.plot([], [], " ", label=f"{name} {value:g} (out of view)")
+        axes.set_xlim(low, high)
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8))
         caption = _caption([np.size(group.values) for group in groups])
         axes.set_xlabel(f"{xlabel}\n{caption}" if caption else xlabel)
         if anchors:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+            figure.legend(loc="outside lower center", ncols=2)
     return files
 
 

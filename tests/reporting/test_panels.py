@@ -68,7 +68,7 @@ def test_nothing_to_draw_is_told(tmp_path):
 
 
 def test_a_chart_places_points_by_hand():
-    made = chart(Panel("p", [RISING], {"random": 0.5, "far off": 99.0}), ["MAPPO"])
+    made = chart(Panel("p", [RISING], {"random": 0.5, "far off": 99.0}), ["MAPPO"], "greedy return")
     points = made.curves[0].points
     # steps 0 to 200 between the edges; values 0 to 5 with a margin of 4 % of 5 at either end
     assert [point[0] for point in points] == [made.left, (made.left + made.right) / 2, made.right]
@@ -82,14 +82,14 @@ def test_a_chart_places_points_by_hand():
 
 def test_a_chart_leaves_out_what_is_not_finite_and_thins_what_is_long():
     broken = Curve("a", [0, 1, 2], [[1.0, 1.0], [np.nan, 2.0], [3.0, 3.0]])
-    assert [point[2] for point in chart(Panel("p", [broken]), ["a"]).curves[0].points] == [0, 2]
+    assert [point[2] for point in chart(Panel("p", [broken]), ["a"], "y").curves[0].points] == [0, 2]
     long = Curve("a", np.arange(1001), np.arange(1001.0)[:, None])
-    points = chart(Panel("p", [long]), ["a"]).curves[0].points
+    points = chart(Panel("p", [long]), ["a"], "y").curves[0].points
     assert len(points) == 168, "every sixth of 1001, and the last"
     assert points[-1][2:4] == (1000, 1000.0)
 
 
 def test_a_flat_chart_and_one_of_a_single_evaluation_are_drawn():
-    made = chart(Panel("p", [Curve("a", [0], [[3.0]]), Curve("b", [0], [[3.0]])]), ["a", "b"])
+    made = chart(Panel("p", [Curve("a", [0], [[3.0]]), Curve("b", [0], [[3.0]])]), ["a", "b"], "y")
     assert made.curves[0].line
     assert made.curves[0].colour != made.curves[1].colour

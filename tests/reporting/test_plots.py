@@ -12,12 +12,12 @@ from PIL import Image
 
 from esp_cli.evaluation.curve_statistics import curve_band
 from esp_cli.reporting import plots
-from esp_cli.reporting.plots import PALETTE, Bar, Curve, bars, learning_curves
+from esp_cli.reporting.plots import PALETTE, Curve, Group, dots, learning_curves
 
 STEPS = [0, 100_000, 200_000]
 VALUES = np.array([[-220.0, -210.0, -215.0], [-150.0, -140.0, -148.0], [-120.0, -118.0, -125.0]])
 CURVES = [Curve("MAPPO", STEPS, VALUES - 10), Curve("MAPPO-ESP", STEPS, VALUES)]
-GROUPS = [Bar("rot90", [-121.0, -123.0, -122.0]), Bar("d4", [-118.0])]
+GROUPS = [Group("rot90", [-121.0, -123.0, -122.0]), Group("d4", [-118.0])]
 
 
 @pytest.fixture
@@ -39,12 +39,12 @@ def draw_curves(path, **changes):
     return learning_curves(CURVES, path, "navigation", "return, convention esp", **settings)
 
 
-def draw_bars(path, **changes):
-    settings = {"baseline": -221.4, "anchors": {"random": -221.4}, **changes}
-    return bars(GROUPS, path, "transforms", "return, convention esp", **settings)
+def draw_dots(path, **changes):
+    settings = {"anchors": {"random": -221.4, "heuristic": -119.0}, **changes}
+    return dots(GROUPS, path, "transforms", "return, convention esp", **settings)
 
 
-@pytest.mark.parametrize("draw", [draw_curves, draw_bars])
+@pytest.mark.parametrize("draw", [draw_curves, draw_dots])
 def test_figures_are_the_same_bytes_every_time_and_carry_no_date(tmp_path, draw):
     first, second = draw(tmp_path / "a"), draw(tmp_path / "b.svg")
     assert [file.name for file in (*first, *second)] == ["a.png", "a.svg", "b.png", "b.svg"]
@@ -58,7 +58,7 @@ def test_figures_are_the_same_bytes_every_time_and_carry_no_date(tmp_path, draw)
     assert "dc:date" not in text
 
 
-@pytest.mark.parametrize(("draw", "lines"), [(draw_curves, "references"), (draw_bars, "anchors")])
+@pytest.mark.parametrize(("draw", "lines"), [(draw_curves, "references"), (draw_dots, "anchors")])
 def test_other_numbers_are_another_figure(tmp_path, draw, lines):
     other = draw(tmp_path / "b", **{lines: {"paper": -130.0}})
     assert draw(tmp_path / "a")[1].read_bytes() != other[1].read_bytes()
@@ -71,7 +71,7 @@ def test_the_settings_of_the_caller_are_left_alone(tmp_path):
 
 
 def test_only_the_ending_of_a_picture_is_replaced(tmp_path):
-    assert [file.name for file in draw_bars(tmp_path / "cn.500k")] == ["cn.500k.png", "cn.500k.svg"]
+    assert [file.name for file in draw_dots(tmp_path / "cn.500k")] == ["cn.500k.png", "cn.500k.svg"]
 
 
 def test_curves_show_the_mean_over_seeds_in_colours_apart(tmp_path, drawn):
@@ -110,17 +110,30 @@ def test_lines_out_of_view_have_no_label(tmp_path, drawn):
     assert {text.get_text() for text in axes.texts} == {"heuristic -109", "paper -110.22"}
 
 
-def test_bars_begin_at_the_baseline_and_show_every_seed(tmp_path, drawn):
-    draw_bars(tmp_path / "a")
+def test_dots_are_means_with_their_interval_and_every_seed(tmp_path, drawn):
+    draw_dots(tmp_path / "a")
     axes = drawn[0].axes[0]
-    assert [bar.get_x() for bar in axes.patches] == [-221.4, -221.4]
-    assert [bar.get_x() + bar.get_width() for bar in axes.patches] == pytest.approx([-122.0, -118.0])
-    dots = [line.get_xdata().tolist() for line in axes.get_lines() if line.get_marker() == "o"]
-    assert dots == [[-121.0, -123.0, -122.0], [-118.0]]
+    assert not axes.patches, "a bar would begin somewhere that means nothing"
+    marks = [
+        (line.get_xdata().tolist(), line.get_markersize()) for line in axes.get_lines() if line.get_marker() == "o"
+    ]
+    assert [place for place, size in marks if size < 5] == [[-121.0, -123.0, -122.0], [-118.0]]
+    assert [place for place, size in marks if size > 5] == [[-122.0], [-118.0]]
     whiskers = [line.get_xdata() for line in axes.get_lines() if line.get_marker() == "|"]
     assert len(whiskers) == 1, "one seed has no interval"
     assert -123.0 <= whiskers[0][0] < -122.0 < whiskers[0][1] <= -121.0
     assert [label.get_text() for label in axes.get_yticklabels()] == ["rot90\n(3 seeds)", "d4\n(1 seed)"]
+    assert axes.get_ylim()[0] > axes.get_ylim()[1], "the first is on top"
+
+
+def test_the_view_of_dots_is_that_of_the_groups(tmp_path, drawn):
+    draw_dots(tmp_path / "a")
+    axes = drawn[0].axes[0]
+    low, high = axes.get_xlim()
+    assert -124.0 < low < -123.0
+    assert -118.0 < high < -117.0
+    names = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert names == ["random -221.4 (out of view)", "heuristic -119"]
 
 
 def test_names_are_not_mathematics(tmp_path):
@@ -143,14 +156,14 @@ def test_labels_are_pushed_apart_in_order():
     ("draw", "text"),
     [
         (lambda path: learning_curves([], path, "t", "y"), "no curve to draw"),
-        (lambda path: bars([], path, "t", "x"), "no bar to draw"),
+        (lambda path: dots([], path, "t", "x"), "no group to draw"),
         (
             lambda path: learning_curves([Curve("a", [1, 2], [[1.0]])], path, "t", "y"),
             "'a' has 2 steps and 1 evaluations",
         ),
         (lambda path: learning_curves([Curve("a", [1], [1.0])], path, "t", "y"), r"\[K, S\]"),
-        (lambda path: bars([Bar("a", [math.nan])], path, "t", "x"), "not finite"),
-        (lambda path: bars(GROUPS, "/dev/null/a", "t", "x"), "cannot write the figure .*(Not a directory|File exists)"),
+        (lambda path: dots([Group("a", [math.nan])], path, "t", "x"), "not finite"),
+        (lambda path: dots(GROUPS, "/dev/null/a", "t", "x"), "cannot write the figure .*(Not a directory|File exists)"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_sentence_and_no_file(tmp_path, draw, text):

@@ -30,6 +30,19 @@ svg.dispatchEvent(new PointerEvent("pointermove", at));
 document.body.dataset.shown = document.querySelector(".tip").innerText;
 svg.dispatchEvent(new PointerEvent("pointerleave", at));
 document.body.dataset.left = document.querySelector(".tip").hidden;
+const touch = { ...at, pointerType: "touch" };
+svg.dispatchEvent(new PointerEvent("pointerdown", touch));
+svg.dispatchEvent(new PointerEvent("pointerleave", touch));
+document.body.dataset.touched = document.querySelector(".tip").innerText;
+document.body.dispatchEvent(new PointerEvent("pointerdown", touch));
+document.body.dataset.elsewhere = document.querySelector(".tip").hidden;
+const wide = document.querySelector(".wide"), hints = [];
+for (const width of ["", "60px"]) {
+  wide.style.width = width;
+  dispatchEvent(new Event("resize"));
+  hints.push(!wide.previousElementSibling.hidden);
+}
+document.body.dataset.hints = hints.join();
 </script></body>
 """
 
@@ -70,10 +83,27 @@ def test_the_page_loads_nothing_and_forbids_it_too(page):
     loads = Loads()
     loads.feed(text)
     assert loads.found
-    assert all(source.startswith("data:") for source in loads.found)
+    assert all(source.startswith(("data:", "#")) for source in loads.found)
     assert "default-src 'none'" in text
     assert not re.search(r"url\(|@import|fetch\(|XMLHttpRequest", text)
     assert loads.scripts == 1, "what was handed in is text, not a script"
+
+
+def test_every_section_has_a_link_that_leads_to_it(page):
+    text = page.read_text()
+    places = re.findall(r'<h2 id="([^"]+)">', text)
+    assert text.count("<h2") == len(places) == len(set(places))
+    assert {"table-1", "curves", "films", "runs"} <= set(places)
+    assert "figures" not in places, "this study has none"
+    for place in places:
+        assert text.count(f'href="#{place}"') == 2, "in the list of sections, and beside the heading"
+    assert set(re.findall(r'href="#([^"]+)"', text)) == set(places)
+
+
+def test_charts_say_what_their_axes_are(page):
+    text = page.read_text()
+    assert text.count(">environment steps per seed</text>") == text.count('<figure class="chart"') == 1
+    assert text.count(">greedy return</text>") == 1
 
 
 def test_tables_commands_configuration_and_films_are_on_the_page(page):
@@ -117,7 +147,7 @@ def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProc
 
 
 @needs_browser
-def test_a_browser_renders_it_and_shows_values_on_hovering(page, tmp_path):
+def test_a_browser_renders_it_and_shows_values_on_hovering_and_on_touch(page, tmp_path):
     hovered = page.with_name("hovered.html")
     text = page.read_text().replace("</body>", HOVER)
     hovered.write_text(text)
@@ -129,6 +159,10 @@ def test_a_browser_renders_it_and_shows_values_on_hovering(page, tmp_path):
     assert "MAPPO: -150.00 [-160.00, -140.00]" in shown
     assert "MAPPO-ESP: -130.00 [-140.00, -120.00]" in shown
     assert 'data-left="true"' in done.stdout
+    touched = re.search(r'data-touched="([^"]*)"', done.stdout).group(1)
+    assert touched == shown, "a finger that leaves the chart leaves the values"
+    assert 'data-elsewhere="true"' in done.stdout
+    assert 'data-hints="false,true"' in done.stdout, "a table says that it scrolls where it does"
 
 
 @needs_browser
