@@ -90,7 +90,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
         elements: to try.
     """
     half = len(data.obs) // 2
-    inputs, outputs = _rows(spaces, data)
+    inputs, outputs = regression_rows(spaces, data)
     model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
     held = Transitions(*(part[half:] for part in vars(data).values() if part is not None))
     return [_judge(element, spaces, held, model) for element in elements]
@@ -99,10 +99,10 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
 def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -> ElementVerdict:
     transform = build_transform([element], spaces)
     declared = is_declared(element, spaces)
-    turned = _turned(data, transform)
-    if shift := _asymmetry(data.obs[:, 0], turned.obs[:, 0]):
+    image = turned(data, transform)
+    if shift := _asymmetry(data.obs[:, 0], image.obs[:, 0]):
         return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
-    here, there = (_statistics(spaces, part, model) for part in (data, turned))
+    here, there = (_statistics(spaces, part, model) for part in (data, image))
     layout = spaces.observation
     verdicts: list[FieldVerdict] = []
     for name, where in layout.slices().items():
@@ -124,7 +124,7 @@ def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: 
     return judged(name, gap[:, live] / here[..., where].flatten(1).std(0)[live].clamp_min(1e-6), 1.0, moved)
 
 
-def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
+def regression_rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
     """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1] of each agent: change, reward and any mask."""
     action = data.action
     acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
@@ -149,7 +149,7 @@ def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
 
 def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
     """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1]."""
-    inputs, outputs = _rows(spaces, data)
+    inputs, outputs = regression_rows(spaces, data)
     residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
     action = spaces.action
     acted = action.count - 1 if isinstance(action, Discrete) else action.width
@@ -157,7 +157,9 @@ def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
     return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
 
 
-def _turned(data: Transitions, transform: Transform) -> Transitions:
+def turned(data: Transitions, transform: Transform) -> Transitions:
+    """Return transformed transitions."""
+
     def one(part: Tensor) -> Tensor:
         return part.unsqueeze(0)
 

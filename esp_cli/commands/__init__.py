@@ -19,6 +19,7 @@ COMMANDS: dict[str, str] = {
     "compare-homomorphic": "esp_cli.commands.compare_homomorphic:compare_homomorphic",
     "tune": "esp_cli.commands.tune:tune",
     "check": "esp_cli.commands.check:check",
+    "discover": "esp_cli.commands.discover:discover",
     "tasks": "esp_cli.commands.tasks:tasks",
     "settings": "esp_cli.commands.settings:settings",
 }

@@ -11,11 +11,11 @@ import typer
 from esp_cli.commands.completion import COMPLETERS, Completer
 from esp_cli.formatting import format_count
 
-_TRAINED, _PRIOR, _SETTINGS = "What is trained", "Symmetry prior", "Settings"
+_TRAINED, _SEARCHED, _PRIOR, _SETTINGS = "What is trained", "What is searched", "Symmetry prior", "Settings"
 _RUN, _OUTPUT, _POLICY, _PICTURE = "How it runs", "Output", "What is evaluated", "Picture"
 _GROUPS: dict[str, tuple[str, ...]] = {
     _TRAINED: ("tasks", "algos", "preset", "steps", "seeds", "seed_list", "drones", "grid", "methods", "group"),
-    "What is searched": ("budget", "space", "goal", "reach", "trial_seeds"),
+    _SEARCHED: ("budget", "space", "goal", "reach", "trial_seeds"),
     _PRIOR: ("transforms", "consistency_coef"),
     _SETTINGS: ("settings", "config", "print_config", "init_from"),
     _RUN: ("resume", "device", "jobs", "dry_run", "reuse", "engine", "address", "gpu_share"),
@@ -26,6 +26,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
 _MOVED: dict[str, dict[str, str]] = {
     "train": {"task": _TRAINED, "algo": _TRAINED, "network": _TRAINED, "physics": _TRAINED, "prior": _PRIOR},
     "check": {"transforms": "Options"},
+    "discover": {"task": _SEARCHED, "transforms": _SEARCHED, "logs": _SEARCHED},
     "tune": {"prior": _PRIOR},
 }
 """Options that belong elsewhere in a command than in the others."""

@@ -206,7 +206,9 @@ PhysicsOption = Annotated[
 TransformsOption = Annotated[
     str | None,
     typer.Option(
-        "--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses.", metavar="LIST"
+        "--transforms",
+        help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses, or discovered.",
+        metavar="LIST",
     ),
 ]
 PolicyArgument = Annotated[

@@ -19,7 +19,9 @@ class PriorConfig(BaseModel):
     kind: Literal["esp", "augment", "consistency", "none"] = Field(
         "esp", description="copies and consistency losses, one of them alone, or neither: the plain learner"
     )
-    transforms: str = Field("d4", description="elements or a group; paper: rot90; ours: measured best on navigation")
+    transforms: str = Field(
+        "d4", description="elements, a group, or discovered; paper: rot90; ours: measured best on navigation"
+    )
     copies: Literal["draw", "all"] = Field(
         "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"
     )

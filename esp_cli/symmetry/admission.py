@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
 from esp_envs.spec import Discrete, Items, Spaces, joint_layout
 
+DISCOVERED = "discovered:"
+"""Begins transforms that were found in data, and that the task need not declare."""
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
 """The planar groups that `carried_groups` tries, smaller ones first."""
 
@@ -132,7 +135,11 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 
 def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
-    """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`)."""
-    elements = parse_elements(text, spaces.num_agents)
-    admit(text, elements, spaces)
+    """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`).
+
+    What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
+    """
+    found = text.removeprefix(DISCOVERED)
+    elements = parse_elements(found, spaces.num_agents)
+    admit(found, elements, spaces if found == text else replace(spaces, nearly="o2*agents"))
     return elements

@@ -13,10 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from typer.testing import CliRunner
 
 from esp_cli.app import app
+from esp_cli.checking import collect
+from esp_cli.checking.logs import read_transitions
 from esp_cli.deploy.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.reporting.pages import filled
@@ -178,6 +181,9 @@ def _make_sound_files(scratch: Path) -> None:
     (scratch / "results").mkdir()
     _run_command(["report", str(study.path), "--results", str(scratch / KINDS["results"].path), "--json", "-"])
     (scratch / "results" / "page.md").write_text("<!-- results: results.json returns -->\n<!-- end of results -->\n")
+    recorded = collect(make("navigation", 64, [0]), 64, 2)
+    arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
+    np.savez(scratch / "transitions.npz", **arrays)
     (scratch / "bundled").mkdir()
     manifest = json.loads((bundled_folder() / MANIFEST).read_text())
     manifest["policies"] = manifest["policies"][:2]  # the others are alike
@@ -283,6 +289,10 @@ def _prey(path: Path) -> None:
     make("predator-prey", 1, [0], {"prey": "policy", "prey_policy": str(path)})
 
 
+def _transitions(path: Path) -> None:
+    read_transitions(path, make("navigation", 1, [0]).spec)
+
+
 def _format(name: str) -> str:
     return "esp-checkpoint" if name == "checkpoint" else "esp-policy"
 
@@ -298,8 +308,20 @@ _ALL = (
     ("results/results.json", _results, "report --fill {scratch}/results/page.md", spoil_json),
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
     ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
+    ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
 )
-_NAMES = ("policy", "checkpoint", "config", "metrics", "study", "evaluation", "results", "manifest", "prey")
+_NAMES = (
+    "policy",
+    "checkpoint",
+    "config",
+    "metrics",
+    "study",
+    "evaluation",
+    "results",
+    "manifest",
+    "prey",
+    "transitions",
+)
 KINDS = {
     name: Kind(path, load, tuple(command.split()), spoil)
     for name, (path, load, command, spoil) in zip(_NAMES, _ALL, strict=True)

@@ -1,0 +1,245 @@
+"""Find symmetries that nobody declared: try many elements, keep those that are shown to hold, name their group.
+
+An element is accepted where every field of it is shown to be off by less than a tolerance. The null hypothesis of each
+field is that it is off by the tolerance or more; an element's p-value is the largest of its fields. The procedure
+of Benjamini and Hochberg (1995) over all elements bounds the share of false ones among the accepted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from esp_cli.checking.candidates import candidates
+from esp_cli.checking.paired import MakeWorlds, check_paired
+from esp_cli.checking.regression import TOLERATED, check_by_regression
+from esp_cli.checking.transitions import Transitions, collect
+from esp_cli.checking.verdicts import ElementVerdict
+from esp_cli.symmetry import Element, FiniteGroup
+from esp_cli.symmetry.admission import DISCOVERED
+from esp_cli.symmetry.parse import parse_elements
+from esp_cli.training.config import RunConfig
+from esp_envs.registry import make
+from esp_envs.spec import Spaces
+
+FALSE_DISCOVERIES = 0.05
+"""Share of false elements among the accepted, at most, in expectation."""
+_TOLERATED_SD = 0.15
+"""Gap between paired steps, in standard deviations, below which a field that is not found broken counts as equal."""
+_EXCHANGES = 28
+"""Exchanges of two agents that are tried, at most: all of 8 agents."""
+_WORLDS = 256
+_EPISODES = 4096
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What became of one element.
+
+    Attributes:
+        element: its name.
+        accepted: whether it counts as a symmetry.
+        p_value: of the hypothesis that it is off by the tolerance or more.
+        gap: of the worst field, in the unit of the method.
+        error: its standard error.
+        field: the worst field.
+    """
+
+    element: str
+    accepted: bool
+    p_value: float
+    gap: float
+    error: float
+    field: str
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What was found.
+
+    Attributes:
+        source: the task, run or file.
+        method: "paired states" or "transitions".
+        group: the name of what was found: "d4*agents", "flip-x", "c1" for nothing.
+        transforms: what `--transforms` takes to use it; empty where nothing was found.
+        tried: one entry for each element.
+    """
+
+    source: str
+    method: str
+    group: str
+    transforms: str
+    tried: tuple[Tried, ...]
+
+
+def discover_in_task(make: MakeWorlds, transforms: str | None = None, logs_alone: bool = False) -> Discovery:
+    """Find the symmetries of a task; its declared symmetry is not looked at.
+
+    Args:
+        make: makes E worlds for some seeds.
+        transforms: elements to try; by default those of a 16-gon, any angle, and exchanges of agents.
+        logs_alone: use transitions of the random policy even where the task can be set to states.
+    """
+    probe = make(1, [0])
+    spec, elements = probe.spec, _candidates(probe.spec, transforms)
+    if probe.has("set_state") and not logs_alone:
+        verdicts = check_paired(make, elements)
+        return _concluded(spec.name, "paired states", spec, elements, verdicts, _TOLERATED_SD)
+    data = collect(make(max(16, min(_WORLDS, 8192 // spec.horizon)), [0]), _EPISODES)
+    return discover_in_transitions(spec.name, spec, data, transforms)
+
+
+def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, transforms: str | None = None) -> Discovery:
+    """Find the symmetries of transitions of any policy; see `discover_in_task`."""
+    elements = _candidates(spaces, transforms)
+    verdicts = check_by_regression(spaces, data, elements)
+    return _concluded(source, "transitions", spaces, elements, verdicts, 2 * TOLERATED)
+
+
+def with_discovered(config: RunConfig) -> RunConfig:
+    """Return a configuration whose transforms are what is found in its task, where they are "discovered".
+
+    Without a finding there is no prior.
+    """
+    if config.prior.transforms != DISCOVERED.rstrip(":") or config.prior.kind == "none":
+        return config
+    name, settings = config.task, config.task_settings
+    found = discover_in_task(lambda num_envs, seeds: make(name, num_envs, seeds, settings))
+    change = {"transforms": DISCOVERED + found.transforms} if found.transforms else {"kind": "none", "transforms": "d4"}
+    return config.model_copy(update={"prior": config.prior.model_copy(update=change)})
+
+
+def accepted_of(p_values: Sequence[float], rate: float = FALSE_DISCOVERIES) -> list[bool]:
+    """Return which hypotheses are rejected at a false discovery rate (Benjamini and Hochberg, 1995)."""
+    ordered = sorted(p_values)
+    bounds = [p for k, p in enumerate(ordered, 1) if p <= rate * k / len(ordered)]
+    return [bool(bounds) and p <= bounds[-1] for p in p_values]
+
+
+def named(accepted: Sequence[Element], tried: Sequence[Element], num_agents: int) -> tuple[str, str]:
+    """Return the name of the largest group that the accepted elements close to, and its `--transforms`.
+
+    A group counts where all of its elements that were tried are accepted, and at least one was tried.
+
+    Args:
+        accepted: elements that hold.
+        tried: all elements.
+        num_agents: N.
+    """
+    plane, plane_text = _plane([e for e in accepted if e.permutation is None], tried)
+    exchanges = [e for e in accepted if e.permutation is not None and e.in_place.is_identity]
+    agents_text = ""
+    if exchanges:
+        group = FiniteGroup.generated_by("found", exchanges) if num_agents <= 6 else None
+        everyone = len(exchanges) == len([e for e in tried if e.permutation is not None and e.in_place.is_identity])
+        whole = everyone or (group is not None and group.order == math.factorial(num_agents))
+        agents_text = "agents" if whole else ",".join(e.name for e in exchanges)
+    if not agents_text:
+        return plane, plane_text
+    if agents_text == "agents":
+        return f"{plane}*agents", f"{plane_text}*agents" if plane_text and "," not in plane_text else "agents"
+    return f"{plane} and {agents_text}", ",".join(text for text in (plane_text, agents_text) if text)
+
+
+def _plane(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, str]:
+    """Return the name and the `--transforms` of the largest planar group whose tried elements are all accepted."""
+    held, seen = set(accepted), set(tried)
+    names = {e.name for e in accepted}
+    best, text, size = "c1", "", 0
+    for name, elements in _subgroups():
+        known = [e for e in elements if e in seen]
+        if len(known) > size and held.issuperset(known) and _generate(known, elements):
+            best, text, size = name, name if "," not in name else ",".join(e.name for e in known), len(known)
+    if {"rot57", "flip23"} <= names:
+        return "o2", "o2"
+    if "rot57" in names and best.startswith("c"):
+        return "so2", "so2"
+    return best, text
+
+
+def _generate(known: Sequence[Element], elements: Sequence[Element]) -> bool:
+    """Return whether the tried elements of a group generate all of it."""
+    return bool(known) and FiniteGroup.generated_by("known", known).order == len(elements) + 1
+
+
+def _subgroups() -> list[tuple[str, tuple[Element, ...]]]:
+    """Return every subgroup of D16 with its elements but the identity, named where `parse_elements` has a name."""
+    found: list[tuple[str, tuple[Element, ...]]] = []
+    for fold in (1, 2, 4, 8, 16):
+        turns = () if fold == 1 else _listed(f"c{fold}")
+        if turns:
+            found.append((f"c{fold}", turns))
+        for shift in range(16 // fold):
+            mirrors = _listed(",".join(f"flip{11.25 * (shift + 16 / fold * k):g}" for k in range(fold)))
+            plain = shift == 0 and fold > 1
+            name = f"d{fold}" if plain else ",".join(e.name for e in (*turns, *mirrors))
+            found.append((name, (*turns, *mirrors)))
+    return found
+
+
+def _listed(text: str) -> tuple[Element, ...]:
+    elements = parse_elements(text, 1)
+    assert isinstance(elements, tuple)
+    return elements
+
+
+def _candidates(spaces: Spaces, transforms: str | None) -> list[Element]:
+    """Return the elements to try that actions and layouts can carry, whatever the task declares.
+
+    By default turns and mirrors of a 16-gon, two that stand for all angles, and exchanges of two agents.
+    """
+    if transforms is not None:
+        return candidates(spaces, transforms)
+    texts, count = ["d16", "rot57", "flip23"], spaces.num_agents
+    for a, b in itertools.islice(itertools.combinations(range(count), 2), _EXCHANGES):
+        order = list(range(count))
+        order[a], order[b] = b, a
+        texts.append("agents-" + "-".join(map(str, order)))
+    return [element for text in texts for element in _carried(spaces, text)]
+
+
+def _carried(spaces: Spaces, text: str) -> list[Element]:
+    """Return those of some elements that can be carried."""
+    try:
+        return candidates(spaces, text)
+    except ValueError:
+        return []
+
+
+def _concluded(
+    source: str,
+    method: str,
+    spaces: Spaces,
+    elements: Sequence[Element],
+    verdicts: Sequence[ElementVerdict],
+    tolerance: float,
+) -> Discovery:
+    p_values = [_p_value(verdict, tolerance) for verdict in verdicts]
+    accepted = accepted_of(p_values) if p_values else []
+    tried = [_tried(verdict, p, holds) for verdict, p, holds in zip(verdicts, p_values, accepted, strict=True)]
+    kept = [element for element, holds in zip(elements, accepted, strict=True) if holds]
+    group, transforms = named(kept, elements, spaces.num_agents)
+    return Discovery(source, method, group, transforms, tuple(tried))
+
+
+def _p_value(verdict: ElementVerdict, tolerance: float) -> float:
+    """Return how likely gaps this small are, if some field is off by the tolerance; 1 where one is found broken."""
+    if verdict.outcome != "holds":
+        return 1.0
+    worst = 0.0
+    for field in verdict.fields:
+        if field.outcome == "holds":
+            score = (tolerance - field.gap) / max(field.error, 1e-12)
+            worst = max(worst, 0.5 * math.erfc(score / math.sqrt(2)))
+    return worst
+
+
+def _tried(verdict: ElementVerdict, p_value: float, accepted: bool) -> Tried:
+    rank = {"broken": 2, "holds": 1, "not covered": 0}
+    fields = [f for f in verdict.fields if f.outcome != "not covered"]
+    if not fields:
+        return Tried(verdict.element, accepted, p_value, math.nan, math.nan, verdict.reason or "not covered")
+    worst = max(fields, key=lambda f: (rank[f.outcome], f.gap))
+    return Tried(verdict.element, accepted, p_value, worst.gap, worst.error, worst.field)

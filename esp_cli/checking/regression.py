@@ -1,0 +1,113 @@
+"""Measure from anybody's transitions how far an element is from a symmetry: of any policy, without setting states.
+
+A ridge regression of change and reward on what is seen and done is fitted twice on one half of the episodes: on the
+transitions alone, and on them together with their transformed copies. If dynamics and reward are symmetric, the copies
+are transitions like others, and the second fit predicts the other half as well as the first. The gap
+
+    (error with copies - error without) / variance
+
+is the share of the variance that a learner gets wrong by believing in the element. It is measured where the data
+lies; what happens where only transformed states lie is not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from esp_cli.checking.transitions import Transitions, regression_rows, turned
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
+from esp_cli.symmetry import Element, build_transform
+from esp_envs.spec import Discrete, Spaces
+
+TOLERATED = 2e-3
+"""Gap below which an element counts as a symmetry of transitions."""
+_RIDGE = 1e-4
+_WIDEST = 160
+"""Up to so many numbers that all other agents see and do, what they see is looked at too; else what they do alone."""
+_STILL = 1e-10
+"""Variance below which a field does not change, so that it says nothing."""
+
+
+def check_by_regression(
+    spaces: Spaces, data: Transitions, elements: Sequence[Element], tolerated: float = TOLERATED
+) -> list[ElementVerdict]:
+    """Judge elements from transitions; `gap` is a share of variance here, and `error` its standard error.
+
+    Args:
+        spaces: what the numbers are.
+        data: anybody's transitions; each episode counts once.
+        elements: to try.
+        tolerated: gap up to which a field holds.
+    """
+    rows = _rows(spaces, data)
+    return [_judged(element, spaces, data, rows, tolerated) for element in elements]
+
+
+def _judged(
+    element: Element, spaces: Spaces, data: Transitions, rows: tuple[Tensor, Tensor], tolerated: float
+) -> ElementVerdict:
+    parts = [*rows, *_rows(spaces, turned(data, build_transform([element], spaces)))]
+    if element.permutation is None:  # agents stay, and one regression serves them all
+        parts = [part.flatten(1, 2).unsqueeze(2) for part in parts]
+    gap, outputs = _excess(*parts), parts[1]
+    names = spaces.observation.slices() | {"reward": slice(spaces.observation.width, spaces.observation.width + 1)}
+    verdicts = [
+        _field(name if name == "reward" else f"obs.{name}", gap[:, where], outputs[..., where], tolerated)
+        for name, where in names.items()
+    ]
+    return ElementVerdict(element.name, False, tuple(verdicts))
+
+
+def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
+    """Return `regression_rows` with what the other agents see and do, on which an agent's next observation depends.
+
+    Without it, others that prefer a direction would look like a task that does.
+    """
+    inputs, outputs = regression_rows(spaces, data)
+    agents, width = spaces.num_agents, spaces.observation.width
+    acted = spaces.action.count - 1 if isinstance(spaces.action, Discrete) else spaces.action.width
+    first = 1 if (agents - 1) * (width + acted) <= _WIDEST else 1 + width
+    others = [[j for j in range(agents) if j != i] for i in range(agents)]
+    beside = inputs[..., first : 1 + width + acted][:, :, others].flatten(3)
+    return torch.cat([inputs, beside], -1), outputs
+
+
+def _field(name: str, excess: Tensor, outputs: Tensor, tolerated: float) -> FieldVerdict:
+    """Judge one field by the excess of squared error [M, numbers] of each held-out episode."""
+    variance = float(outputs.flatten(0, 2).double().var(0).sum())
+    if variance < _STILL:
+        return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    shares = excess.sum(1) / variance
+    gap, error = float(shares.mean()), float(shares.std() / len(shares) ** 0.5)
+    return FieldVerdict(name, "broken" if gap > tolerated else "holds", gap, error)
+
+
+def _excess(inputs: Tensor, outputs: Tensor, copied_inputs: Tensor, copied_outputs: Tensor) -> Tensor:
+    """Return by how much copies worsen the prediction of each held-out episode, [M / 2, outputs].
+
+    Args:
+        inputs: [M, T, A, features], one regression for each of the A agents.
+        outputs: [M, T, A, outputs].
+        copied_inputs: the same of the transformed transitions.
+        copied_outputs: likewise.
+    """
+    half = len(inputs) // 2
+    own = _moments(inputs[:half], outputs[:half])
+    copied = _moments(copied_inputs[:half], copied_outputs[:half])
+    together = (own[0] + copied[0], own[1] + copied[1])
+    errors = []
+    for gram, cross in (own, together):
+        ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
+        weights = torch.linalg.solve(gram + ridge, cross).float()
+        predicted = torch.einsum("mtaf,afo->mtao", inputs[half:], weights)
+        errors.append((predicted - outputs[half:]).double().square().mean((1, 2)))
+    return errors[1] - errors[0]
+
+
+def _moments(inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Return X^T X and X^T Y of each agent, in float64."""
+    x, y = (part.flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
+    return (x.mT @ x).double(), (x.mT @ y).double()

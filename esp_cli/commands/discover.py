@@ -1,0 +1,102 @@
+"""`esp discover`: which symmetries does a task have, or the transitions that somebody recorded?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_tasks
+
+if TYPE_CHECKING:
+    from esp_cli.checking.discovery import Discovery
+    from esp_envs import Environment
+
+EPILOG = """Examples:\n
+    esp discover navigation --set task.wind=0.3\n
+    esp discover runs/navigation --json found.json\n
+    esp discover transitions.npz --task rendezvous:Rendezvous\n
+    esp train --task navigation --transforms discovered"""
+
+
+def discover(
+    what: Annotated[
+        str, typer.Argument(help="A task, a run folder, or an .npz file of transitions.", metavar="TASK|RUN|FILE")
+    ],
+    task: Annotated[
+        str | None,
+        typer.Option("--task", "-t", help="Task whose layout the transitions of a file have.", metavar="TASK"),
+    ] = None,
+    transforms: Annotated[
+        str | None,
+        typer.Option("--transforms", help="Elements to try, as d8; by default many.", metavar="LIST"),
+    ] = None,
+    settings: TaskSetOption = None,
+    logs: Annotated[
+        bool, typer.Option("--logs", help="Judge from transitions alone, also where states can be set.")
+    ] = False,
+    json: JsonOption = None,
+) -> None:
+    """Find symmetries that nobody declared, and print the --transforms that use them.
+
+    What the task declares is not looked at. An element is accepted where it is shown to hold; of all accepted elements
+    at most 5 % are false, in expectation.
+    """
+    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs)
+    if json != "-":
+        _print(found)
+    if json is not None:
+        console.write_json(json, found)
+
+
+def _discovery(
+    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool
+) -> Discovery:
+    from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
+    from esp_cli.checking.logs import read_transitions
+    from esp_envs.registry import make
+
+    register_tasks([task or "", what if ":" in what and not Path(what).exists() else ""])
+    path = Path(what)
+    if path.suffix == ".npz" or path.is_file():
+        if task is None:
+            raise ValueError(f"{what} does not say what its numbers are; name the task that has its layout with --task")
+        spec = make(task, 1, [0], settings).spec
+        return discover_in_transitions(what, spec, read_transitions(path, spec), transforms)
+    name = what
+    if path.is_dir():
+        from esp_cli.training.loading import parse_config
+        from esp_cli.training.run_folder import RunFolder
+
+        config = parse_config(RunFolder.open(path).config, path)
+        name, settings = config.task, config.task_settings | settings
+    elif task is not None:
+        raise ValueError(f"--task is for a file of transitions, and there is no file {what}; leave it out")
+
+    def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
+        return make(name, num_envs, seeds, settings)
+
+    return discover_in_task(worlds, transforms, logs)
+
+
+def _print(found: Discovery) -> None:
+    rows = [
+        (
+            one.element,
+            "accepted" if one.accepted else "-",
+            f"{one.p_value:.2g}",
+            f"{one.field} {one.gap:.4f} ± {one.error:.4f}",
+        )
+        for one in found.tried
+    ]
+    unit = "standard deviations" if found.method == "paired states" else "shares of variance"
+    title = f"{found.source} by {found.method}: found {found.group}"
+    caption = f"worst field: gap ± standard error in {unit}; p: that a field is off by the tolerance or more"
+    console.table(("element", "result", "p>", "worst field"), rows, title=title, caption=caption)
+    if found.transforms:
+        console.note(f"use it with: --transforms {found.transforms}")
+    else:
+        console.note("nothing was found: train with --prior none, or with prior.compass")

@@ -1,0 +1,228 @@
+"""Symmetries that nobody declared: found in tasks and in logs, and none found where there is none."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli.checking import Transitions, collect
+from esp_cli.checking.discovery import (
+    accepted_of,
+    discover_in_task,
+    discover_in_transitions,
+    named,
+    with_discovered,
+)
+from esp_cli.checking.logs import read_transitions
+from esp_cli.checking.regression import check_by_regression
+from esp_cli.symmetry import parse_elements
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_envs import make
+from tests.cli.running import esp, refused
+
+FORCES = {"actions": "continuous"}
+ROBOTS = {"horizon": 40, "num_agents": 4, "num_obstacles": 2}
+DRONES = {"width": 5, "height": 5, "horizon": 30}
+FOUND = [
+    ("navigation", {}, "d4*agents"),
+    ("navigation", FORCES, "o2*agents"),
+    ("navigation", {"wind": 0.3, **FORCES}, "flip-x*agents"),
+    ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal*agents"),
+    ("navigation", {"weak_agent": 0.5}, "d4 and agents-0-2-1"),
+    ("navigation", {"wind": 0.3, "gust_mean": 1.0, "weak_agent": 0.5, "num_agents": 2}, "c1"),
+    ("predator-prey", {}, "d4*agents"),
+    ("predator-prey", {"control": "prey", **FORCES}, "d4"),
+    ("wildlife", DRONES, "d4*agents"),
+    ("formation", ROBOTS, "d4*agents"),
+]
+
+
+def discovered(task: str, settings, transforms: str | None = None, logs_alone: bool = False):
+    """Discover in a task whose declaration says that there is nothing."""
+
+    def worlds(num_envs, seeds):
+        env = make(task, num_envs, seeds, settings)
+        env.spec = replace(env.spec, symmetry="c1", nearly="")
+        return env
+
+    return discover_in_task(worlds, transforms, logs_alone)
+
+
+@pytest.mark.parametrize(("task", "settings", "group"), FOUND, ids=str)
+def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> None:
+    robots = "d4,agents-1-0-2-3,agents-0-2-1-3,agents-0-1-3-2" if task == "formation" else None
+    found = discovered(task, settings, robots)
+    assert (found.method, found.group) == ("paired states", group)
+    assert bool(found.transforms) == (group != "c1")
+
+
+@pytest.mark.parametrize(("task", "settings", "group"), [*FOUND[:2], *FOUND[3:5]], ids=str)
+def test_logs_alone_show_the_same(task, settings, group) -> None:
+    found = discovered(task, settings, logs_alone=True)
+    assert (found.method, found.group) == ("transitions", group)
+
+
+def test_logs_tell_symmetric_from_broken_elements() -> None:
+    """The area under the curve of the gap, over elements of six tasks."""
+    held, broken = [], []
+    for task, settings, left in [
+        ("navigation", {}, "d4"),
+        ("navigation", {"wind": 0.2}, "flip-x"),
+        ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal"),
+        ("navigation", {"mud": 0.5}, "flip-x"),
+        ("predator-prey", {"wind": 0.2}, "flip-x"),
+        ("wildlife", {"wind": 0.8, **DRONES}, "flip-x"),
+    ]:
+        env = make(task, 256, [0], settings)
+        true = {element.name for element in parse_elements(left, 1)}
+        for verdict in check_by_regression(env.spec, collect(env, 1024), parse_elements("d4", 1)):
+            gap = max(field.gap for field in verdict.fields if field.outcome != "not covered")
+            (held if verdict.element in true else broken).append(gap)
+    better = torch.tensor(broken).unsqueeze(1) > torch.tensor(held)
+    assert len(held) >= 12
+    assert better.float().mean() >= 0.95
+
+
+def test_a_policy_that_prefers_a_direction_accuses_no_symmetric_task() -> None:
+    env = make("navigation", 256, [0])
+    data = collect(env, 512)
+    rows = [env.reset()]
+    prefers = torch.tensor([0.1, 0.1, 0.5, 0.1, 0.2])  # mostly to the right
+    actions, rewards = [], []
+    g = torch.Generator().manual_seed(0)
+    for _ in range(8):
+        action = torch.multinomial(prefers, 256 * 3, replacement=True, generator=g).view(1, 256, 3)
+        step = env.step(action)
+        actions.append(action[0])
+        rewards.append(step.reward[0])
+        rows.append(step.next)
+    obs = torch.stack([row.obs[0] for row in rows], 1)
+    biased = Transitions(obs[:, :-1], torch.stack(actions, 1), torch.stack(rewards, 1), obs[:, 1:])
+    for transitions in (data, biased):
+        verdicts = check_by_regression(env.spec, transitions, parse_elements("d4", 3))
+        assert {verdict.outcome for verdict in verdicts} == {"holds"}
+
+
+def test_the_false_discovery_rate_by_hand() -> None:
+    """Sorted: 0.01 <= 0.0125, 0.02 <= 0.025, 0.04 > 0.0375, 0.9 > 0.05: the first two count."""
+    assert accepted_of([0.04, 0.01, 0.9, 0.02]) == [False, True, False, True]
+    assert accepted_of([0.04, 0.04, 0.04, 0.04]) == [True] * 4, "the last bound is the rate itself"
+    assert accepted_of([0.06]) == [False]
+
+
+def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
+    """Forty elements of which half are off by just the tolerance: of those accepted at most 5 % are, on average."""
+    g = torch.Generator().manual_seed(0)
+    shares = []
+    for _ in range(400):
+        z = torch.randn(40, generator=g, dtype=torch.float64)
+        z[20:] += 3.0  # the tolerance is three standard errors away
+        p = 0.5 * torch.erfc(z / 2**0.5)
+        kept = accepted_of(p.tolist())
+        shares.append(sum(kept[:20]) / max(1, sum(kept)))
+    assert 0.005 < np.mean(shares) <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("accepted", "group", "transforms"),
+    [
+        ("d4", "d4", "d4"),
+        ("rot90,rot180,rot270", "c4", "c4"),
+        ("rot180,flip-x", "flip-x", "flip-x"),
+        ("rot90", "c1", ""),
+        ("flip-diagonal", "flip-diagonal", "flip-diagonal"),
+        ("rot180,flip-diagonal,flip-antidiagonal", "rot180,flip-diagonal,flip-antidiagonal", None),
+        ("d16,rot57,flip23", "o2", "o2"),
+        ("c16,rot57", "so2", "so2"),
+        ("d4,agents-1-0-2,agents-0-2-1,agents-2-1-0", "d4*agents", "d4*agents"),
+        ("flip-x,agents-1-0-2", "flip-x and agents-1-0-2", "flip-x,agents-1-0-2"),
+        ("agents-1-0-2,agents-2-1-0", "c1*agents", "agents"),
+    ],
+)
+def test_accepted_elements_close_to_the_largest_group(accepted: str, group: str, transforms: str | None) -> None:
+    tried = parse_elements("d16,rot57,flip23,agents-1-0-2,agents-0-2-1,agents-2-1-0", 3)
+    name, text = named(parse_elements(accepted, 3), tried, 3)
+    assert name == group
+    assert text == (group if transforms is None else transforms)
+    if text:
+        parse_elements(text, 3)
+
+
+def recorded(folder: Path, **changes: object) -> Path:
+    """Write transitions of navigation with forces, some of them changed."""
+    env = make("navigation", 128, [0], {"actions": "continuous", "wind": 0.3})
+    data = collect(env, 1536)
+    arrays = {name: getattr(data, name).numpy() for name in ("obs", "action", "reward", "next_obs")} | changes
+    path = folder / "transitions.npz"
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(tmp_path: Path) -> None:
+    path, out = recorded(tmp_path), tmp_path / "found.json"
+    shown = esp("discover", path, "--task", "navigation", "--set", "task.actions=continuous", "--json", out)
+    assert "found flip-x*agents" in shown.stdout
+    assert "--transforms flip-x*agents" in shown.stderr
+    assert json.loads(out.read_text())["group"] == "flip-x*agents"
+    spec = make("navigation", 1, [0], FORCES).spec
+    data = read_transitions(path, spec)
+    flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
+    assert discover_in_transitions("rows", spec, flat, "rot90,flip-x").group == "flip-x"
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"obs": None}, "has no array obs"),
+        ({"reward": np.zeros((1536, 8, 2))}, "'reward' of"),
+        ({"action": np.zeros((1536, 8, 3, 2), dtype=complex)}, "holds complex128"),
+        ({"reward": np.full((1536, 8, 3), np.nan)}, "not finite"),
+        ({"reward": np.zeros((100, 8, 3))}, "different numbers of transitions"),
+        ({"obs": np.array([{}], dtype=object)}, "not an intact .npz file"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(tmp_path: Path, changes, sentence: str) -> None:
+    path = recorded(tmp_path, **changes)
+    said = refused("discover", path, "--task", "navigation", "--set", "task.actions=continuous")
+    assert sentence in said
+
+
+def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
+    junk = tmp_path / "junk.npz"
+    junk.write_bytes(b"PK\x03\x04 no archive")
+    assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
+    assert "name the task that has its layout" in refused("discover", junk)
+    assert "there is no file" in refused("discover", tmp_path / "none.npz", "--task", "navigation")
+    assert "unknown task 'nowhere'" in refused("discover", "nowhere")
+    assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
+
+
+def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settings(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    esp("train", "--task", "navigation", "--set", "task.wind=0.3", "--transforms", "discovered", "--steps", "50",
+        "--set", "mappo.num_envs=2", "--out", folder)  # fmt: skip
+    assert json.loads((folder / "config.json").read_text())["prior"]["transforms"] == "discovered:flip-x*agents"
+    assert "found flip-x*agents" in esp("discover", folder).stdout
+    esp("train", "--resume", folder)
+
+
+def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> None:
+    found = resolve_config("navigation", overrides={"prior.transforms": "discovered:flip-x"})
+    learner = build_learner(found)
+    assert learner.prior.transforms.names == ("flip-x",)
+    with pytest.raises(ValueError, match="45 degrees"):
+        build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:rot45"}))
+
+
+def test_where_nothing_is_found_there_is_no_prior() -> None:
+    broken = {"task.wind": 0.3, "task.gust_mean": 1.0, "task.weak_agent": 0.5, "task.num_agents": 2}
+    config = resolve_config("navigation", overrides={**broken, "prior.transforms": "discovered"})
+    assert with_discovered(config).prior.kind == "none"
+    plain = resolve_config("navigation")
+    assert with_discovered(plain) is plain
