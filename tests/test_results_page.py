@@ -99,6 +99,23 @@ def test_a_measurement_begins_with_its_question_its_answer_and_a_figure(page: Pa
     assert after.startswith("![")
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: page.name)
+def test_a_figure_of_learning_curves_says_its_command(page: Path) -> None:
+    assert silent_figures(page.read_text(encoding="utf-8")) == []
+
+
+def silent_figures(text: str) -> list[str]:
+    """Return the figures of learning curves that no command follows."""
+    blocks = re.findall(r"((?:^!\[Learning curves.*\n)+)\n(.*)", text, re.MULTILINE)
+    return [figures for figures, following in blocks if not following.startswith("Drawn by `esp ")]
+
+
+def test_a_figure_without_its_command_is_noticed() -> None:
+    figure = "![Learning curves of two](measured/two.png)\n"
+    assert silent_figures(f"text\n\n{figure}\nDrawn by `esp report runs/two`.\n") == []
+    assert silent_figures(f"text\n\n{figure}\n*Ten seeds.*\n") == [figure]
+
+
 def test_every_figure_of_a_table_can_be_drawn_again_and_is_on_its_page() -> None:
     drawing = runpy.run_path(str(DOCS / "make_figures.py"))
     for name, panels in drawing["FIGURES"].items():
