@@ -18,10 +18,7 @@ from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup
-from esp_cli.symmetry.admission import DISCOVERED
 from esp_cli.symmetry.parse import parse_elements
-from esp_cli.training.config import RunConfig
-from esp_envs.registry import make
 from esp_envs.spec import Spaces
 
 FALSE_DISCOVERIES = 0.05
@@ -96,19 +93,6 @@ def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, tran
     elements = _candidates(spaces, transforms)
     verdicts = check_by_regression(spaces, data, elements)
     return _concluded(source, "transitions", spaces, elements, verdicts, 2 * TOLERATED)
-
-
-def with_discovered(config: RunConfig) -> RunConfig:
-    """Return a configuration whose transforms are what is found in its task, where they are "discovered".
-
-    Without a finding there is no prior.
-    """
-    if config.prior.transforms != DISCOVERED.rstrip(":") or config.prior.kind == "none":
-        return config
-    name, settings = config.task, config.task_settings
-    found = discover_in_task(lambda num_envs, seeds: make(name, num_envs, seeds, settings))
-    change = {"transforms": DISCOVERED + found.transforms} if found.transforms else {"kind": "none", "transforms": "d4"}
-    return config.model_copy(update={"prior": config.prior.model_copy(update=change)})
 
 
 def accepted_of(p_values: Sequence[float], rate: float = FALSE_DISCOVERIES) -> list[bool]:

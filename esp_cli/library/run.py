@@ -20,7 +20,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.checking.discovery import with_discovered
+from esp_cli.checking.measured import prepared
 from esp_cli.deploy.bundled import open_policy
 from esp_cli.deploy.library import LoadedPolicy, register_own
 from esp_cli.evaluation.final import FinalEvaluation
@@ -183,7 +183,7 @@ def plan(
     Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: what
     the caller brings along is registered already.
     """
-    config = with_discovered(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
+    config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
     learner = build_learner(config)
     if init_from is None:
         return config, None

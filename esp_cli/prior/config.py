@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -50,6 +50,14 @@ class PriorConfig(BaseModel):
         description="length of axes that policy and critic see too, and that turn with every transform; 0: none",
     )
 
+    trust: Literal["full", "measured"] = Field(
+        "full", description="weight of each element: 1, or by how far it is broken, measured before training"
+    )
+    doubt: float = Field(2.0, ge=0, le=1000, description="an element that is off by b s.d. weighs exp(-doubt b)")
+    weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
+        default_factory=dict, description="weight of each element by its name; filled in where trust is measured"
+    )
+
     @property
     def augments(self) -> bool:
         """Whether copies of transitions enter the learner's own loss."""
@@ -75,5 +83,6 @@ class PriorConfig(BaseModel):
         kind = self.kind
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
-        kept = {name: value for name, value in self if name not in loses[kind]}
+        lost = loses[kind] | (set() if self.trust == "measured" else {"doubt", "weights"})
+        kept = {name: value for name, value in self if name not in lost}
         return PriorConfig(**{**kept, "kind": kind})

@@ -40,7 +40,8 @@ class SymmetryPrior:
         strength: the probability with which a drawn element is used, 0 to 1; see `begin`.
 
     Raises:
-        ValueError: the task cannot carry an element, or all copies of an infinite group are asked for.
+        ValueError: the task cannot carry an element, all copies of an infinite group are asked for, or some element
+            has no weight though trust is measured.
     """
 
     def __init__(
@@ -55,17 +56,28 @@ class SymmetryPrior:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
         self._probe = _probe(spaces, device)
         self.strength = 1.0
+        self._weights = self._weigh()
 
     def begin(self, progress: float) -> None:
         """Set how strong the prior is from here on: 1 - progress / fade, or 1 where it does not fade.
 
-        With probability 1 - strength the identity takes the place of a drawn element. Such a copy adds nothing to a
-        mean loss, and its consistency terms are 0: the share of copies and c both fall, in expectation, in proportion.
+        With probability 1 - strength x weight the identity takes the place of a drawn element. Such a copy adds nothing
+        to a mean loss, and its consistency terms are 0: the share of copies and c fall in proportion, in expectation.
 
         Args:
             progress: share of the run that is done, 0 to 1.
         """
         self.strength = max(0.0, 1.0 - progress / self.config.fade) if self.config.fade else 1.0
+
+    def _weigh(self) -> list[float]:
+        """Return the weight of each element."""
+        names = self.transforms.names if self.transforms is not None else ()
+        if self.config.trust == "full":
+            return [1.0] * len(names)
+        if set(self.config.weights) != set(names) and names:
+            told = ", ".join(names)
+            raise ValueError(f"prior.trust is measured, but prior.weights does not weigh just these elements: {told}")
+        return [self.config.weights[name] for name in names]
 
     @property
     def num_copies(self) -> int:
@@ -82,7 +94,8 @@ class SymmetryPrior:
     @property
     def augmented_share(self) -> float:
         """Share of the rows in a learner's own loss that are copies."""
-        return self.strength * self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
+        kept = self.strength * sum(self._weights) / max(1, len(self._weights))
+        return kept * self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
 
     @property
     def recomputes(self) -> bool:
@@ -128,11 +141,12 @@ class SymmetryPrior:
         if self.transforms is None or self.strength == 0:
             return []
         everyone = self.config.copies == "all" or self.transforms.size == 1
-        if self.strength == 1:
+        keep = [self.strength * weight for weight in self._weights]
+        if all(share == 1 for share in keep):
             return self.transforms.each() if everyone else [self.transforms.draw(generators)]
         if not everyone:
-            return [self.transforms.draw(generators, self.strength)]
-        return [self.transforms.kept(index, self.strength, generators) for index in range(self.transforms.size)]
+            return [self.transforms.draw(generators, keep)]
+        return [self.transforms.kept(index, share, generators) for index, share in enumerate(keep)]
 
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:

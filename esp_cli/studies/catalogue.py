@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.checking.measured import prepared
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, Settings, StudyKind, Team
@@ -141,7 +142,8 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
             settings[name] = value
     settings |= choice
     config = resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
-    return config.model_copy(update={"prior": config.prior.effective()})  # what trains the same is the same run
+    # what trains the same is the same run
+    return prepared(config.model_copy(update={"prior": config.prior.effective()}))
 
 
 def _comparable(config: RunConfig, settings: Settings) -> bool:

@@ -211,7 +211,7 @@ class TransformSet:
         self._stack = self._build([*self._elements, identity_of(self._elements[0])]) if stacked else None
         self._singles: dict[int, Transform] = {}
 
-    def draw(self, generators: Sequence[torch.Generator], strength: float = 1.0) -> Transform:
+    def draw(self, generators: Sequence[torch.Generator], keep: Sequence[float] = ()) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
 
         The identity is left out because a copy of the batch that equals the batch adds nothing: a consistency loss of
@@ -220,13 +220,16 @@ class TransformSet:
 
         Args:
             generators: one per seed, on the CPU.
-            strength: probability with which a drawn element stays; otherwise the identity takes its place.
+            keep: by listed element (one number for a sampled group) the probability with which it stays when it is
+                drawn; otherwise the identity takes its place. Empty: all stay.
         """
         if self._group is not None:
             drawn = ((_draw_moving(self._group, g), g) for g in generators)
-            return self._build([e if _stays(strength, g) else identity_of(e) for e, g in drawn])
+            return self._build([e if not keep or _stays(keep[0], g) else identity_of(e) for e, g in drawn])
         picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
-        return self._picked([i if _stays(strength, g) else self.size for i, g in zip(picks, generators, strict=True)])
+        if keep:
+            picks = [i if _stays(keep[i], g) else self.size for i, g in zip(picks, generators, strict=True)]
+        return self._picked(picks)
 
     def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:
         """Return one of the listed elements, for each seed with probability `strength`, else the identity."""

@@ -16,9 +16,9 @@ from esp_cli.checking.discovery import (
     discover_in_task,
     discover_in_transitions,
     named,
-    with_discovered,
 )
 from esp_cli.checking.logs import read_transitions
+from esp_cli.checking.measured import prepared
 from esp_cli.checking.regression import check_by_regression
 from esp_cli.symmetry import parse_elements
 from esp_cli.training.build import build_learner
@@ -223,6 +223,6 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
 def test_where_nothing_is_found_there_is_no_prior() -> None:
     broken = {"task.wind": 0.3, "task.gust_mean": 1.0, "task.weak_agent": 0.5, "task.num_agents": 2}
     config = resolve_config("navigation", overrides={**broken, "prior.transforms": "discovered"})
-    assert with_discovered(config).prior.kind == "none"
+    assert prepared(config).prior.kind == "none"
     plain = resolve_config("navigation")
-    assert with_discovered(plain) is plain
+    assert prepared(plain) is plain

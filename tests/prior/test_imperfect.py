@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
 
 import pytest
 import torch
 
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.checking.measured import prepared
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment, build_learner
@@ -56,6 +59,62 @@ def test_elements_stay_with_the_probability_that_the_strength_says(choice) -> No
     moving = torch.tensor([[not element.is_identity for element in pair] for pair in drawn]).float()
     error = (0.3 * 0.7 / len(moving)) ** 0.5
     assert moving.mean(0) == pytest.approx(torch.full((2,), 0.3), abs=4 * error)
+
+
+def test_each_element_stays_with_its_weight_times_the_strength() -> None:
+    spec = make("navigation", 1, [0]).spec
+    weights = {"rot90": 0.2, "rot180": 1.0, "flip-x": 0.0}
+    config = PriorConfig(transforms="rot90,rot180,flip-x", trust="measured", weights=weights, fade=1.0)
+    prior = SymmetryPrior(config, spec)
+    for strength in (1.0, 0.5):
+        prior.begin(1 - strength)
+        own = generators(1)
+        names = [prior._draw(own)[0].elements[0].name for _ in range(1500)]
+        for name, weight in weights.items():
+            expected = weight * strength / 3
+            error = (expected * (1 - expected) / 1500) ** 0.5
+            assert names.count(name) / 1500 == pytest.approx(expected, abs=4 * error)
+        assert prior.augmented_share == pytest.approx(0.4 * strength / 2)
+
+
+def test_weights_of_1_are_the_prior_as_it_is_bit_for_bit(tmp_path: Path) -> None:
+    measured = ("--set", "prior.trust=measured")
+    assert train_small(tmp_path / "a", "mappo", *measured) == train_small(tmp_path / "b", "mappo")
+    config = json.loads((tmp_path / "a" / "config.json").read_text())
+    assert set(config["prior"]["weights"].values()) == {1.0}
+    windy = ("--set", "task.wind=0.3")
+    broken = train_small(tmp_path / "c", "mappo", *measured, *windy)
+    assert broken != train_small(tmp_path / "d", "mappo", *windy)
+    weights = json.loads((tmp_path / "c" / "config.json").read_text())["prior"]["weights"]
+    assert weights["flip-x"] == 1
+    assert weights["rot180"] < weights["rot90"] < 0.7
+    assert weights["rot90"] == pytest.approx(math.exp(-2 * 0.285), abs=0.02), "off by 0.285 s.d. of the velocity"
+
+
+@pytest.mark.parametrize("weights", [{}, {"rot90": 0.5}, {"rot90": 1.0, "rot180": 1.0, "flip-y": 0.5}], ids=str)
+def test_weights_that_are_not_of_the_elements_are_refused(weights) -> None:
+    config = PriorConfig(transforms="rot90,rot180", trust="measured", weights=weights)
+    with pytest.raises(ValueError, match="does not weigh just these elements: rot90, rot180"):
+        SymmetryPrior(config, make("navigation", 1, [0]).spec)
+
+
+def test_a_sampled_group_cannot_be_weighed() -> None:
+    settings = {"task.actions": "continuous", "prior.transforms": "o2", "prior.trust": "measured"}
+    with pytest.raises(ValueError, match="'o2' is sampled"):
+        prepared(resolve_config("navigation", overrides=settings))
+
+
+def test_a_task_without_states_is_weighed_by_its_transitions(monkeypatch) -> None:
+    monkeypatch.setattr("esp_envs.base.Environment.has", classmethod(lambda cls, method: False))
+
+    def weights(wind):
+        overrides = {"prior.trust": "measured", "prior.transforms": "c4,flip-x", "task.wind": wind}
+        return prepared(resolve_config("navigation", overrides=overrides)).prior.weights
+
+    assert set(weights(0.0).values()) == {1.0}
+    found = weights(0.31)
+    assert found["flip-x"] == 1
+    assert found["rot180"] < found["rot90"] < 0.8
 
 
 def test_a_prior_of_no_strength_makes_no_copies_and_draws_nothing() -> None:

@@ -1,0 +1,84 @@
+"""What a prior asks to be measured in its task before training: which elements there are, and how far to trust each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+from esp_cli.checking.discovery import discover_in_task
+from esp_cli.checking.paired import check_paired
+from esp_cli.checking.regression import check_by_regression
+from esp_cli.checking.transitions import collect
+from esp_cli.checking.verdicts import ElementVerdict
+from esp_cli.symmetry import Group
+from esp_cli.symmetry.admission import DISCOVERED, admitted_elements
+from esp_cli.training.config import RunConfig
+from esp_envs.base import Environment
+from esp_envs.registry import make
+
+_EPISODES = 1024
+_WORLDS = 256
+
+
+def prepared(config: RunConfig) -> RunConfig:
+    """Return a configuration with all that its prior leaves to be measured; others come back as they are.
+
+    Transforms "discovered" become what is found, and without a finding there is no prior. Where trust is "measured",
+    each element gets its weight. What was measured stands in the configuration: nothing is measured twice.
+    """
+    prior = config.prior
+    if prior.kind == "none":
+        return config
+    if prior.transforms == DISCOVERED.rstrip(":"):
+        found = discover_in_task(_Maker(config)).transforms
+        change: dict[str, object] = (
+            {"transforms": DISCOVERED + found} if found else {"kind": "none", "transforms": "d4"}
+        )
+        prior = prior.model_copy(update=change)
+    if prior.kind != "none" and prior.trust == "measured" and not prior.weights:
+        weights = {name: math.exp(-prior.doubt * gap) for name, gap in _breaking(_Maker(config), prior.transforms)}
+        prior = prior.model_copy(update={"weights": weights})
+    return config if prior is config.prior else config.model_copy(update={"prior": prior})
+
+
+class _Maker:
+    """Makes the worlds of a configuration; equal for equal tasks, so that nothing is measured twice."""
+
+    def __init__(self, config: RunConfig) -> None:
+        self._task, self._settings = config.task, config.task_settings
+        self._key = (config.task, repr(sorted(config.task_settings.items())))
+
+    def __call__(self, num_envs: int, seeds: Sequence[int]) -> Environment:
+        return make(self._task, num_envs, seeds, self._settings)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Maker) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@lru_cache(maxsize=64)
+def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], ...]:
+    """Return by how many standard deviations of its worst field each element is off; 0 where it holds.
+
+    Raises:
+        ValueError: the task cannot carry the elements, or they cannot be listed.
+    """
+    env = make_worlds(_WORLDS, [0])
+    spec = env.spec
+    elements = admitted_elements(transforms, spec)
+    if isinstance(elements, Group):
+        raise ValueError(
+            f"prior.trust=measured weighs each element, but '{transforms}' is sampled; choose a finite group"
+        )
+    if env.has("set_state"):
+        return tuple((verdict.element, _worst(verdict)) for verdict in check_paired(make_worlds, elements))
+    verdicts = check_by_regression(spec, collect(env, _EPISODES), elements)
+    # Half of the data are copies, so that a shift of d standard deviations costs (d / 2)^2 of the variance.
+    return tuple((verdict.element, 2 * _worst(verdict) ** 0.5) for verdict in verdicts)
+
+
+def _worst(verdict: ElementVerdict) -> float:
+    return max((field.gap for field in verdict.fields if field.outcome == "broken"), default=0.0)
