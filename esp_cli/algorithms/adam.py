@@ -80,18 +80,15 @@ class SeedAdam:
 
     def gradient(self, loss: Tensor) -> Tensor:
         """Return the gradients [S, P] of the losses [S] of all seeds."""
-        return self.gradient_through([loss], [torch.ones_like(loss)])
-
-    def gradient_through(self, outputs: Sequence[Tensor], gradients: Sequence[Tensor]) -> Tensor:
-        """Return the gradients [S, P] of losses whose gradients by some outputs of the networks are known."""
         parameters = self.parameters.parameters
-        found = torch.autograd.grad(outputs, parameters, gradients, allow_unused=True, materialize_grads=True)
+        ones = torch.ones_like(loss)
+        found = torch.autograd.grad(loss, parameters, ones, allow_unused=True, materialize_grads=True)
         return self.parameters.flat(found)
 
     @torch.no_grad()
     def step(self, gradient: Tensor) -> list[Tensor]:
         """Clip the gradients [S, P] in place and take one step; return each group's norms [S] before clipping."""
-        norms = [clip_per_seed(gradient[:, begin:end], self.max_grad_norm) for begin, end in self._groups]
+        norms = clip_per_seed([gradient[:, begin:end] for begin, end in self._groups], self.max_grad_norm)
         self.count += 1
         torch._fused_adam_(  # what torch.optim.Adam calls, whose Python takes longer than the step
             [self.parameters.buffer],
@@ -142,8 +139,14 @@ class SeedAdam:
                 self.parameters.views(self.mean if key == "exp_avg" else self.square)[int(index)].copy_(tensor)
 
 
-def clip_per_seed(gradient: Tensor, max_norm: float) -> Tensor:
-    """Scale each seed's gradient [S, P] in place so that its norm is at most `max_norm`; return the old norms [S]."""
-    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    gradient.mul_((max_norm / (norm + 1e-6)).clamp_max_(1.0))
-    return norm.squeeze(1)
+def clip_per_seed(groups: Sequence[Tensor], max_norm: float) -> list[Tensor]:
+    """Scale each seed's gradients of every group [S, P] in place to a norm of at most `max_norm`.
+
+    Returns:
+        The norms [S] before, by group.
+    """
+    norms = torch.stack([torch.linalg.vector_norm(gradient, dim=1) for gradient in groups])
+    scales = (norms + 1e-6).reciprocal_().mul_(max_norm).clamp_max_(1.0).unsqueeze(2)
+    for gradient, scale in zip(groups, scales.unbind(0), strict=True):
+        gradient.mul_(scale)
+    return [*norms.unbind(0)]

@@ -7,8 +7,10 @@ Shape letters: S seeds, K copies of every row, R rows (of all agents, or of worl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Protocol
 
 import torch
@@ -81,7 +83,6 @@ def carries(transforms: Sequence[Transform]) -> bool:
     return all(g.agents is None and isinstance(g.output_map, Gather) for g in transforms)
 
 
-@torch.no_grad()
 def policy_gradient(
     logits: Tensor,
     transforms: Sequence[Transform],
@@ -143,7 +144,6 @@ def _add_divergence(gradient: Tensor, log_prob: Tensor, prob: Tensor, weights: W
         gradient[:, :, :1].sub_(moved if moved.shape[2] == 1 else moved.sum(2, keepdim=True), alpha=weight)
 
 
-@torch.no_grad()
 def critic_gradient(values: Tensor, target: Tensor, weights: Weights) -> Tensor:
     """Return the gradient, by the values, of the weighted Huber loss + c S_V (Eq. 4, 9): as `values`.
 
@@ -175,9 +175,18 @@ def reordered(x: Tensor, orders: Sequence[Tensor]) -> Tensor:
         x: [S, A, ..., 1 + K, R], whose first part, the originals, stays as it is.
         orders: K, [S or 1, A] each: which action comes to each place.
     """
-    num_seeds, num_actions, parts = x.shape[0], x.shape[1], x.shape[-2]
-    places = torch.arange(x[..., 0].numel(), device=x.device).view(x.shape[:-1])
-    for k, order in enumerate(orders):
-        index = order.view(-1, num_actions, *[1] * (x.dim() - 4)).expand(num_seeds, *x.shape[1:-2])
-        places[..., 1 + k] = places[..., 1 + k].gather(1, index)
-    return x.reshape(-1, x.shape[-1]).index_select(0, places.flatten()).view(x.shape) if parts > 1 else x
+    if not orders:
+        return x
+    num_seeds, num_actions, *middle, parts, rows = x.shape
+    stays, below = _places(num_seeds, num_actions, math.prod(middle), parts, x.device)
+    order = torch.stack([stays, *(order.expand(num_seeds, -1) for order in orders)], 2)  # [S, A, 1 + K]
+    index = torch.add(below, order.unsqueeze(2), alpha=math.prod(middle) * parts)
+    return x.reshape(-1, rows).index_select(0, index.view(-1)).view(x.shape)
+
+
+@lru_cache
+def _places(num_seeds: int, num_actions: int, middle: int, parts: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return each action's own number [S, A], and the rows [S, 1, middle, parts] of action 0 among all of them."""
+    own = torch.arange(num_actions, device=device).expand(num_seeds, -1)
+    rows = torch.arange(num_seeds * num_actions * middle * parts, device=device)
+    return own, rows.view(num_seeds, num_actions, middle, parts)[:, :1]

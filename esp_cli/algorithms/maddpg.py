@@ -171,8 +171,8 @@ class Maddpg(OffPolicyLearner):
         """Return what `reference_gradient` returns, by fewer operations; rows lie agent by agent, then part by part."""
         config, prior = self.config, self.prior.config
         obs = copies.rows.obs[:, :, :-1].permute(0, 3, 1, 2, 4)  # [S, N, B (1 + copies), T, D]
-        outputs = self.policy.actor(obs.flatten(1, 3))
-        parts = outputs.detach().transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
+        outputs, pull = self.policy.actor.traced(obs.flatten(1, 2))  # [S, N B (1 + copies), T, A]
+        parts = outputs.flatten(1, 2).transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
         learned = parts if copies.augments else parts[:, :, :, :1]
         drawn = draw(learned, noise)
 
@@ -188,10 +188,10 @@ class Maddpg(OffPolicyLearner):
             config.output_penalty, prior.coefficient if prior.terms != "value" else 0.0, prior.stop_gradient
         )
         by_outputs = actor_gradient(parts, drawn, by_action, share.flatten(1), copies.transforms, weights)
-        by_outputs = by_outputs.flatten(2).transpose(1, 2)
+        by_outputs = by_outputs.flatten(2).transpose(1, 2).view(outputs.shape)
         value, mask = value.detach(), copies.batch.mask
         uncertain = entropy(learned).flatten(2).transpose(1, 2).unflatten(1, mask.shape[1:])
-        return self.actor_optimiser.gradient_through([outputs], [by_outputs]), {
+        return self.actor_optimiser.parameters.flat(pull(by_outputs)), {
             "policy_loss": -self._value_scale * mean_per_seed(value, mask),
             "entropy": mean_per_seed(uncertain, mask),
         }

@@ -227,16 +227,16 @@ class Mappo(Learner):
     ) -> Tensor:
         """Return the gradient [S, P] of `reference_loss`, by fewer operations."""
         config, batch = self.config, copies.originals
-        logits = self.policy.rows(copies.obs, config.truncation)
+        logits, pull_logits = self.policy.traced(copies.obs, config.truncation)
         state = copies.state if self.critic.reads == "state" else batch.state
-        values = self.critic.unroll(copies.obs, state, config.truncation)
+        values, pull_values = self.critic.traced(copies.obs, state, config.truncation)
         if sums is not None:
-            outputs = self.policy.head.normalise(copies.original(logits.detach()).transpose(2, 3))
-            self._watch(batch, outputs, copies.original(values.detach()), weight, sums)
+            outputs = self.policy.head.normalise(copies.original(logits).transpose(2, 3))
+            self._watch(batch, outputs, copies.original(values), weight, sums)
         weights = weights_of(config, entropy_coef, self.prior.config, copies.augments)
         by_logits = policy_gradient(logits, copies.transforms, batch.action, batch.log_prob, batch.advantage, weights)
         by_values = critic_gradient(values, batch.target, weights)
-        return self.optimiser.gradient_through((logits, values), (by_logits, by_values))
+        return self.optimiser.parameters.flat([*pull_logits(by_logits), *pull_values(by_values)])
 
     def reference_loss(
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
@@ -14,6 +14,9 @@ from torch import Tensor, nn
 from esp_cli.networks.io_spec import IoSpec
 
 ActivationName = Literal["relu", "tanh"]
+
+Pull = Callable[[Tensor], list[Tensor]]
+"""From the gradient by a network's outputs to those by its parameters."""
 
 
 class NetworkConfig(BaseModel, ABC):
@@ -99,6 +102,19 @@ class Network(nn.Module, ABC):
         Returns:
             y: [S, B, T, out].
         """
+
+    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
+        """Return what `unroll` does, and a function from the gradient by it to those by the parameters, in their order.
+
+        By autograd, unless a network knows better.
+        """
+        outputs = self.unroll(x, truncation)
+
+        def pull(gradient: Tensor) -> list[Tensor]:
+            parameters = list(self.parameters())
+            return [*torch.autograd.grad(outputs, parameters, gradient, allow_unused=True, materialize_grads=True)]
+
+        return outputs.detach(), pull
 
 
 class Memoryless(Network):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import build_network
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import NetworkConfig, Pull
 from esp_cli.networks.io_spec import IoSpec, Reads
 from esp_envs.spec import TaskSpec
 
@@ -41,10 +41,27 @@ class Critic(nn.Module):
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
+        return self._values(self.network.unroll(self._rows(obs, state), truncation), obs)
+
+    def traced(self, obs: Tensor, state: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
+        """Return what `unroll` does, and a function from the gradient by it to those by the parameters."""
+        values, pull = self.network.traced(self._rows(obs, state), truncation)
+
+        def pull_values(gradient: Tensor) -> list[Tensor]:
+            if self.reads == "own":
+                gradient = gradient.transpose(2, 3).flatten(1, 2).unsqueeze(-1)
+            return pull(gradient)
+
+        return self._values(values, obs), pull_values
+
+    def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
+        """Return what the network reads, [S, B, T, width] or agent by agent [S, B N, T, width]."""
         if self.reads == "state":
-            return self.network.unroll(state, truncation)
-        if self.reads == "observations":
-            return self.network.unroll(obs.flatten(-2), truncation)
-        rows = obs.transpose(2, 3).flatten(1, 2)
-        values = self.network.unroll(rows, truncation).unflatten(1, (obs.shape[1], obs.shape[3]))
-        return values.squeeze(-1).transpose(2, 3)
+            return state
+        return obs.flatten(-2) if self.reads == "observations" else obs.transpose(2, 3).flatten(1, 2)
+
+    def _values(self, outputs: Tensor, obs: Tensor) -> Tensor:
+        """Return the values [S, B, T, C] that are in the network's outputs."""
+        if self.reads != "own":
+            return outputs
+        return outputs.unflatten(1, (obs.shape[1], obs.shape[3])).squeeze(-1).transpose(2, 3)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.perceptron import Shape, activate_, affine, perceptron
+from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, perceptron
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
 """Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
@@ -106,6 +106,10 @@ class SeedMLP(nn.Module):
             return self._forward_normed(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
         return self._from_layer(0, parts, rows_innermost)
 
+    def passed(self, x: Tensor) -> Pass:
+        """Map [S, B, in] as `forward` does, with a backward to call by hand; not with layer normalisation."""
+        return Pass(self._shape(), [x], self._from(0))
+
     def from_first_sums(self, sums: Tensor) -> Tensor:
         """Map what the first layer gives, x W_1 + b_1 before its activation, [S, B, H], to [S, B, out].
 
@@ -132,9 +136,14 @@ class SeedMLP(nn.Module):
         return torch.cat(idle, 1).float().mean(1)
 
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:
+        return perceptron(self._shape(rows_innermost), parts, self._from(first))
+
+    def _shape(self, rows_innermost: bool = False) -> Shape:
+        return Shape(self.activation, self.activate_output, self.precision, rows_innermost)
+
+    def _from(self, first: int) -> list[Tensor]:
         layers: list[SeedLinear] = [*self.layers][first:]
-        shape = Shape(self.activation, self.activate_output, self.precision, rows_innermost)
-        return perceptron(shape, parts, [p for layer in layers for p in (layer.weight, layer.bias)])
+        return [p for layer in layers for p in (layer.weight, layer.bias)]
 
     def _forward_normed(self, x: Tensor) -> Tensor:
         assert self.norms is not None

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.autograd import Function
-from torch.nn.functional import pad
 
 CACHED_ROWS = 4096
 """Rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache."""
@@ -56,8 +55,13 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
     """Return rows whose numbers lie side by side, some at a time."""
-    for parts in zip(*(x.split(_size(x), 1) for x in inputs), strict=True):
+    for parts in zip(*(_split(x, _size(x)) for x in inputs), strict=True):
         yield (parts[0] if len(parts) == 1 else torch.cat(parts, -1)).to(shape.precision)
+
+
+def _split(x: Tensor, size: int) -> Sequence[Tensor]:
+    """Return pieces of at most `size` rows per seed."""
+    return x.split(size, 1) if x.shape[1] > size else (x,)
 
 
 def _size(x: Tensor) -> int:
@@ -86,44 +90,59 @@ def _run(shape: Shape, x: Tensor, parameters: Sequence[Tensor]) -> list[Tensor]:
     return run
 
 
+class Pass:
+    """A pass through a perceptron that keeps its activations until its `backward`; arguments as of `perceptron`.
+
+    Attributes:
+        outputs: y.
+    """
+
+    @torch.no_grad()
+    def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> None:
+        parameters = [p.detach().to(shape.precision) for p in parameters]
+        self._shape, self._size, self._weights = shape, _size(inputs[0]), parameters[::2]
+        self._runs = [_run(shape, piece, parameters) for piece in _pieces(shape, inputs)]
+        self._widths = [x.shape[-1] for x in inputs]
+        self.outputs = _joined([run[-1] for run in self._runs])
+
+    def backward(self, grad: Tensor) -> list[Tensor]:
+        """Return the gradients by the parameters, of what has the gradient `grad` by the outputs."""
+        grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
+        return [g for g in grads if g is not None]
+
+    def backward_to(
+        self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
+    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
+        """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
+        weights, shape = self._weights, self._shape
+        grads: list[Tensor | None] = [None] * (2 * len(weights))
+        below: list[list[Tensor]] = [[] for _ in asked]
+        columns = list(zip(asked, pairwise(accumulate(self._widths, initial=0)), below, strict=False))
+        for run, upper in zip(self._runs, _split(grad.to(shape.precision), self._size), strict=True):
+            here = _backward(shape, run, upper, weights, learns, grads)
+            for wanted, (begin, end), parts in columns:
+                if wanted:
+                    parts.append(_down(here, weights[0][:, begin:end]))
+        if shape.precision != torch.float32:
+            grads = [None if g is None else g.float() for g in grads]
+        return grads, [torch.cat(parts, 1).float() if parts else None for parts in below]
+
+
 class _Perceptron(Function):
-    """`perceptron` with a backward that works in place."""
+    """`perceptron` under autograd."""
 
     @staticmethod
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
-        inputs, parameters = tensors[:num_inputs], tensors[num_inputs:]
-        ctx.rounds = shape.precision != torch.float32
-        if ctx.rounds:
-            parameters = tuple(p.to(shape.precision) for p in parameters)
-        kept, outputs = [], []
-        for piece in _pieces(shape, inputs):
-            run = _run(shape, piece, parameters)
-            outputs.append(run[-1])
-            kept += run if shape.activate_output else run[:-1]
-        weights = parameters[::2]
-        ctx.save_for_backward(*kept, *weights)
-        ctx.shape, ctx.count, ctx.size = shape, len(weights), _size(inputs[0])
-        ctx.columns = list(pairwise(accumulate((x.shape[-1] for x in inputs), initial=0)))
-        return _joined(outputs)
+        ctx.num_inputs, ctx.run = num_inputs, Pass(shape, tensors[:num_inputs], tensors[num_inputs:])
+        ctx.save_for_backward(*tensors[num_inputs:])  # so that autograd notices a change of them
+        return ctx.run.outputs
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        kept, weights = ctx.saved_tensors[: -ctx.count], ctx.saved_tensors[-ctx.count :]
-        per_piece = ctx.count + ctx.shape.activate_output
-        if ctx.rounds:
-            grad = grad.to(weights[0].dtype)
-        needed = ctx.needs_input_grad[2:]
-        learns, num_inputs = needed[len(ctx.columns) :], len(ctx.columns)
-        grads: list[Tensor | None] = [None] * (2 * ctx.count)
-        below: list[list[Tensor]] = [[] for _ in range(num_inputs)]
-        for n, upper in enumerate(grad.split(ctx.size, 1)):
-            run = kept[n * per_piece : (n + 1) * per_piece]
-            here = _backward(ctx.shape, run, upper, weights, learns, grads)
-            for into, (begin, end), asked in zip(below, ctx.columns, needed[:num_inputs], strict=True):
-                if asked:
-                    into.append(_down(here, weights[0][:, begin:end]))
-        rounded = [None if g is None else g.float() for g in grads]
-        return None, None, *(torch.cat(parts, 1).float() if parts else None for parts in below), *rounded
+        _ = ctx.saved_tensors
+        asked, learns = ctx.needs_input_grad[2 : 2 + ctx.num_inputs], ctx.needs_input_grad[2 + ctx.num_inputs :]
+        grads, below = ctx.run.backward_to(grad, learns, asked)
+        return None, None, *below, *grads
 
 
 def _backward(
@@ -155,18 +174,17 @@ def _backward(
     return here
 
 
-# A single column is computed as two: for one seed and one column torch would take a matrix-vector routine, which rounds
-# otherwise than the batched product that several seeds take.
+# A single output is a sum of products: for one seed and one column torch would take a matrix-vector routine, which
+# rounds otherwise than the batched product that several seeds take.
 
 
 def affine(bias: Tensor, x: Tensor, weight: Tensor, scale: float = 1.0, rows_innermost: bool = False) -> Tensor:
     """Return scale (x W + b) [S, B, out]; for a thin output as the transpose of W' x' + b', so with B innermost."""
+    if weight.shape[-1] == 1:
+        return (x * weight.transpose(1, 2)).sum(2, keepdim=True).add_(bias).mul_(scale)
     if weight.shape[-1] >= THIN and not rows_innermost:
         return torch.baddbmm(bias, x, weight, beta=scale, alpha=scale)
     bias, weight = bias.transpose(1, 2), weight.transpose(1, 2)
-    if weight.shape[1] == 1:
-        bias, weight = pad(bias, (0, 0, 0, 1)), pad(weight, (0, 0, 0, 1))
-        return torch.baddbmm(bias, weight, x.transpose(1, 2), beta=scale, alpha=scale)[:, :1].transpose(1, 2)
     return torch.baddbmm(bias, weight, x.transpose(1, 2), beta=scale, alpha=scale).transpose(1, 2)
 
 
@@ -189,10 +207,9 @@ def _outer(x: Tensor, grad: Tensor, more: Tensor | None = None) -> Tensor:
     if grad.shape[-1] >= THIN:
         rows = x.transpose(1, 2)
         return torch.bmm(rows, grad) if more is None else more.baddbmm_(rows, grad)
-    columns = grad.transpose(1, 2)
     if grad.shape[-1] == 1:
-        columns = pad(columns, (0, 0, 0, 1))
-    return _added(torch.bmm(columns, x)[:, : grad.shape[-1]].transpose(1, 2), more)
+        return _added((x * grad).sum(1, keepdim=True).transpose(1, 2), more)
+    return _added(torch.bmm(grad.transpose(1, 2), x).transpose(1, 2), more)
 
 
 def _added(part: Tensor, more: Tensor | None) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig, Pull
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.recurrent import SeedGRU
@@ -76,6 +76,17 @@ class MLP(SeedMLP, Memoryless):
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
+
+    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
+        """Return outputs and the way back; see `Network.traced`."""
+        if self.norms is not None:
+            return super().traced(x, truncation)
+        run = self.passed(x.flatten(1, 2))
+
+        def pull(gradient: Tensor) -> list[Tensor]:
+            return run.backward(gradient.flatten(1, 2))
+
+        return run.outputs.unflatten(1, x.shape[1:3]), pull
 
 
 class GRU(Network):

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import Network, NetworkConfig, build_network
+from esp_cli.networks.contract import Pull
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.io_spec import IoSpec
@@ -98,6 +99,11 @@ class StochasticPolicy(Policy):
         """Return the actor's outputs as they are, agent by agent: [S, B, N, T, outputs]; see `unroll`."""
         outputs = self.actor.unroll(obs.transpose(2, 3).flatten(1, 2), truncation)
         return outputs.unflatten(1, (obs.shape[1], obs.shape[3]))
+
+    def traced(self, obs: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
+        """Return what `rows` does, and a function from the gradient by it to those by the actor's parameters."""
+        outputs, pull = self.actor.traced(obs.transpose(2, 3).flatten(1, 2), truncation)
+        return outputs.unflatten(1, (obs.shape[1], obs.shape[3])), lambda gradient: pull(gradient.flatten(1, 2))
 
 
 class HistoryPolicy(Policy):

@@ -82,13 +82,13 @@ def test_groups_are_clipped_apart():
 def test_gradients_are_clipped_by_the_norm_of_their_own_seed():
     # seed 0 has norm 5, seed 1 has 0.5
     gradient = torch.tensor([[3.0, 4.0], [0.3, 0.4]])
-    torch.testing.assert_close(clip_per_seed(gradient, 1.0), torch.tensor([5.0, 0.5]))
+    torch.testing.assert_close(clip_per_seed([gradient], 1.0), [torch.tensor([5.0, 0.5])])
     torch.testing.assert_close(gradient, torch.tensor([[0.6, 0.8], [0.3, 0.4]]), atol=1e-5, rtol=0)
 
 
 def test_a_broken_seed_does_not_spoil_the_others_gradients():
     gradient = torch.tensor([[3.0, 4.0], [math.nan, 1.0]])
-    clip_per_seed(gradient, 1.0)
+    clip_per_seed([gradient], 1.0)
     torch.testing.assert_close(gradient[0], torch.tensor([0.6, 0.8]), atol=1e-5, rtol=0)
     assert gradient[1].isnan().all()
 
