@@ -55,7 +55,7 @@ class PriorConfig(BaseModel):
     )
     doubt: float = Field(2.0, ge=0, le=1000, description="an element that is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
-        default_factory=dict, description="weight of each element by its name; filled in where trust is measured"
+        {}, description="weight of each element by its name; filled in where trust is measured"
     )
 
     @property
