@@ -30,7 +30,8 @@ TOLERANCE = 1e-5
 _WORLDS = 200
 _JITTER_M = 0.001
 """Of positions that are met in the task: in a perfect square two robots are equally near."""
-_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}
+_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0, "heading_offset_rad": 0.0, "blind_sector_rad": 0.0}
+"""What disturbs a robot's sensors in training, poses do not show."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,8 @@ def told(description: Mapping[str, Any]) -> str:
     lines += ["`heading` is the cosine and sine of the robot's own heading, `goal` its goal minus its position."]
     ways = {"robots": f"the {seen} nearest other robot(s), nearest first", "obstacle": "the nearest pillar"}
     names = [field["field"] for field in description["observation"]]
+    if (unit := settings["goal_sight_m"]) is not None:
+        lines.append(f"The goal is seen in units of {unit:g} m; a vector longer than one is cut to one.")
     lines += [f"`{name}` is {way}." for name, way in ways.items() if name in names]
     if settings["sight"] == "nearness":
         lines.append(

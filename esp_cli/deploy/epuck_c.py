@@ -153,6 +153,11 @@ _FIELDS = {
 }
 """Field of the task's layout -> the lines that write it."""
 
+_GOAL_WITHIN = """    {
+        const float apart = hypotf(goal[0] - from[0], goal[1] - from[1]), unit = @goal_unit@;
+        for (k = 0; k < 2; k++) observation[@place@ + k] = (goal[k] - from[k]) / (apart > unit ? apart : unit);
+    }
+"""
 _SQUASHED = """    esp_policy_act(observation, wheels);
     for (k = 0; k < 2; k++) {
         if (!isfinite(wheels[k])) {
@@ -186,7 +191,9 @@ def epuck_sources(description: Mapping[str, Any]) -> dict[str, bytes]:
     names, body = [field["field"] for field in fields], robot["body_radius_m"]
     if unknown := set(names) - _FIELDS.keys():
         raise ValueError(f"poses do not tell what this policy sees: {', '.join(sorted(unknown))}")
-    lines = [_FIELDS[f["field"]].replace("@place@", f["index"].partition("..")[0]) for f in fields]
+    unit = settings["goal_sight_m"]
+    texts = _FIELDS if unit is None else _FIELDS | {"goal": _GOAL_WITHIN}
+    lines = [texts[f["field"]].replace("@place@", f["index"].partition("..")[0]) for f in fields]
     pairs = [x for option in options or () for x in option["means"]]
     values = {
         "pairs": f"static const float pairs[] = {{\n{numbers(pairs)}}};\n\n" if pairs else "",
@@ -203,6 +210,7 @@ def epuck_sources(description: Mapping[str, Any]) -> dict[str, bytes]:
         "pillar_reach": literal(settings["obstacle_radius_m"] + body),
         "robot_reach": literal(2 * body),
         "fading": literal(robot["fading_m"]),
+        "goal_unit": literal(unit or 1.0),
         "max_speed": literal(robot["max_wheel_speed_rad_s"]),
     }
     return {"esp_epuck.h": _filled(_HEADER, values), "esp_epuck.c": _filled(_SOURCE, values)}

@@ -18,7 +18,7 @@ from esp_cli.deploy.bundled import find, load_entry, open_policy
 from esp_cli.deploy.bundling import best_seed, bundle, play_greedily, score_of
 from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled
 from esp_cli.evaluation.final import evaluate
-from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from tests.deploy.policies import drawn_policy
 
 ENTRIES = read_bundled()
@@ -64,7 +64,8 @@ def test_the_command_of_a_manifest_resolves_to_its_configuration(entry: Entry) -
         given.get("--device", "cpu"),
         overrides,
     )
-    assert resolved == config
+    later = resolve_task_settings(config.task, config.task_settings)  # settings that are newer have their default
+    assert resolved == config.model_copy(update={"task_settings": later})
     assert config.command() == entry.command
     assert entry.seed in config.seeds
     assert len(config.seeds) == entry.chosen_from

@@ -25,6 +25,7 @@ from tests.deploy.policies import drawn_policy
 needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
     "offset": {},
+    "goal in its unit": {"goal_sight_m": 0.3},
     "nearness, three neighbours": {"sight": "nearness", "neighbours": 3, "num_agents": 5},
     "no pillars, noise": {"num_obstacles": 0, "num_agents": 4, "sensor_noise_m": 0.1, "heading_noise_rad": 0.1},
     "a robot alone": {"num_obstacles": 0, "num_agents": 1},

@@ -18,7 +18,7 @@ from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
-from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness, outside_sector
+from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness, outside_sector, within
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
 
@@ -46,7 +46,8 @@ class Formation(LockstepTask):
         | 6..7  | robots   | the nearest robots' centres minus own       | m         |
 
     In the convention `tight`, `obstacle` and `robots` are seen as nearness instead: a vector in the direction of the
-    body, of length exp(-gap / 0.2 m). The setting `sight` chooses either in both conventions.
+    body, of length exp(-gap / 0.2 m). The setting `sight` chooses either in both conventions. With `goal_sight_m` the
+    goal is seen in that unit, and beyond it by its direction alone, so that the last centimetres count in the input.
 
     State: headings, positions, velocities, turning rates and goals of all robots, positions of the pillars. It says
         everything but what the robots' own differences and delays hide, and in `mujoco-3d` the wheels and tilts.
@@ -201,6 +202,8 @@ class Formation(LockstepTask):
             heading = heading + self.settings.heading_offset_rad
         direction = torch.stack([heading.cos(), heading.sin()], -1)
         goal, pillar, others = seen.split([1, min(pillars, 1), self.settings.seen_robots], 2)
+        if self.settings.goal_sight_m is not None:
+            goal = within(goal, self.settings.goal_sight_m)
         if self.settings.seen_as == "nearness":
             pillar = nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
             others = nearness(others, 2 * BODY_RADIUS_M)

@@ -51,6 +51,11 @@ class FormationSettings(TaskSettings):
         description="bodies are seen by their offset in m (by default in the convention paper), or as nearness, a "
         "direction that fades with the gap (in the convention tight)",
     )
+    goal_sight_m: float | None = Setting(
+        None,
+        gt=0,
+        description="the goal is seen in this unit and no farther than one of it, m; by default by its offset in m",
+    )
     neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
     progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
     collision_penalty: float | None = Setting(
@@ -112,6 +117,11 @@ class FormationSettings(TaskSettings):
         return self.sight or SIGHT[self.convention]
 
     @property
+    def goal_unit(self) -> str:
+        """Unit in which the goal is seen."""
+        return "m" if self.goal_sight_m is None else f"{self.goal_sight_m:g} m, at most 1"
+
+    @property
     def seen_robots(self) -> int:
         """Robots that an observation shows."""
         return min(self.neighbours, self.num_agents - 1)
@@ -143,7 +153,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         observation=filled_layout(
             Field("heading", Kind.VECTOR, 1, "direction"),
             Field("obstacle", Kind.VECTOR, min(pillars, 1), unit),
-            Field("goal", Kind.VECTOR, 1, "m"),
+            Field("goal", Kind.VECTOR, 1, settings.goal_unit),
             # Sorted by distance, so that no permutation of the robots moves them.
             Field("robots", Kind.VECTOR, settings.seen_robots, unit),
         ),

@@ -44,6 +44,11 @@ def outside_sector(offset: Tensor, width_rad: float) -> Tensor:
     return torch.where(angle.abs() < width_rad / 2, 0.0, offset)
 
 
+def within(offset: Tensor, unit_m: float) -> Tensor:
+    """Return offsets [..., 2] in a unit of length, those that are longer than one cut to one."""
+    return offset / offset.norm(dim=-1, keepdim=True).clamp_min(unit_m)
+
+
 def formation_scene(
     settings: FormationSettings, goals: Tensor, pillars: Tensor, position: Tensor, heading: Tensor
 ) -> Scene:

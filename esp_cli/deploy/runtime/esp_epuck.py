@@ -30,6 +30,7 @@ class Pilot:
         self.act = act
         self.control_period_s = float(description["task"]["control_period_s"])
         self.nearness = settings["sight"] == "nearness"
+        self.goal_sight_m = settings.get("goal_sight_m")
         self.pillar_radius_m = settings["obstacle_radius_m"]
         self.fields = [field["field"] for field in description["observation"]]
         if unknown := set(self.fields) - {"heading", "obstacle", "goal", "robots"}:
@@ -57,7 +58,7 @@ class Pilot:
         parts: dict[str, Callable[[], Any]] = {
             "heading": lambda: np.stack([np.cos(heading), np.sin(heading)], -1),
             "obstacle": lambda: self._pillar(position, pillars),
-            "goal": lambda: goals - position,
+            "goal": lambda: self._goal(goals - position),
             "robots": lambda: self._others(position),
         }
         return np.concatenate([parts[field]() for field in self.fields], -1).astype(np.float32)
@@ -85,6 +86,12 @@ class Pilot:
         """Return forward speed (m/s) and turning rate (rad/s) [..., 2] of wheel speeds [..., 2]."""
         rim = np.asarray(wheels, float) * self.robot["wheel_radius_m"]
         return np.stack([rim.sum(-1) / 2, (rim[..., 1] - rim[..., 0]) / self.robot["axle_m"]], -1)
+
+    def _goal(self, way: Any) -> Any:
+        """Return the way to each goal as it is, or in its unit and no longer than one."""
+        if self.goal_sight_m is None:
+            return way
+        return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), self.goal_sight_m)
 
     def _pillar(self, position: Any, pillars: Any) -> Any:
         """Return the nearest pillar as each robot sees it [N, 2]."""

@@ -126,6 +126,18 @@ def test_nearness_by_hand() -> None:
     torch.testing.assert_close(obs, torch.tensor([1, 0, 0.9, 0.0, 0.0, math.exp(-1)]), atol=1e-5, rtol=0)
 
 
+def test_a_goal_in_its_unit_by_hand() -> None:
+    env = world([(0.0, 0.0), (0.5, 0.0)], [(0.3, -0.4), (0.53, 0.04)], goal_sight_m=0.2)
+    goal = env.spec.observation.slices()["goal"]
+    obs = env._seen().obs[0, 0]
+    assert obs[0, goal].tolist() == pytest.approx([0.6, -0.8]), "half a metre away: its direction"
+    assert obs[1, goal].tolist() == pytest.approx([0.15, 0.2]), "5 cm away: a quarter of 0.2 m"
+    rest = [k for k in range(env.spec.observation.width) if k not in range(*goal.indices(100))]
+    plain = world([(0.0, 0.0), (0.5, 0.0)], [(0.3, -0.4), (0.53, 0.04)])._seen().obs[0, 0]
+    assert torch.equal(obs[:, rest], plain[:, rest])
+    assert plain[0, goal].tolist() == pytest.approx([0.3, -0.4])
+
+
 def test_arrival_counts_once_and_time_runs_until_then() -> None:
     env = world([(0.06, 0.0), (0.5, 0.5)], [(0.12, 0.0), (-0.5, -0.5)], horizon=8)
     steps = [env.step(wheels((1, 1), (0, 0))) for _ in range(8)]
