@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the second thread of a test that asks for two sleeps, not spins
 
 import pytest
 import torch

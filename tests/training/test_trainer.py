@@ -9,12 +9,15 @@ import time
 import pytest
 import torch
 
+from esp_cli import app
+from esp_cli.training import trainer as training
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import resolve_config
 from esp_cli.training.loading import load_policy, parse_config
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer, checkpoint_seconds
+from tests.forks import fork, said, wait
 from tests.training.runs import tiny_config, tiny_folder
 
 ESP = "from esp_cli.app import main; main()"
@@ -209,40 +212,42 @@ def _newest(folder):
     return max((int(file.name[5:17]) for file in (folder / "checkpoints").glob("step-*")), default=0)
 
 
-def _wait_for_steps(folder, steps, process):
+def _wait_for_steps(folder, steps):
     """Wait until a process has written a checkpoint past `steps`."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         if _newest(folder) > steps:
             return
-        assert process.poll() is None, f"it ended too early: {process.stderr.read()}"
         time.sleep(0.01)
-    raise AssertionError("no checkpoint within a minute")
+    raise AssertionError(f"no checkpoint within a minute: {said(folder)}")
+
+
+def _go_on(folder):
+    """Go on with a run in a fork that writes a checkpoint in every iteration; return its number."""
+
+    def job():
+        training.CHECKPOINT_SECONDS = training.CHECKPOINT_SPACING = 0
+        app.app(["train", "--resume", str(folder)])
+
+    return fork(job, folder)
 
 
 def test_a_killed_process_is_resumed_bit_for_bit_and_a_second_one_is_refused(tmp_path):
-    steps = 20_000
+    steps = 5000
     straight, killed = tiny_folder(tmp_path / "a", steps=steps), tiny_folder(tmp_path / "b", steps=steps)
     for _ in range(2):
         reached = _newest(killed.path)
-        process = _start(killed.path)
-        _wait_for_steps(killed.path, reached, process)
-        second = subprocess.run(
-            [sys.executable, "-c", ESP, "train", "--resume", str(killed.path)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert second.returncode == 2
-        assert f"{process.pid}" in second.stderr
-        assert "Traceback" not in second.stderr
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        process = _go_on(killed.path)
+        _wait_for_steps(killed.path, reached)
+        os.kill(process, signal.SIGSTOP)  # it holds the run, and comes no further
+        assert wait(_go_on(killed.path)) == 2
+        assert f"{process}" in said(killed.path)
+        assert "Traceback" not in said(killed.path)
+        os.kill(process, signal.SIGKILL)
+        assert wait(process) == -signal.SIGKILL
     assert trainer(killed).step < steps, "it was killed on the way"
-    torch.set_num_threads(1)
     trainer(straight).run(lambda news: True)
-    process = _start(killed.path)
-    assert process.wait(timeout=120) == 0, process.stderr.read()
+    assert wait(_go_on(killed.path)) == 0, said(killed.path)
     assert same(final_state(straight)[0], final_state(RunFolder.open(killed.path))[0])
     assert untimed(straight) == untimed(killed)
 
@@ -250,7 +255,7 @@ def test_a_killed_process_is_resumed_bit_for_bit_and_a_second_one_is_refused(tmp
 def test_an_interrupt_stops_cleanly_with_the_command_to_go_on(tmp_path):
     folder = tiny_folder(tmp_path / "run", steps=10_000_000)
     process = _start(folder.path)
-    _wait_for_steps(folder.path, 0, process)
+    _wait_for_steps(folder.path, 0)
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
