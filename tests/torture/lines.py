@@ -103,7 +103,7 @@ class Lines:
         for argument in command.params:
             if argument.param_type_name == "argument":
                 sound = typing.get_args(argument.type_descriptor.annotation) or ("nowhere", "no/such/place", "x" * 300)
-                words += [rng.choice(("nowhere", *sound)) if str not in sound else "nowhere"]
+                words += ["nowhere" if isinstance(sound[0], type) else rng.choice(("nowhere", *sound))]
         words += _NEEDED.get(name, [])
         choice = rng.random()
         if choice < 0.1:
