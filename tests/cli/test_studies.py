@@ -5,26 +5,27 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import subprocess
+import signal
 import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from esp_cli import console
+from esp_cli import app, console
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training import trainer
 from esp_cli.training.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
+from tests.forks import fork, said, wait
 from tests.studies.small_studies import small_study, stand_in
 
-ROOT = Path(__file__).parents[2]
 TINY = ("reproduce", "table1", "--tasks", "navigation", "--algos", "mappo", "--seeds", "2", "--episodes", "4")
 KILLED_STEPS = 1500
 """Thirty iterations: time enough to kill it twice."""
@@ -221,15 +222,14 @@ def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     assert runs[1].cell.name not in screen
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("forked_jobs")
 def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_path: Path) -> None:
     out = tmp_path / "s"
-    options = [str(x) for x in (*TINY, "--steps", KILLED_STEPS, *TINY_OPTIONS, "--out", out, "--jobs", 1)]
-    command = [sys.executable, "-c", "from esp_cli.app import main; main()", *options]
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "environments")]),
-        "ESP_CHECKPOINT_SECONDS": "0",
-    }
+    words = [str(x) for x in (*TINY, "--steps", KILLED_STEPS, *TINY_OPTIONS, "--out", out, "--jobs", 1)]
+
+    def study() -> None:
+        trainer.CHECKPOINT_SECONDS = trainer.CHECKPOINT_SPACING = 0
+        app.app(words)
 
     def rows(name: str) -> int:
         file = out / "runs" / name / "metrics.jsonl"
@@ -237,14 +237,14 @@ def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_p
 
     names = ["navigation-1.5k-mappo-plain", "navigation-1.5k-mappo-esp"]
     for name in names:  # each time in the middle of another run
-        with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, cwd=tmp_path) as process:
-            deadline = time.monotonic() + 300
-            while rows(name) < 5 and process.poll() is None and time.monotonic() < deadline:
-                time.sleep(0.005)
-            process.kill()
+        process, deadline = fork(study, out), time.monotonic() + 300
+        while rows(name) < 5 and time.monotonic() < deadline:
+            time.sleep(0.005)
+        os.kill(process, signal.SIGKILL)
+        assert wait(process) == -signal.SIGKILL, said(out)
         assert rows(name) >= 5
     first = (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns
-    subprocess.run(command, env=environment, cwd=tmp_path, check=True, capture_output=True)
+    assert wait(fork(study, out)) == 0, said(out)
     assert (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns == first, "not run again"
     for name, prior in zip(names, ("none", "esp"), strict=True):
         run = out / "runs" / name

@@ -50,7 +50,6 @@ def test_runs_that_were_killed_end_as_runs_that_were_not(kills, monkeypatch, tmp
     assert kills.count() >= 4
 
 
-@pytest.mark.slow  # two real processes a round import everything
 def test_a_study_of_real_processes_loses_nothing_when_any_or_all_of_them_are_killed(tmp_path):
     whole, path = tmp_path / "whole" / "study", tmp_path / "killed" / "study"
     for folder in (whole, path):
@@ -60,7 +59,7 @@ def test_a_study_of_real_processes_loses_nothing_when_any_or_all_of_them_are_kil
     assert kill_members(real_study, path, "job", "KILL", lambda members: any(path.glob(checkpoint))) == 1
     assert kill_members(real_study, path, "parent", "KILL", lambda members: len(members) > 1) == -9
     assert kill_members(real_study, path, "all", "KILL", lambda members: len(members) > 1) == -9
-    assert wait(fork(lambda: real_study(path), path)) == 0
+    assert wait(fork(lambda: forked_study(path), path)) == 0
     assert study_state(path) == study_state(whole)
 
 
