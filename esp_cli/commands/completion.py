@@ -81,6 +81,7 @@ COMPLETERS: dict[str, Completer] = {
     "preset": presets,
     "settings": settings,
     "policy": policies,
+    "beside": policies,
     "init_from": policies,
     "of": configured,
     "track": trackers,

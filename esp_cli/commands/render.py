@@ -18,6 +18,7 @@ from esp_cli.commands.options import (
     OwnNetworkOption,
     OwnTaskOption,
     PhysicsOption,
+    PolicyArgument,
     TaskSetOption,
     parse_task_settings,
     register_learners,
@@ -31,9 +32,6 @@ EPILOG = """Examples:\n
     esp render runs/fc-mappo -o formation.gif --speed 4x\n
     esp render runs/fc-mappo -o formation.png --view top\n
     esp render formation-mappo-plain formation-mappo-esp -o both.gif"""
-
-
-_MOST_POLICIES = 2
 
 
 def parse_speed(value: str | float) -> float:
@@ -52,15 +50,12 @@ def parse_speed(value: str | float) -> float:
 
 
 def render(
-    policies: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Run folder, policy file, or bundled policy by its task or its name (`esp policies`). "
-            "Two play the same episodes side by side.",
-            metavar="RUN|POLICY [RUN|POLICY]",
-        ),
-    ],
+    policy: PolicyArgument,
     out: OutOption,
+    beside: Annotated[
+        Path | None,
+        typer.Argument(help="Another policy of the same task, which plays the same episodes.", metavar="[RUN|POLICY]"),
+    ] = None,
     task: OwnTaskOption = None,
     view: Annotated[
         Literal["auto", "top", "3d"],
@@ -102,12 +97,11 @@ def render(
     from esp_cli.training.loading import transfer
 
     kind = check_target(out, episodes)
-    if len(policies) > _MOST_POLICIES:
-        raise ValueError(f"{len(policies)} policies do not fit side by side; name one or two")
     register_tasks(task)
     register_learners([algo], network or [])
     changed = parse_task_settings(settings or [], physics)
-    opened = [transfer(open_policy(policy, algo, prior), changed) for policy in policies]
+    named = [policy] if beside is None else [policy, beside]
+    opened = [transfer(open_policy(where, algo, prior), changed) for where in named]
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
     with _progress() as watch:
@@ -115,7 +109,7 @@ def render(
             opened[0],
             out,
             other=opened[1] if len(opened) > 1 else None,
-            names=(policies[0].name, policies[-1].name),
+            names=(named[0].name, named[-1].name),
             seed=seed,
             episodes=episodes,
             view=view,

@@ -259,6 +259,7 @@ def completed(line: str, **environment: str) -> list[str]:
         ("esp train --task formation --set task.sensor", ["task.sensor_noise_m="]),
         ("esp train --set task.sensor", []),
         ("esp eval formation-mappo-", ["formation-mappo-esp", "formation-mappo-plain"]),
+        ("esp render navigation wildlife-mappo-", ["wildlife-mappo-esp", "wildlife-mappo-plain"]),
         ("esp settings pri", ["prior"]),
         ("esp nothing --task na", []),
     ],
