@@ -79,8 +79,8 @@ def weights_of(config: Settings, entropy_coef: float, prior: PriorConfig, augmen
 
 
 def carries(transforms: Sequence[Transform]) -> bool:
-    """Return whether `policy_gradient` can pull logits back: where agents stay, and actions are discrete."""
-    return all(g.agents is None and isinstance(g.output_map, Gather) for g in transforms)
+    """Return whether the closed forms know these transforms: where agents stay, and discrete actions change places."""
+    return all(g.agents is None and (g.action_index is None or isinstance(g.output_map, Gather)) for g in transforms)
 
 
 def policy_gradient(
@@ -126,12 +126,18 @@ def _objective_gradient(
         return torch.cat([own, torch.zeros_like(log_prob[:, :, 1:])], 2)
     share = 1.0 / (log_prob.shape[2] * log_prob.shape[3])
     taken, advantage = action[:, None, None].expand(-1, 1, log_prob.shape[2], -1), advantage[:, None, None]
-    ratio = (log_prob.gather(1, taken) - old_log_prob[:, None, None]).exp_()
-    gain = ratio * advantage
-    bound = ratio.clamp_(1 - weights.clip_epsilon, 1 + weights.clip_epsilon).mul_(advantage)
-    slope = gain.masked_fill_(gain > bound, 0.0)  # of the objective by log pi: rho A, or 0 where it is clipped
+    log_ratio = log_prob.gather(1, taken) - old_log_prob[:, None, None]
+    slope = surrogate_slope(log_ratio, advantage, weights.clip_epsilon)
     gradient = (log_prob * prob).mul_(weights.entropy_coef * share)
     return gradient.scatter_add_(1, taken, slope.mul_(-share))
+
+
+def surrogate_slope(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
+    """Return the slope of PPO's objective by log pi: rho A, or 0 where it is clipped; works in place on `log_ratio`."""
+    ratio = log_ratio.exp_()
+    gain = ratio * advantage
+    bound = ratio.clamp_(1 - clip_epsilon, 1 + clip_epsilon).mul_(advantage)
+    return gain.masked_fill_(gain > bound, 0.0)
 
 
 def _add_divergence(gradient: Tensor, log_prob: Tensor, prob: Tensor, weights: Weights) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.closed_form import carries, critic_gradient, policy_gradient, weights_of
+from esp_cli.algorithms.closed_gaussian import gaussian_gradient
 from esp_cli.algorithms.learner import Iteration, Learner
 from esp_cli.algorithms.losses import (
     clipped_surrogate,
@@ -89,7 +90,7 @@ class Mappo(Learner):
         self._old: tuple[StochasticPolicy, Critic] | None = None
         reevaluates = config.clip_value or self.prior.recomputes
         partial = spec.masks or spec.agents_end
-        self._closed_form = isinstance(self.policy.head, Categorical) and not reevaluates and not partial
+        self._closed_form = not reevaluates and not partial
 
     @classmethod
     def build_policy(
@@ -226,17 +227,25 @@ class Mappo(Learner):
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
     ) -> Tensor:
         """Return the gradient [S, P] of `reference_loss`, by fewer operations."""
-        config, batch = self.config, copies.originals
-        logits, pull_logits = self.policy.traced(copies.obs, config.truncation)
+        config, batch, head = self.config, copies.originals, self.policy.head
+        outputs, pull_outputs = self.policy.traced(copies.obs, config.truncation)
         state = copies.state if self.critic.reads == "state" else batch.state
         values, pull_values = self.critic.traced(copies.obs, state, config.truncation)
         if sums is not None:
-            outputs = self.policy.head.normalise(copies.original(logits).transpose(2, 3))
-            self._watch(batch, outputs, copies.original(values), weight, sums)
+            said = head.normalise(copies.original(outputs).transpose(2, 3))
+            self._watch(batch, said, copies.original(values), weight, sums)
         weights = weights_of(config, entropy_coef, self.prior.config, copies.augments)
-        by_logits = policy_gradient(logits, copies.transforms, batch.action, batch.log_prob, batch.advantage, weights)
-        by_values = critic_gradient(values, batch.target, weights)
-        return self.optimiser.parameters.flat([*pull_logits(by_logits), *pull_values(by_values)])
+        pulled = pull_values(critic_gradient(values, batch.target, weights))
+        if isinstance(head, Categorical):
+            made = (batch.action, batch.log_prob, batch.advantage)
+            pulled = pull_outputs(policy_gradient(outputs, copies.transforms, *made, weights)) + pulled
+        else:
+            mean, log_std = outputs.transpose(2, 3), head.log_deviation(outputs).detach()
+            old, advantage = copies.repeated(batch.log_prob), copies.repeated(batch.advantage)
+            action = copies.learned(copies.action)
+            by_mean, by_log_std = gaussian_gradient(mean, log_std, copies.transforms, action, old, advantage, weights)
+            pulled = [head.by_item(by_log_std), *pull_outputs(by_mean.transpose(2, 3)), *pulled]
+        return self.optimiser.parameters.flat(pulled)
 
     def reference_loss(
         self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None

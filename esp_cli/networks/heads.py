@@ -133,9 +133,13 @@ class BoundedGaussian(Head):
         self.disc: Tensor
         self.register_buffer("disc", same_disc(space), False)
 
-    def _log_std(self, like: Tensor) -> Tensor:
+    def log_deviation(self, like: Tensor) -> Tensor:
         """Return the log deviation of each number, shaped to stand beside `like`: [S, ..., width]."""
         return self.log_std[:, self.item].view(-1, *[1] * (like.dim() - 2), self.num_outputs)
+
+    def by_item(self, by_numbers: Tensor) -> Tensor:
+        """Return the gradient by the parameter, from that by the log deviation of each number [S, width]."""
+        return torch.zeros_like(self.log_std).index_add_(1, self.item, by_numbers)
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
@@ -144,7 +148,7 @@ class BoundedGaussian(Head):
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the latent action mean + std * noise."""
-        return outputs + self._log_std(outputs).exp() * noise
+        return outputs + self.log_deviation(outputs).exp() * noise
 
     def mode(self, outputs: Tensor) -> Tensor:
         """Return the mean."""
@@ -152,18 +156,18 @@ class BoundedGaussian(Head):
 
     def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
         """Return the latent Gaussian's log density: [S, B, N]."""
-        log_std = self._log_std(outputs)
+        log_std = self.log_deviation(outputs)
         z = (action - outputs) * (-log_std).exp()
         return -(0.5 * z.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def entropy(self, outputs: Tensor) -> Tensor:
         """Return the latent Gaussian's entropy: [S, B, N]."""
-        entropy = (self._log_std(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
+        entropy = (self.log_deviation(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
         return entropy.expand(outputs.shape[:-1])
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
-        return (0.5 * ((p - q) * (-self._log_std(p)).exp()).square()).sum(-1)
+        return (0.5 * ((p - q) * (-self.log_deviation(p)).exp()).square()).sum(-1)
 
     def to_environment(self, action: Tensor) -> Tensor:
         """Squash the latent action to the task's bounds."""

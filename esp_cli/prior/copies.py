@@ -63,6 +63,11 @@ class Copies(Generic[Rows]):
         """The states of `rows` alone."""
         return self._pushed(self.originals.state, lambda g: g.state)
 
+    @cached_property
+    def action(self) -> Tensor:
+        """The actions of `rows` alone."""
+        return self._pushed(self.originals.action, lambda g: g.action)
+
     def chunks(self, size: int) -> list[Copies[Rows]]:
         """Cut the originals into pieces of at most `size`, each with its own copies."""
         if size >= self.originals.count:

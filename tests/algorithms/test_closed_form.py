@@ -39,7 +39,7 @@ def weights(**changes):
 
 
 def gradients(trained, reference):
-    """Return the gradients of actor and critic on a minibatch, by the closed form or by the reference.
+    """Return the gradients of head (if it learns), actor and critic on a minibatch, by closed form or reference.
 
     The networks are far from their first weights, where the policy is uniform and the entropy has no gradient.
     """
@@ -54,8 +54,11 @@ def gradients(trained, reference):
         gradient = trained.optimiser.gradient(trained.reference_loss(copies, 0.01, 1.0, None))
     else:
         gradient = trained._closed_form_gradient(copies, 0.01, 1.0, None)
-    size = sum(p[0].numel() for p in trained.policy.parameters())
-    return gradient[:, :size], gradient[:, size:]
+    head, actor, critic = (
+        sum(p[0].numel() for p in part.parameters())
+        for part in (trained.policy.head, trained.policy.actor, trained.critic)
+    )
+    return [part for part in gradient[:, : head + actor + critic].split((head, actor, critic), 1) if part.numel()]
 
 
 def gap(ours, theirs):
@@ -63,6 +66,7 @@ def gap(ours, theirs):
     return ((ours - theirs).abs().max() / theirs.abs().max()).item()
 
 
+CONTINUOUS = {"task__actions": "continuous"}
 CHOICES = [
     {"prior__kind": "none"},
     {"prior__kind": "esp"},
@@ -75,6 +79,12 @@ CHOICES = [
     {"prior__kind": "consistency", "prior__terms": "value"},
     {"prior__kind": "esp", "network__name": "gru", "mappo__critic_input": "own"},
     {"prior__kind": "esp", "task__convention": "pettingzoo", "mappo__critic_input": "state"},
+    {"prior__kind": "none", **CONTINUOUS},
+    {"prior__kind": "esp", **CONTINUOUS},
+    {"prior__kind": "esp", "prior__transforms": "o2", "prior__consistency_coef": 3.0, **CONTINUOUS},
+    {"prior__kind": "esp", "prior__copies": "all", "prior__stop_gradient": "original", **CONTINUOUS},
+    {"prior__kind": "consistency", "prior__stop_gradient": "transformed", **CONTINUOUS},
+    {"prior__kind": "augment", "network__name": "gru", **CONTINUOUS},
 ]
 
 
@@ -85,12 +95,13 @@ def test_the_closed_form_is_the_reference_to_rounding(choice):
     assert max(map(gap, ours, theirs)) < 1e-4
 
 
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
 @pytest.mark.parametrize("change", ["entropy_coef", "policy_gap", "value_gap", "value_coef", "augments"])
-def test_each_term_of_the_closed_form_moves_the_gradient(change, monkeypatch):
+def test_each_term_of_the_closed_form_moves_the_gradient(change, actions, monkeypatch):
     """The negative control of the comparison above."""
-    theirs = gradients(learner(), reference=True)
+    theirs = gradients(learner(task__actions=actions), reference=True)
     monkeypatch.setattr("esp_cli.algorithms.closed_form.Weights", lambda **k: Weights(**k | {change: k[change] * 0}))
-    ours = gradients(learner(), reference=False)
+    ours = gradients(learner(task__actions=actions), reference=False)
     assert max(map(gap, ours, theirs)) > 3e-3
 
 
