@@ -119,8 +119,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a task nobody has": (lambda run: edit_config(run, task="chess"), "unknown task 'chess'"),
     "an algorithm nobody has": (lambda run: edit_config(run, algorithm="magic"), "unknown algorithm 'magic'"),
     "task settings of another": (
-        lambda run: edit_config(run, task_settings={"wind": 1}),
-        "unknown setting 'task.wind'",
+        lambda run: edit_config(run, task_settings={"weather": 1}),
+        "unknown setting 'task.weather'",
     ),
     "a network larger than the file": (
         lambda run: edit_config(run, network={"hidden": [4096] * 16}),

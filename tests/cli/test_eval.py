@@ -143,7 +143,7 @@ def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> 
         ("task.num_agents=2", "was trained with other agents than the task has with task.num_agents changed"),
         ("task.num_landmarks=2", "was trained with other observation than the task has"),
         ("task.actions=continuous", "was trained with other action than the task has"),
-        ("task.wind=2", "unknown setting 'task.wind'"),
+        ("task.weather=2", "unknown setting 'task.weather'"),
         ("task.horizon=0", "bad value 0 for 'task.horizon'"),
         ("mappo.gamma=0.9", "is not a setting of the task"),
     ],
