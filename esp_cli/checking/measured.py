@@ -19,6 +19,8 @@ from esp_envs.registry import make
 
 _EPISODES = 1024
 _WORLDS = 256
+_HORIZON = 50
+"""Steps of an episode, at most, where a task has such a setting: of a longer one only the beginning is looked at."""
 
 
 def prepared(config: RunConfig) -> RunConfig:
@@ -46,8 +48,10 @@ class _Maker:
     """Makes the worlds of a configuration; equal for equal tasks, so that nothing is measured twice."""
 
     def __init__(self, config: RunConfig) -> None:
-        self._task, self._settings = config.task, config.task_settings
-        self._key = (config.task, repr(sorted(config.task_settings.items())))
+        self._task, self._settings = config.task, dict(config.task_settings)
+        if isinstance(horizon := self._settings.get("horizon"), int):
+            self._settings["horizon"] = min(horizon, _HORIZON)
+        self._key = (config.task, repr(sorted(self._settings.items())))
 
     def __call__(self, num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(self._task, num_envs, seeds, self._settings)

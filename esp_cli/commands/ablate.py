@@ -13,6 +13,7 @@ EPILOG = """Examples:\n
     esp ablate transforms --algo maddpg --task navigation\n
     esp ablate coefficient --steps 500k --dry-run\n
     esp ablate modules --algo maddpg,mappo --seeds 10 --steps 500k --out runs/modules\n
+    esp ablate breaking --task navigation --seeds 3 --steps 300k --dry-run\n
     esp ablate prior --task rendezvous:Rendezvous --seeds 5 --steps 200k\n
     esp ablate modules --reuse runs/table1 --reuse runs/transforms"""
 
@@ -20,10 +21,11 @@ EPILOG = """Examples:\n
 @study_command
 def ablate(
     part: Annotated[
-        Literal["transforms", "coefficient", "modules", "prior"],
+        Literal["transforms", "coefficient", "modules", "prior", "breaking"],
         typer.Argument(
             help="Number and type of transforms (figures 5a, 5b), weight of the consistency loss (5c), loss and "
-            "augmentation apart (6a), or the learner with the whole prior and without it.",
+            "augmentation apart (6a), the learner with the whole prior and without it, or methods under broken "
+            "symmetry.",
             metavar="PART",
         ),
     ],

@@ -145,6 +145,9 @@ def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonVa
             "episodes": cell.config.evaluation.episodes,
             "returns": {mode: _rounded(compared.values[-1])},
         }
+    kind = KINDS.get(study.kind)
+    if curve is not None and kind is not None and kind.breakings and (early := curve.until(cell.config.steps // 5)):
+        found["early"] = _rounded(early.values[-1])
     if "returns" in found and compared is not None:
         found["evaluations"] = len(compared.steps)
         if len(compared.steps) > 1:

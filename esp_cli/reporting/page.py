@@ -10,19 +10,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from esp_cli import __version__
 from esp_cli.drawing.draw import draw
+from esp_cli.evaluation.statistics import Floats
 from esp_cli.files.documents import encode
 from esp_cli.files.writing import replace_file
+from esp_cli.reporting.breaking import Series, series_of
 from esp_cli.reporting.charts import chart, stroke
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.marl_eval import marl_eval
 from esp_cli.reporting.panels import Panel, Sensitivity, curve_panels, sensitivity
 from esp_cli.reporting.plots import Curve, Group, dots
-from esp_cli.reporting.results import RESULTS_FORMAT, CellResult
-from esp_cli.reporting.summary import floats
+from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results
+from esp_cli.reporting.summary import floats, returns_of
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import KINDS
 from esp_cli.training.loading import load_policy
@@ -147,6 +150,8 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
         panel: {variant: floats(cell.returns[results.mode]) for variant, cell in own.items()}
         for panel, own in finished.items()
     }
+    if series := series_of(results):
+        return [*pictures, *_over_strength(results, series, out, label)]
     if results.kind == "ablate-coefficient":
         lines = [
             Sensitivity(panel, values[panel], {v: c.paper[0] for v, c in own.items() if c.paper})
@@ -161,6 +166,23 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
         groups = [Group(variant, numbers) for variant, numbers in values[panel].items()]
         anchors = {key: round(value, 1) for key, value in next(iter(own.values())).anchors.items()}
         pictures.append(dots(groups, out / f"returns-{k + 1}", panel, label, anchors))
+    return pictures
+
+
+def _over_strength(results: Results, series: Sequence[Series], out: Path, label: str) -> Pictures:
+    """Draw the return over the strength of breaking, one picture for each task, one line for each method."""
+    pictures: Pictures = []
+    for k, one in enumerate(series, 1):
+        lines: dict[str, dict[str, Floats]] = {}
+        for strength, cells in one.cells.items():
+            for method, cell in cells.items():
+                values = returns_of(cell, results.mode)
+                if values is not None and bool(np.isfinite(values).all()):
+                    lines.setdefault(method, {})[f"{strength:g}"] = values
+        drawn = [Sensitivity(method, values) for method, values in lines.items()]
+        if drawn:
+            order = [f"{strength:g}" for strength in one.cells]
+            pictures.append(sensitivity(drawn, out / f"breaking-{k}", one.name, one.setting, label, order))
     return pictures
 
 

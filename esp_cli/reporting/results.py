@@ -49,6 +49,7 @@ class CellResult(BaseModel):
         anchors: mean returns of the reference policies.
         metrics: the task's measures of the greedy policy.
         evaluations: on the way.
+        early: returns at a fifth of the run, by seed, in a study of broken symmetry.
         area_under_curve: mean height of the learning curve, by seed.
         steps_to: first steps at thresholds.
         parameters: weights by network, of one seed.
@@ -77,6 +78,7 @@ class CellResult(BaseModel):
     anchors: dict[str, float] = {}
     metrics: dict[str, float | None] = {}
     evaluations: int | None = None
+    early: Numbers | None = None
     area_under_curve: Numbers | None = None
     steps_to: tuple[Passing, ...] = ()
     parameters: dict[str, int] = {}

@@ -6,8 +6,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from esp_cli.evaluation.statistics import Estimate, SeedSummary
+from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
 from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.reporting.breaking import ESP, PLAIN, early_of, series_of, side, verdicts
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell
 from esp_cli.studies import paper
@@ -144,6 +145,36 @@ def aggregates_table(results: Results) -> Table | None:
     return Table("Over all panels", headings, rows, caption) if rows else None
 
 
+def breaking_table(results: Results) -> Table | None:
+    """Return the returns over the strength of breaking, or None of a study that breaks nothing."""
+    rows = []
+    for one in series_of(results):
+        for strength, cells in one.cells.items():
+            for method, cell in cells.items():
+                early = early_of(cell)
+                short = NOTHING if early is None else _mean_of(summarise(early))
+                beside = [
+                    _AHEAD[side(results, cell, cells.get(name))] if method != name else "" for name in (PLAIN, ESP)
+                ]
+                rows.append((one.name, f"{one.setting} {strength:g}", method, short, _short(results, cell), *beside))
+    caption = "Mean ± standard error over seeds at a fifth of the run and at its end; ahead: at the end, by intervals."
+    headings = ("run", "breaking", "method", "at 20 %>", "at 100 %>", "ahead of plain", "ahead of ESP")
+    return Table("Returns over the strength of breaking", headings, tuple(rows), caption) if rows else None
+
+
+def verdicts_table(results: Results) -> Table | None:
+    """Return for each method whether it could be the default, or None of a study that breaks nothing."""
+    said = {True: "yes", False: "no", None: NOTHING}
+    rows = tuple((v.method, said[v.unbroken], said[v.largest], said[v.between]) for v in verdicts(results))
+    caption = (
+        "A default is within one standard error of ESP where nothing is broken, not behind the plain learner at the "
+        "largest strength, and in between ahead of both or level with them; in every task. "
+        f"{NOTHING}: runs are missing."
+    )
+    headings = ("method", "as ESP unbroken", "not behind plain at the largest", "ahead or level in between")
+    return Table("Could it be the default?", headings, rows, caption) if rows else None
+
+
 def times_table(results: Results) -> Table:
     """Return what was run, by which version, and how long it took."""
     done = [cell for cell in results.cells if cell.seconds is not None]
@@ -164,6 +195,8 @@ TABLES: dict[str, Callable[[Results], Table | None]] = {
     "comparison": comparison_table,
     "statistics": statistics_table,
     "networks": networks_table,
+    "breaking": breaking_table,
+    "verdicts": verdicts_table,
     "aggregates": aggregates_table,
     "provenance": times_table,
 }

@@ -98,16 +98,22 @@ def _variants(
     kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
     """Yield the variants of each algorithm, which are compared with the first of them."""
-    for algorithm, steps in ((a, s) for a in algorithms for s in _steps(kind, task, request)):
-        stem = f"{file_name(task)}-{file_name(algorithm)}-{_count(steps)}"
+    setting, values = kind.breakings.get(task, ("", ()))
+    strengths = [Team(f"{setting} {value:g}", {f"task.{setting}": value}, ()) for value in values] or [Team("", {}, ())]
+    for strength, algorithm, steps in (
+        (team, a, s) for team in strengths for a in algorithms for s in _steps(kind, task, request)
+    ):
+        heads = [part for part in (task, strength.label) if part]
+        stem = "-".join(file_name(part) for part in (*heads, algorithm)) + f"-{_count(steps)}"
         for variant in variants:
             choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
+            choice |= strength.settings
             config = _config(task, algorithm, steps, request, choice, kind.common)
             fields = {"task": task, "steps": steps, "algorithm": algorithm, "value": variant.removeprefix("c = ")}
             place = tuple(part.format(**fields) for part in kind.place)
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
-                panel=f"{task}, {_paired_name(algorithm, 'none')}, {_count(steps)}",
+                panel=", ".join([*heads, _paired_name(algorithm, "none"), _count(steps)]),
                 variant=variant,
                 config=config,
                 reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
@@ -159,6 +165,9 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
     other = next((task for task in tasks if kind.only not in (None, task)), None)
     if other is not None:
         raise ValueError(f"this study is on {kind.only} alone, not on {other}; leave out --tasks")
+    unknown = [task for task in tasks if kind.breakings and task not in kind.breakings]
+    if unknown:
+        raise ValueError(f"this study knows no breaking of {unknown[0]}; its tasks are {', '.join(kind.breakings)}")
     for name in request.overrides:
         section = name.rpartition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):

@@ -18,6 +18,13 @@ ALGORITHMS = ("maddpg", "qmix", "mappo")
 PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
 """What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
 PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
+BREAKINGS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    "navigation": ("wind", (0.0, 0.3, 0.6, 1.0)),
+    "predator-prey": ("wind", (0.0, 0.3, 0.6)),
+    "formation": ("slope", (0.0, 0.3, 0.6)),
+    "wildlife": ("wind", (0.0, 0.4, 0.8)),
+}
+"""By task the setting that breaks its symmetry, and its strengths."""
 COEFFICIENTS = (0.0, 0.01, 0.05, 0.1, 0.5, 1.0)
 
 
@@ -53,6 +60,7 @@ class StudyKind:
         all_rows: take every row of the paper's table, not only the first.
         only: the one task that the study is about.
         teams: rows beside the task itself.
+        breakings: by task the setting that breaks its symmetry, and its strengths; empty for other studies.
         place: of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none.
         mode: evaluations that are reported, unless the user asks for others.
         thresholds: returns whose first passing is reported; by default that which the reference ended with.
@@ -70,6 +78,7 @@ class StudyKind:
     all_rows: bool = False
     only: str | None = None
     teams: tuple[Team, ...] = ()
+    breakings: Mapping[str, tuple[str, tuple[float, ...]]] = field(default_factory=dict)
     place: tuple[str, ...] = ()
     mode: Mode = "greedy"
     thresholds: tuple[float, ...] = ()
@@ -145,6 +154,24 @@ KINDS: Mapping[str, StudyKind] = {
         varies=frozenset({"prior.kind"}),
         variants=PLAIN_AND_ESP,
         algorithms=("mappo",),
+    ),
+    "ablate-breaking": StudyKind(
+        "Methods for imperfect symmetry over the strength of breaking",
+        rows="variants",
+        varies=frozenset(
+            {"prior.kind", "prior.fade", "prior.trust", "prior.compass", *(f"task.{s}" for s, _ in BREAKINGS.values())}
+        ),
+        variants={
+            "plain": {"prior.kind": "none"},
+            "ESP": {"prior.kind": "esp"},
+            "ESP that fades": {"prior.kind": "esp", "prior.fade": 0.5},
+            "measured weights": {"prior.kind": "esp", "prior.trust": "measured"},
+            "compass": {"prior.kind": "esp", "prior.compass": 1.0},
+        },
+        tasks=("navigation", "predator-prey", "formation"),
+        algorithms=("mappo",),
+        steps=(1_000_000,),
+        breakings=BREAKINGS,
     ),
     # the standard network, the same with the prior, the equivariant one, and the standard one averaged over the group
     "homomorphic": StudyKind(

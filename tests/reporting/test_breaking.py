@@ -1,0 +1,146 @@
+"""The study of broken symmetry: what it runs, and what its tables say of made-up returns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from esp_cli.reporting.breaking import Verdict, series_of, side, verdicts
+from esp_cli.reporting.collect import collect
+from esp_cli.reporting.page import write_report
+from esp_cli.reporting.results import read_results
+from esp_cli.reporting.tables import breaking_table, returns_table, verdicts_table
+from esp_cli.studies.catalogue import plan
+from esp_cli.studies.kinds import BREAKINGS, KINDS
+from esp_cli.studies.study import StudyFolder
+from esp_envs import make
+from tests.studies.small_studies import request, small_study, write_run, write_study
+
+METHODS = list(KINDS["ablate-breaking"].variants)
+BASE = {"plain": -150.0, "ESP": -120.0, "ESP that fades": -120.5, "measured weights": -120.0, "compass": -125.0}
+"""Returns where nothing is broken; the standard error is 1."""
+BROKEN = {"plain": -150.0, "ESP": -180.0, "ESP that fades": -150.0, "measured weights": -140.0, "compass": -130.0}
+NOISE = (-1.0, 0.0, 1.0)
+
+
+def study(**choice):
+    return small_study("ablate-breaking", **{"tasks": ("navigation",), **choice})
+
+
+def test_every_method_meets_every_strength_of_its_task():
+    cells = plan("ablate-breaking", request(tasks=tuple(BREAKINGS), seeds=(0,))).cells
+    for task, (setting, values) in BREAKINGS.items():
+        own = [cell for cell in cells if cell.config.task == task]
+        found = [(cell.config.task_settings[setting], cell.variant) for cell in own]
+        assert found == [(value, method) for value in values for method in METHODS]
+        assert values[0] == 0
+        assert setting in {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
+    priors = {cell.variant: cell.config.prior for cell in cells}
+    assert [priors[m].kind for m in METHODS] == ["none", "esp", "esp", "esp", "esp"]
+    assert priors["ESP that fades"].fade > 0
+    assert priors["compass"].compass > 0
+    assert all(cell.reference is None or cell.reference.endswith("-plain") for cell in cells)
+
+
+def test_weights_are_measured_when_the_study_is_planned():
+    weights = {
+        cell.config.task_settings["wind"]: cell.config.prior.weights
+        for cell in study().cells
+        if cell.variant == "measured weights"
+    }
+    assert set(weights[0.0].values()) == {1.0}
+    assert weights[1.0]["rot180"] < weights[0.3]["rot180"] < 1
+    assert weights[1.0]["flip-x"] == 1
+
+
+@pytest.mark.parametrize("setting", ["prior.compass", "task.wind", "prior.kind"])
+def test_what_the_study_varies_cannot_be_set(setting: str):
+    with pytest.raises(ValueError, match="what this study varies by itself"):
+        plan("ablate-breaking", request(overrides={setting: 1}))
+
+
+def test_a_task_that_nobody_breaks_is_refused():
+    with pytest.raises(ValueError, match="knows no breaking of nowhere"):
+        plan("ablate-breaking", request(tasks=("nowhere",)))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> StudyFolder:
+    """All runs of navigation: unbroken as in BASE, else as in BROKEN."""
+    made = StudyFolder.create(tmp_path / "study", study())
+    for cell in made.study.cells:
+        mean = (BASE if cell.config.task_settings["wind"] == 0 else BROKEN)[cell.variant]
+        ends = [mean + x for x in NOISE]
+        rows = [[x - 10.0 * (2 - k) for x in ends] for k in range(3)]
+        write_run(made, cell, rows, ends)
+    return made
+
+
+def test_each_method_gets_its_verdict(folder: StudyFolder):
+    """Fading: not ahead of plain, but level. Compass: 5 below ESP unbroken. Measured: as ESP, then ahead."""
+    results = collect(folder).results
+    (one,) = series_of(results)
+    assert (one.name, one.setting, list(one.cells)) == ("navigation, MAPPO, 200", "wind", [0.0, 0.3, 0.6, 1.0])
+    assert verdicts(results) == [
+        Verdict("ESP that fades", True, True, True),
+        Verdict("measured weights", True, True, True),
+        Verdict("compass", False, True, True),
+    ]
+    table = verdicts_table(results)
+    assert table is not None
+    assert table.rows[2] == ("compass", "no", "yes", "yes")
+
+
+def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
+    worse = StudyFolder.create(tmp_path / "study", study())
+    for cell in worse.study.cells:
+        wind = cell.config.task_settings["wind"]
+        mean = (BASE if wind == 0 else BROKEN)[cell.variant] - (60 if wind == 1 and cell.variant == "compass" else 0)
+        mean -= 60 if wind == 0.3 and cell.variant == "measured weights" else 0
+        ends = [mean + x for x in NOISE]
+        write_run(worse, cell, [ends, ends, ends], ends)
+    found = {verdict.method: verdict for verdict in verdicts(collect(worse).results)}
+    assert found["compass"].largest is False
+    assert found["measured weights"] == Verdict("measured weights", True, True, False)
+
+
+def test_the_table_has_returns_at_a_fifth_and_at_the_end(folder: StudyFolder):
+    table = breaking_table(collect(folder).results)
+    assert table is not None
+    assert len(table.rows) == 4 * len(METHODS)
+    first = dict(zip(table.headings, table.rows[0], strict=True))
+    assert first["breaking"] == "wind 0"
+    assert first["at 20 %>"].startswith("-170.00")
+    assert first["at 100 %>"].startswith("-150.00")
+    rows = {(row[1], row[2]): row for row in table.rows}
+    assert rows["wind 1", "compass"][-2:] == ("yes", "yes")
+    assert rows["wind 0.3", "ESP"][-2:] == ("no", "")
+    assert rows["wind 0", "measured weights"][-1] == "not told apart"
+
+
+def test_the_report_draws_returns_over_the_strength(folder: StudyFolder, tmp_path: Path):
+    files = write_report(collect(folder), tmp_path / "report")
+    assert "breaking-1.png" in {file.name for file in files}
+    again = read_results(tmp_path / "report" / "results.json")
+    assert verdicts(again) == verdicts(collect(folder).results), "the file alone gives the tables again"
+
+
+def test_equal_runs_are_level_and_one_seed_says_nothing(folder: StudyFolder):
+    results = collect(folder).results
+    cells = series_of(results)[0].cells[0.0]
+    assert side(results, cells["measured weights"], cells["ESP"]) == "level"
+    assert side(results, cells["plain"], cells["ESP"]) == "behind"
+    alone = {name: cell.model_copy(update={"returns": {"greedy": (-1.0,)}}) for name, cell in cells.items()}
+    assert side(results, alone["plain"], alone["ESP"]) is None
+
+
+def test_without_runs_nothing_is_said_and_other_studies_have_no_such_table(tmp_path: Path):
+    empty = StudyFolder.create(tmp_path / "empty", study())
+    assert {(v.unbroken, v.largest, v.between) for v in verdicts(collect(empty).results)} == {(None, None, None)}
+    other = write_study(tmp_path / "other", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
+    results = collect(other).results
+    assert breaking_table(results) is None
+    assert verdicts_table(results) is None
+    assert returns_table(results).rows
+    assert all(cell.early is None for cell in results.cells)
