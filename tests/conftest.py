@@ -6,6 +6,7 @@ import os
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -48,6 +49,14 @@ def forked_jobs() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine_local, "LocalEngine", ForkEngine)
         yield
+
+
+@pytest.fixture
+def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let exports compare observations in a few states; test_epuck.py does it in all of them."""
+    from esp_cli.deploy import epuck
+
+    monkeypatch.setattr(epuck, "take_scenes", partial(epuck.take_scenes, count=50))
 
 
 @pytest.fixture

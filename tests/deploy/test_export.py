@@ -22,6 +22,7 @@ from esp_cli.deploy.translate import program_of
 from esp_cli.training.build import build_environment
 from tests.deploy.policies import KINDS, drawn_policy
 
+pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c", "onnx")
 needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import math
 import sys
-from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.deploy.epuck import take_scenes
 from esp_cli.deploy.export import export
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
@@ -25,12 +23,7 @@ from tests.deploy.policies import drawn_policy
 STEPS = 40
 EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
 WEBOTS = Path("controllers") / "esp_epuck_webots"
-
-
-@pytest.fixture(autouse=True)
-def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare observations in a few states; test_epuck.py does it in all of them."""
-    monkeypatch.setattr("esp_cli.deploy.epuck.take_scenes", partial(take_scenes, count=50))
+pytestmark = pytest.mark.usefixtures("few_scenes")
 
 
 class Team:
