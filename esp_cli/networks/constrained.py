@@ -39,16 +39,23 @@ class ConstrainedLinear(nn.Module):
         outputs: how y transforms.
         gain: the initial weights are orthogonal ones of this gain, projected onto what is allowed and scaled to keep
             their size.
+        relax: weight of a plain layer beside it, which begins at 0 and need not commute: y = x (W + relax F) + ..., the
+            layer of residual pathway priors (Finzi et al., 2021). 0 leaves it out.
 
     Shape:
         x: [S, B, in] -> [S, B, out].
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], inputs: Sequence[Block], outputs: Sequence[Block], gain: float
+        self,
+        generators: Sequence[torch.Generator],
+        inputs: Sequence[Block],
+        outputs: Sequence[Block],
+        gain: float,
+        relax: float = 0.0,
     ) -> None:
         super().__init__()
-        self.inputs, self.outputs = list(inputs), list(outputs)
+        self.inputs, self.outputs, self.relax = list(inputs), list(outputs), relax
         full = orthogonal(generators, block_width(inputs), block_width(outputs), gain)
         one = Block(np.ones((len(inputs[0].matrices), 1, 1)), 1)
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
@@ -72,6 +79,9 @@ class ConstrainedLinear(nn.Module):
                 self.biases[str(b)] = nn.Parameter(torch.zeros(len(generators), target.copies, len(basis)))
                 self.register_buffer(f"constant-{b}", basis.flatten(1), False)
         self.num_seeds = len(generators)
+        if relax:
+            self.free = nn.Parameter(torch.zeros_like(full))
+            self.free_bias = nn.Parameter(torch.zeros(len(generators), 1, full.shape[2]))
 
     def weight(self) -> Tensor:
         """Return W: [S, in, out]."""
@@ -88,7 +98,8 @@ class ConstrainedLinear(nn.Module):
                 else:
                     parts.append(like.new_zeros(self.num_seeds, source.width, target.width))
             rows.append(torch.cat(parts, 2) if len(parts) > 1 else parts[0])
-        return torch.cat(rows, 1) if len(rows) > 1 else rows[0]
+        held = torch.cat(rows, 1) if len(rows) > 1 else rows[0]
+        return held + self.relax * self.free if self.relax else held
 
     def bias(self) -> Tensor:
         """Return b: [S, 1, out]."""
@@ -99,7 +110,8 @@ class ConstrainedLinear(nn.Module):
                 parts.append((self.biases[str(b)] @ self.get_buffer(f"constant-{b}")).flatten(1))
             else:
                 parts.append(like.new_zeros(self.num_seeds, target.width))
-        return torch.cat(parts, 1).unsqueeze(1)
+        held = torch.cat(parts, 1).unsqueeze(1)
+        return held + self.relax * self.free_bias if self.relax else held
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer."""
@@ -112,6 +124,9 @@ class EquivariantConfig(NetworkConfig):
     name: Literal["equivariant"] = "equivariant"
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
     group: str = Field("c4", max_length=100, description="the layers commute with this group")
+    relax: float = Field(
+        0.0, ge=0, le=10, description="weight of a plain layer beside each, which begins at 0; 0: exactly equivariant"
+    )
 
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
@@ -140,7 +155,8 @@ class Equivariant(Memoryless):
         blocks = [io.inputs(self.group), *hidden, io.outputs(self.group)]
         gains = [GAINS[config.activation]] * len(hidden) + [output_gain]
         self.layers = nn.ModuleList(
-            ConstrainedLinear(generators, a, b, gain) for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
+            ConstrainedLinear(generators, a, b, gain, config.relax)
+            for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
         )
         self.activation = config.activation
 

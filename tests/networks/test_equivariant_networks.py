@@ -313,3 +313,47 @@ def test_drones_out_of_reach_are_not_heard() -> None:
 def test_what_does_not_fit_is_refused(task, overrides, message) -> None:
     with pytest.raises(ValueError, match=message):
         build_learner(resolve_config(task, overrides={"mappo.num_envs": 2} | overrides))
+
+
+def relaxed(spec: TaskSpec, relax: float) -> nn.Module:
+    config = NETWORKS["equivariant"](hidden=(16, 16), group="d4", relax=relax)
+    return build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
+
+
+@torch.no_grad()
+def symmetry_gap(network: nn.Module, spec: TaskSpec, obs: Tensor) -> float:
+    """Return the largest difference between outputs and those of turned inputs, turned back."""
+    rows, gap = obs.flatten(1, 2), 0.0
+    for g in transform_set("d4", spec).each():
+        there = network(g.obs(obs).flatten(1, 2)).unflatten(1, obs.shape[1:3])
+        gap = max(gap, float((g.pull_back(there) - network(rows).unflatten(1, obs.shape[1:3])).abs().max()))
+    return gap
+
+
+def test_a_relaxed_network_begins_equivariant_and_can_give_it_up() -> None:
+    spec, obs, _ = scene("navigation")
+    network = relaxed(spec, 0.5)
+    assert symmetry_gap(network, spec, obs) < EXACT
+    assert torch.equal(network(obs.flatten(1, 2)), relaxed(spec, 0.0)(obs.flatten(1, 2)))
+    network(obs.flatten(1, 2)).square().sum().backward()
+    assert all(layer.free.grad.abs().max() > 0 for layer in network.layers)
+    stir(network)
+    assert symmetry_gap(network, spec, obs) > 0.1
+    strict = relaxed(spec, 0.0)
+    stir(strict)
+    assert symmetry_gap(strict, spec, obs) < 10 * EXACT
+    assert not any("free" in name for name, _ in strict.named_parameters())
+
+
+def test_a_relaxed_layer_by_hand() -> None:
+    """W is that of the constrained layer plus half of F: with F = 2, one more in each entry."""
+    group = cyclic(2)
+    blocks = [regular(group, 1)], [regular(group, 1)]
+    strict, soft = (ConstrainedLinear(generators(0), *blocks, 1.0, relax) for relax in (0.0, 0.5))
+    with torch.no_grad():
+        soft.free.fill_(2.0)
+        soft.free_bias[0, 0] = torch.tensor([4.0, -4.0])
+    torch.testing.assert_close(soft.weight(), strict.weight() + 1)
+    assert (soft.bias() - strict.bias()).flatten().tolist() == [2.0, -2.0]
+    x = torch.randn(1, 3, 2)
+    torch.testing.assert_close(soft(x), x @ soft.weight() + soft.bias())
