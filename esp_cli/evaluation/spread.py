@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its part "stats" takes a second to import, and does so where it is first used
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from esp_cli.evaluation.statistics import CONFIDENCE, Interval, bootstrap_interval, mean_and_sem
 
@@ -34,5 +34,5 @@ def spread_over_episodes(returns: ArrayLike) -> EpisodeSpread:
     mean, sem = mean_and_sem(sample)
     if sem is None or sample.size <= MOST_RESAMPLED:
         return EpisodeSpread(sem, None if sem is None else bootstrap_interval(sample))
-    reach = float(stats.norm.ppf((1 + CONFIDENCE) / 2)) * sem
+    reach = float(scipy.stats.norm.ppf((1 + CONFIDENCE) / 2)) * sem
     return EpisodeSpread(sem, (mean - reach, mean + reach))

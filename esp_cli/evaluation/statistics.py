@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its part "stats" takes a second to import, and does so where it is first used
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
@@ -77,7 +77,7 @@ def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
         ValueError: no value, or one that is not finite.
     """
     sample = _sample(values)
-    return float(sample.mean()), float(stats.sem(sample)) if sample.size > 1 else None
+    return float(sample.mean()), float(scipy.stats.sem(sample)) if sample.size > 1 else None
 
 
 def bootstrap_interval(values: ArrayLike) -> Interval | None:
@@ -161,7 +161,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
     if paired:
         wins = _wins(first, second)
         return Estimate(float(wins.mean()), _interval((wins,), np.mean))
-    u = stats.mannwhitneyu(first, second).statistic
+    u = scipy.stats.mannwhitneyu(first, second).statistic
     return Estimate(float(u) / (first.size * second.size), _interval((first, second), _share_of_wins))
 
 
@@ -196,7 +196,9 @@ def leader(
     deviation, other_deviation = sem * np.sqrt(count), other_sem * np.sqrt(other_count)
     if deviation == other_deviation == 0:
         return None
-    test = stats.ttest_ind_from_stats(mean, deviation, count, other_mean, other_deviation, other_count, equal_var=False)
+    test = scipy.stats.ttest_ind_from_stats(
+        mean, deviation, count, other_mean, other_deviation, other_count, equal_var=False
+    )
     if test.pvalue >= 1 - CONFIDENCE:
         return "neither"
     return "first" if mean > other_mean else "second"
@@ -231,7 +233,7 @@ def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Int
 
 def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamples: int = RESAMPLES) -> Any:
     """Return scipy's percentile interval of a statistic of independent samples, with this module's generator."""
-    return stats.bootstrap(
+    return scipy.stats.bootstrap(
         samples,
         statistic,
         n_resamples=resamples,
@@ -245,7 +247,7 @@ def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamp
 
 
 def _iqm(values: Floats, axis: int = -1) -> Any:
-    return stats.trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def _wins(x: Floats, y: Floats) -> Floats:

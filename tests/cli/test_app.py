@@ -176,6 +176,17 @@ def test_help_imports_neither_torch_nor_numpy() -> None:
     assert done.stdout.endswith("heavy: []\n"), done.stdout + done.stderr
 
 
+def test_scipy_s_statistics_are_imported_only_where_they_are_asked_for() -> None:
+    done = _python(
+        "import sys\n"
+        "from esp_cli.evaluation.spread import mean_and_sem\n"
+        "for sample in ([], [1.0], [1.0, 2.0]):\n"
+        "    sample and mean_and_sem(sample)\n"
+        "    print('scipy.stats' in sys.modules)\n"
+    )
+    assert done.stdout.split() == ["False", "False", "True"], done.stderr
+
+
 def test_the_version_is_the_packages() -> None:
     assert runner.invoke(app, ["--version"]).stdout == f"esp {__version__}\n"
 
