@@ -145,6 +145,20 @@ def test_unrolling_an_episode_equals_stepping_through_it(name):
     torch.testing.assert_close(network.unroll(x), torch.stack(steps, 2))
 
 
+@pytest.mark.parametrize(("name", "norm"), [("mlp", False), ("mlp", True), ("gru", False)])
+def test_the_way_back_by_hand_is_that_of_autograd(name, norm):
+    network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8, 8), layer_norm=norm), 1.0)
+    x, gradient = torch.randn(2, 4, 5, 6), torch.randn(2, 4, 5, 3)
+    outputs, pull = network.traced(x)
+    expected = network.unroll(x)
+    torch.testing.assert_close(outputs, expected.detach())
+    assert not outputs.requires_grad
+    found, parameters = pull(gradient), list(network.parameters())
+    for ours, theirs in zip(found, torch.autograd.grad(expected, parameters, gradient), strict=True):
+        torch.testing.assert_close(ours, theirs)
+    assert all(ours.abs().max() > 0 for ours in found), "negative control: no gradient is empty"
+
+
 def test_truncation_cuts_gradients_but_not_values():
     network = build_network(generators(0), 2, 1, NETWORKS["gru"](hidden=(4,)), 1.0)
     x = torch.randn(1, 1, 6, 2, requires_grad=True)
