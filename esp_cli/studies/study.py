@@ -27,7 +27,7 @@ from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
-from esp_cli.training.config import RunConfig
+from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
@@ -94,6 +94,13 @@ class Study(BaseModel):
         return list(dict.fromkeys(cell.panel for cell in self.cells))
 
 
+def _completed(cell: Cell) -> Cell:
+    """Return a stored cell with the settings that came later; one whose task is not at hand stays as it is."""
+    with contextlib.suppress(ValueError):
+        return cell.model_copy(update={"config": completed(cell.config)})
+    return cell
+
+
 class StudyFolder:
     """A folder that holds a study; use :meth:`create` or :meth:`open`.
 
@@ -157,7 +164,8 @@ class StudyFolder:
         """
         if not path.is_dir():
             raise StudyError(f"{path} is no study: there is no such folder")
-        return cls(path, STUDY_FORMAT.parse(path / _STUDY, Study))
+        study = STUDY_FORMAT.parse(path / _STUDY, Study)
+        return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
 
     @classmethod
     def _written(cls, path: Path, study: Study) -> StudyFolder:

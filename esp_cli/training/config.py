@@ -198,6 +198,23 @@ def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str
     return validated(task_class(task).Settings, settings, "task").model_dump()
 
 
+def completed(config: RunConfig) -> RunConfig:
+    """Return a stored configuration with the defaults of the settings that its task and learner gained since.
+
+    Raises:
+        ValueError: its task or algorithm is unknown.
+    """
+    models = {
+        "task_settings": task_class(config.task).Settings,
+        "algorithm_settings": ALGORITHMS[config.algorithm].config_class,
+    }
+    gained = {
+        part: {name: field.default for name, field in model.model_fields.items() if not field.is_required()}
+        for part, model in models.items()
+    }
+    return config.model_copy(update={part: new | getattr(config, part) for part, new in gained.items()})
+
+
 def _read(value: object) -> object:
     """Read command-line text as JSON where it is JSON ("64", "[64, 64]", "true"), else as it stands."""
     if not isinstance(value, str):

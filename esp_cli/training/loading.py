@@ -19,7 +19,7 @@ from esp_cli.files.documents import one_sentence, validate
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import build_environment
-from esp_cli.training.config import RunConfig, resolve_task_settings
+from esp_cli.training.config import RunConfig, completed, resolve_task_settings
 from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
 from esp_cli.training.streams import generators
@@ -71,7 +71,7 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         raise ValueError(f"{source}: {error}") from None
     _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
     _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)
-    return config
+    return completed(config)
 
 
 def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:

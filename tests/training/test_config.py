@@ -11,7 +11,7 @@ from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
 from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.prior import PriorConfig
-from esp_cli.training.config import EvaluationConfig, RunConfig, resolve_config
+from esp_cli.training.config import EvaluationConfig, RunConfig, completed, resolve_config
 from esp_cli.training.loading import parse_config
 
 
@@ -209,3 +209,11 @@ def test_a_configuration_cannot_be_changed_afterwards():
     config = resolve_config("navigation")
     with pytest.raises(ValueError, match="frozen"):
         config.steps = 5
+
+
+def test_a_stored_configuration_gets_the_settings_that_came_later_and_keeps_its_own() -> None:
+    now = resolve_config("navigation", overrides={"task.num_agents": 4, "mappo.learning_rate": 1e-3})
+    left_out = {"task_settings": {"wind"}, "algorithm_settings": {"gamma"}}
+    then = RunConfig.model_validate(now.model_dump(exclude=left_out))
+    assert then != now
+    assert completed(then) == now
