@@ -81,8 +81,8 @@ class SeedAdam:
     def gradient(self, loss: Tensor) -> Tensor:
         """Return the gradients [S, P] of the losses [S] of all seeds."""
         parameters = self.parameters.parameters
-        ones = torch.ones_like(loss)
-        found = torch.autograd.grad(loss, parameters, ones, allow_unused=True, materialize_grads=True)
+        # of a scalar: with gradients given for a vector, torch imports sympy, which takes a second
+        found = torch.autograd.grad(loss.sum(), parameters, allow_unused=True, materialize_grads=True)
         return self.parameters.flat(found)
 
     @torch.no_grad()

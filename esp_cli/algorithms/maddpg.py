@@ -181,7 +181,7 @@ class Maddpg(OffPolicyLearner):
         mask = copies.originals.mask
         share = mask / mask.flatten(1).sum(1).clamp_min(1).view(-1, 1, 1)
         by_value = copies.repeated(share).unsqueeze(-1).mul(-self._value_scale / (learned.shape[3] * value.shape[3]))
-        (by_action,) = torch.autograd.grad(value, action, by_value.expand(value.shape))
+        (by_action,) = torch.autograd.grad((value * by_value).sum(), action)
         by_action = by_action.flatten(1, 2).permute(0, 2, 3, 1).unflatten(3, (learned.shape[3], -1))
 
         weights = ActorWeights(
