@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,14 @@ BROKEN = [
     ("navigation", {"mud": 0.5}, "flip-x*agents"),
     ("navigation", {"weak_agent": 0.5}, "d4"),
     ("navigation", {"wind": 0.3, "gust_mean": 1.0}, "c1*agents"),
+    ("navigation", {"action_turn_rad": 0.5}, "c4*agents"),
+    ("navigation", {"action_turn_rad": 0.5, "actions": "continuous"}, "c4*agents"),
+    ("navigation", {"reward_offset": 0.3}, "flip-x*agents"),
+    ("navigation", {"reward_offset": 0.3, "convention": "pettingzoo"}, "flip-x*agents"),
+    ("navigation", {"action_turn_rad": 0.5, "reward_offset": 0.3}, "c1*agents"),
     ("predator-prey", {"wind": 0.3}, "flip-x*agents"),
+    ("predator-prey", {"action_turn_rad": 0.5, "prey": "still"}, "c4*agents"),
+    ("predator-prey", {"reward_offset": 0.1, "prey": "still"}, "flip-x*agents"),
     ("predator-prey", {"gust_mean": 1.0}, "flip-diagonal*agents"),
     ("predator-prey", {"mud": 0.5, "prey": "still"}, "flip-x*agents"),
     ("predator-prey", {"weak_agent": 0.5, "prey": "still"}, "d4"),
@@ -48,14 +56,16 @@ def test_the_check_finds_the_group_that_is_declared_to_be_left(task: str, settin
     spec = make(task, 1, [0], settings).spec
     swap = "agents-" + "-".join(map(str, [1, 0, *range(2, spec.num_agents)]))
     report = check_symmetry(lambda n, seeds: make(task, n, seeds, settings), f"d4,{swap}")
-    assert spec.symmetry == left.replace("d4", "d4" if settings.get("actions") != "continuous" else "o2")
+    continuous = settings.get("actions") == "continuous"
+    assert spec.symmetry == (left.replace("d4", "o2").replace("c4", "so2") if continuous else left)
     assert report.holds, "what is declared to be left holds"
     assert report.found == left, "and nothing more does"
     assert {"rot90", swap} <= carried(spec), "a prior may use the whole group all the same"
 
 
-def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path) -> None:
-    settings = {"prey": "policy", "prey_policy": write(tmp_path / "prey.safetensors"), "prey_policy_seed": 1}
+@pytest.mark.parametrize("prey", [{"prey": "policy"}, {"learned_prey": 0.5, "prey": "still"}], ids=str)
+def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path, prey) -> None:
+    settings = prey | {"prey_policy": write(tmp_path / "prey.safetensors"), "prey_policy_seed": 1}
     report = check_symmetry(lambda n, seeds: make("predator-prey", n, seeds, settings), "d4")
     assert report.declared == "c1"
     outcomes = {element.element: element.outcome for element in report.elements}
@@ -97,6 +107,81 @@ def test_a_gust_with_a_mean_pushes_along_both_axes() -> None:
 
 def test_mud_slows_on_one_side_alone() -> None:
     assert still("navigation", mud=0.5) == pytest.approx(torch.tensor([[0.375] * 2, [0.375] * 2, [0.75] * 2]))
+
+
+def test_a_turned_action_pushes_elsewhere_and_turned_actions_do_not_push_others() -> None:
+    for actions in ("discrete", "continuous"):
+        env = make("navigation", 1, [0], {"action_turn_rad": math.pi / 6, "actions": actions})
+        state = torch.zeros(env.state_shape)
+        state[..., env.spec.state.slices()["position"]] = torch.tensor([0.0, 0.0, 3.0, 3.0, 6.0, 6.0])
+        env.set_state(state)
+        right = (
+            torch.full(env.action_shape, 2) if actions == "discrete" else torch.tensor([1.0, 0.0]).expand(1, 1, 3, 2)
+        )
+        moved = env.step(right).next.state[0, 0, :6].view(3, 2)
+        assert moved == pytest.approx(torch.tensor([[0.5 * 3**0.5 / 2, 0.25]] * 3))
+    env = make("predator-prey", 1, [0], {"action_turn_rad": 1.0, "prey": "still"})
+    env.reset()
+    start = env.set_state(state := torch.arange(20.0).expand(1, 1, 20)).state
+    assert torch.equal(start, state)
+    after = env.step(torch.full(env.action_shape, 2)).next.state[0, 0]
+    plain = make("predator-prey", 1, [0], {"prey": "still"})
+    plain.reset()
+    plain.set_state(state)
+    same = plain.step(torch.full(env.action_shape, 2)).next.state[0, 0]
+    assert torch.equal(after[6:8], same[6:8]), "the prey's own force is not turned"
+    assert not torch.equal(after[:6], same[:6])
+
+
+def test_the_reward_counts_places_to_the_right() -> None:
+    """One agent on its landmark, or 0.3 right of it: distances 0.3 and 0 where the reward is 0.3 off."""
+    env = make("navigation", 1, [0], {"reward_offset": 0.3, "num_agents": 1, "num_landmarks": 1})
+    rewards = []
+    for x in (0.0, 0.3):
+        env.set_state(torch.tensor([0.0, 0.0, x, 0.0, 0.0, 0.0]).expand(1, 1, 6))
+        step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
+        rewards.append(float(step.reward[0, 0, 0]) + 1)  # the collision with oneself
+        assert float(step.metrics["coverage"]) == (x == 0.3)
+    assert rewards == pytest.approx([-0.3, 0.0], abs=1e-6)
+    env = make("predator-prey", 1, [0], {"reward_offset": 0.5, "prey": "still", "num_predators": 2, "num_obstacles": 0})
+    env.set_state(torch.tensor([0.0] * 6 + [0.5, 0.0, -0.5, 0.0, 0.0, 0.0]).expand(1, 1, 12))
+    step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
+    assert float(step.metrics["touches"]) == 1, "who is right of the prey, and not who is left of it"
+
+
+def test_heuristics_know_where_forces_and_rewards_point() -> None:
+    """The reference policies reach their goals with actions that are turned and landmarks that are off."""
+
+    def distance(**settings: float) -> float:
+        env = make("navigation", 64, [0], {"actions": "continuous", **settings})
+        env.reset()
+        return float(
+            torch.stack([env.step(env.heuristic()).metrics["landmark_distance"] for _ in range(25)])[-1].mean()
+        )
+
+    plain = distance()
+    assert distance(action_turn_rad=1.5) == pytest.approx(plain, rel=0.02)
+    assert distance(reward_offset=0.3) == pytest.approx(plain, rel=0.1)
+
+
+def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:
+    """Seed 0 of the file always moves up; a still prey else stays."""
+    settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.25}
+    env = make("predator-prey", 256, [0, 1], settings)
+    env.reset()
+    nothing, velocity = torch.zeros(env.action_shape, dtype=torch.int64), slice(6, 8)
+    saved = env.state_dict()
+    first = env.step(nothing).next.state[..., velocity]
+    assert float((first[..., 1] > 0.35).float().mean()) == pytest.approx(0.25, abs=0.06)
+    env.load_state_dict(saved)
+    assert torch.equal(env.step(nothing).next.state[..., velocity], first)
+    alone = make("predator-prey", 256, [1], settings)
+    alone.reset()
+    assert torch.equal(alone.step(nothing[1:]).next.state[0, :, velocity], first[1])
+    with pytest.raises(ValueError, match="give both or neither"):
+        make("predator-prey", 1, [0], {"learned_prey": 0.5})
+    with pytest.raises(ValueError, match="leave learned_prey out"):
+        make("predator-prey", 1, [0], settings | {"prey": "policy"})
 
 
 def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() -> None:

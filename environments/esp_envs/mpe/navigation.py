@@ -97,7 +97,8 @@ class Navigation(ParticleTask):
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections of the plane; five discrete moves
     carry those of the square (`d4`), a planar force carries all (`o2`). Settings that break it leave: `wind` and `mud`
-    the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents.
+    the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents,
+    `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the landmarks) `flip-x`.
 
     Heuristics: `greedy` (each agent takes a landmark of its own), `cover` (agents share out all landmarks
     between them, for L > N).
@@ -146,7 +147,7 @@ class Navigation(ParticleTask):
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy` (default) or `cover`."""
         worlds, agents = self.worlds, self.settings.num_agents
-        position, landmark = worlds.position, worlds.entity[agents:]
+        position, landmark = worlds.position, worlds.entity[agents:] + self._shift
         assign = covering.one_each if self.named_heuristic(name) == "greedy" else covering.shared_out
         goal = assign(position, landmark)
         return self._to_action(covering.approach(goal, position, worlds.velocity))
@@ -173,7 +174,8 @@ class Navigation(ParticleTask):
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
         bumps = (self.worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
         collisions = bumps.sum(0)
-        nearest = self._to_landmarks.amin(0).sqrt_()
+        apart = self._squared_to(self.worlds.entity[agents:]) if self.settings.reward_offset else self._to_landmarks
+        nearest = apart.amin(0).sqrt_()
         distance = nearest.sum(0)
         if self.settings.convention == "esp":
             reward = (distance * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)

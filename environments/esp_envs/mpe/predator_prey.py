@@ -68,7 +68,8 @@ class PredatorPrey(ParticleTask):
             full force in a uniform direction. All are drawn at the start of an episode: `prey_moves`.
         fleeing: runs from the nearest predator, and back to the origin when farther than 0.9 from it.
         still: exerts no force (it can be pushed).
-        policy: a frozen learned prey, read from a file.
+        policy: a frozen learned prey, read from a file. With `learned_prey` = p another prey follows that file with
+            probability p at each step, drawn at the start of an episode.
 
     Start: velocities zero, all agents uniform in [-1, 1]^2, obstacles uniform in [-0.9, 0.9]^2. Conventions differ in
     the order of integration only: `esp` updates the velocity first (original MPE), `pettingzoo` the position (mpe2).
@@ -78,9 +79,11 @@ class PredatorPrey(ParticleTask):
     Metrics a step: `contact` (1 where any predator touches the prey), `touches` (their number).
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
-    `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`) need not be
-    equivariant: then nothing is declared to be left. Other settings that break the symmetry leave: `wind` and `mud` the
-    mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of predators.
+    `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`,
+    `learned_prey`) need not be equivariant: then nothing is declared to be left. Other settings that break the symmetry
+    leave: `wind` and `mud` the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the
+    exchange of predators, `action_turn_rad` the rotations, `reward_offset` (who touches a place right of the prey is
+    rewarded) the mirror `flip-x`.
 
     Heuristics: `greedy` (predators run at the prey; with `control="prey"`: the fleeing prey).
 
@@ -114,6 +117,8 @@ class PredatorPrey(ParticleTask):
         first_learner = predators if self._prey_learns else 0
         self._build(predator_prey_spec(settings), bodies, full_gain, first_learner)
         self._prey_plan = torch.zeros(settings.horizon, 2, self.worlds.num_lanes, device=self.device)
+        follows = (settings.horizon, self.worlds.num_lanes) if settings.learned_prey else (0,)
+        self._follows = torch.zeros(follows, dtype=torch.bool, device=self.device)
         self._frozen: FrozenPrey | None = None
         if settings.prey_policy is not None:
             width = prey_layout(settings).width
@@ -169,13 +174,16 @@ class PredatorPrey(ParticleTask):
         return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return physics, clock, generators and the random prey's plan."""
-        return super().state_dict() | {"prey_moves": self.prey_moves.clone(memory_format=torch.contiguous_format)}
+        """Return physics, clock, generators, the random prey's plan, and when it follows its policy, if it has one."""
+        plan = {"prey_moves": self.prey_moves.clone(memory_format=torch.contiguous_format)}
+        return super().state_dict() | plan | ({"follows": self._follows.clone()} if self.settings.learned_prey else {})
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
         super().load_state_dict(tensors)
         self.prey_moves.copy_(tensors["prey_moves"])
+        if self.settings.learned_prey:
+            self._follows.copy_(tensors["follows"])
 
     def _split(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return velocities and positions of predators and prey, and obstacles, each [..., items, 2]."""
@@ -187,9 +195,11 @@ class PredatorPrey(ParticleTask):
     def _start(self, seed: int, lanes: slice) -> None:
         generator = self.generators[seed]
         place(self.worlds, lanes, self._extents, generator)
+        shape, device = (self.settings.horizon, self.num_envs), self.device
+        if share := self.settings.learned_prey:
+            self._follows[:, lanes] = torch.rand(shape, generator=generator, device=device) < share
         if self._prey_learns or self.settings.prey != "random":
             return
-        shape, device = (self.settings.horizon, self.num_envs), self.device
         move = torch.randint(MOVES.count, shape, generator=generator, device=device)
         if self.settings.actions == "discrete":
             plan = self._move_control(move)
@@ -207,9 +217,13 @@ class PredatorPrey(ParticleTask):
             self._control[predators] = self._prey_plan[self._time]
         elif self.settings.prey == "fleeing":
             self._control[predators:] = self._as_control(self._flight())
-        elif self._frozen is not None:
+        elif self.settings.prey == "still":
+            self._control[predators:] = 0.0
+        if self._frozen is not None:
             moves = self._frozen.moves(self.prey_observation_of(self.worlds.rows().t()))
-            self._control[predators:, :, : self.worlds.num_worlds] = self._move_control(moves.unsqueeze(0))
+            learned, control = self._move_control(moves.unsqueeze(0)), self._control[predators:, :, : len(moves)]
+            follows = self._follows[self._time, : len(moves)] if self.settings.learned_prey else None
+            control.copy_(learned if follows is None else torch.where(follows, learned, control))
 
     def _as_control(self, wish: Tensor) -> Tensor:
         return self._move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)
@@ -217,7 +231,8 @@ class PredatorPrey(ParticleTask):
     def _chase(self) -> Tensor:
         predators, worlds = self.settings.num_predators, self.worlds
         position, velocity = worlds.position, worlds.velocity
-        return chase(position[:predators], velocity[:predators], position[predators], velocity[predators])
+        aim = position[predators] + self._shift
+        return chase(position[:predators], velocity[:predators], aim, velocity[predators])
 
     def _flight(self) -> Tensor:
         predators, position = self.settings.num_predators, self.worlds.position
@@ -225,7 +240,10 @@ class PredatorPrey(ParticleTask):
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         predators = self.settings.num_predators
-        touching = self.worlds.squared_contact_distance[:predators] < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
+        apart = self.worlds.squared_contact_distance[:predators]
+        if self.settings.reward_offset:
+            apart = self._squared_to(self.worlds.position[predators:])[:predators, 0]
+        touching = apart < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
         touches = touching.float().sum(0)
         metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
         reward = touches * TOUCH_REWARD

@@ -24,16 +24,33 @@ class PredatorPreySettings(ParticleSettings):
         "random", description="who drives the prey while the predators learn"
     )
     prey_policy: str | None = Setting(
-        None, max_length=255, description="safetensors policy file, for prey 'policy' only"
+        None, max_length=255, description="safetensors policy file, for prey 'policy' or a learned_prey above 0"
     )
     prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
+    learned_prey: float = Setting(
+        0.0, ge=0, le=1, description="breaks symmetry: probability of a step in which the prey follows prey_policy"
+    )
+
+    @property
+    def turns(self) -> str:
+        """The rotations that actions, dynamics and reward carry; the learning prey's bounds are a square."""
+        return "c4" if self.control == "prey" else super().turns
+
+    @property
+    def breakings(self) -> tuple[Breaking, ...]:
+        """What breaks the symmetry, with the group that is left."""
+        return (*super().breakings, Breaking("learned_prey", self.learned_prey, "c1", agents=False))
 
     @model_validator(mode="after")
     def _policy_goes_with_its_file(self) -> PredatorPreySettings:
-        if self.control == "prey" and self.prey != "random":
-            raise ValueError("with control 'prey' the prey is the learner; leave the setting prey out")
-        if (self.prey == "policy") != (self.prey_policy is not None):
-            raise ValueError("prey 'policy' and the file prey_policy go together; give both or neither")
+        if self.control == "prey" and (self.prey != "random" or self.learned_prey):
+            raise ValueError("with control 'prey' the prey is the learner; leave prey and learned_prey out")
+        if self.prey == "policy" and self.learned_prey:
+            raise ValueError("prey 'policy' follows its file at every step; leave learned_prey out")
+        if (self.prey == "policy" or self.learned_prey > 0) != (self.prey_policy is not None):
+            raise ValueError(
+                "the file prey_policy and prey 'policy', or a learned_prey above 0, go together; give both or neither"
+            )
         return self
 
 
@@ -44,8 +61,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
     opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
     whole = "d4*agents" if discrete or prey_learns else "o2*agents"
-    learned = Breaking("learned prey", float(settings.prey == "policy"), "c1", agents=False)
-    breakings = (*settings.breakings, learned)
+    always = Breaking("prey", float(settings.prey == "policy"), "c1", agents=False)
     return TaskSpec(
         name="predator-prey",
         version=1,
@@ -55,7 +71,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
         observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
         state=_state_layout(settings),
         action=MOVES if discrete else FORCE,
-        symmetry=remaining(whole, breakings),
+        symmetry=remaining(whole, (*settings.breakings, always)),
         nearly=whole,
         shared_reward=True,
         settings=settings.model_dump(),

@@ -5,6 +5,7 @@ All random numbers of an episode are drawn at its start, from each seed's own ge
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Literal
@@ -52,6 +53,17 @@ class ParticleSettings(TaskSettings):
     weak_agent: float = Setting(
         0.0, ge=0, lt=1, description="breaks the exchange of agents: share of its force that the first one lacks"
     )
+    action_turn_rad: float = Setting(
+        0.0, ge=0, le=3, description="breaks mirrors: the learners' forces are turned by this angle, which nobody sees"
+    )
+    reward_offset: float = Setting(
+        0.0, ge=0, le=10, description="breaks symmetry: the reward counts places that lie so far to the right, lengths"
+    )
+
+    @property
+    def turns(self) -> str:
+        """The rotations that actions, dynamics and reward carry."""
+        return "c4" if self.actions == "discrete" else "so2"
 
     @property
     def breakings(self) -> tuple[Breaking, ...]:
@@ -62,6 +74,8 @@ class ParticleSettings(TaskSettings):
             Breaking("gust_std", self.gust_std, None),
             Breaking("mud", self.mud, "flip-x"),
             Breaking("weak_agent", self.weak_agent, None, agents=False),
+            Breaking("action_turn_rad", self.action_turn_rad, self.turns),
+            Breaking("reward_offset", self.reward_offset, "flip-x"),
         )
 
     def gains(self, *full: float) -> tuple[float, ...]:
@@ -95,6 +109,7 @@ class ParticleTask(LockstepTask):
         self._push = push if settings.wind or settings.gust_mean else None
         gusts = (spec.horizon, bodies.num_agents, 2, lanes) if settings.gust_std else (0,)
         self._gusts = torch.zeros(gusts, device=self.device)
+        self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
         self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
 
     @abstractmethod
@@ -175,6 +190,11 @@ class ParticleTask(LockstepTask):
         obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
         return Observation(obs, rows.contiguous().view(*lead, -1))
 
+    def _squared_to(self, target: Tensor) -> Tensor:
+        """Return the squared distances [N, K, W'] of the first agents to where the reward counts targets [K, 2, W']."""
+        square = (self.worlds.position.unsqueeze(1) - (target + self._shift)).square_()
+        return square[:, :, 0] + square[:, :, 1]
+
     def _act(self, action: Tensor) -> None:
         """Write the learners' actions into the controls."""
         learners, worlds = self.spec.num_agents, self.worlds.num_worlds
@@ -186,11 +206,13 @@ class ParticleTask(LockstepTask):
             force = action.reshape(worlds, learners, 2)
             length = force.norm(dim=-1, keepdim=True).clamp_min(1.0)
             self._learner_control[:, :, :worlds] = (force / length).permute(1, 2, 0)
+        if self.settings.action_turn_rad:
+            self._learner_control.copy_(_turned(self._learner_control, self.settings.action_turn_rad))
 
     def _to_action(self, wish: Tensor) -> Tensor:
         """Turn wishes [N, 2, W'] (1 is a full force) into a joint action of this task's kind."""
         lead = (self.num_seeds, self.num_envs, self.spec.num_agents)
-        wish = wish[:, :, : self.worlds.num_worlds]
+        wish = _turned(wish[:, :, : self.worlds.num_worlds], -self.settings.action_turn_rad)
         if self.settings.actions == "discrete":
             return nearest_move(wish).t().reshape(lead)
         return unit_disc(wish).permute(2, 0, 1).reshape(*lead, 2)
@@ -202,6 +224,15 @@ class ParticleTask(LockstepTask):
     def _per_world(self, values: Tensor) -> Tensor:
         """Return [S, E, ...] of the real worlds from [W', ...], as memory of its own."""
         return values[: self.worlds.num_worlds].contiguous().view(self.num_seeds, self.num_envs, *values.shape[1:])
+
+
+def _turned(force: Tensor, angle: float) -> Tensor:
+    """Return forces [N, 2, W] turned counter-clockwise by an angle, rad."""
+    if angle == 0:
+        return force
+    x, y = force.unbind(1)
+    cos, sin = math.cos(angle), math.sin(angle)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], 1)
 
 
 MOVE_THRESHOLD = 0.25
