@@ -42,23 +42,24 @@ def check_by_regression(
         elements: to try.
         tolerated: gap up to which a field holds.
     """
+    half = len(data.obs) // 2
+    first = Transitions(*(part[:half] for part in vars(data).values() if part is not None))
     rows = _rows(spaces, data)
-    return [_judged(element, spaces, data, rows, tolerated) for element in elements]
+    for_each, for_all = _Plain(*rows, shared=False), _Plain(*rows, shared=True)
+    verdicts = []
+    for element in elements:
+        plain = for_all if element.permutation is None else for_each
+        gap = plain.worsening(*_rows(spaces, turned(first, build_transform([element], spaces))))
+        verdicts.append(ElementVerdict(element.name, False, _fields(spaces, gap, rows[1], tolerated)))
+    return verdicts
 
 
-def _judged(
-    element: Element, spaces: Spaces, data: Transitions, rows: tuple[Tensor, Tensor], tolerated: float
-) -> ElementVerdict:
-    parts = [*rows, *_rows(spaces, turned(data, build_transform([element], spaces)))]
-    if element.permutation is None:  # agents stay, and one regression serves them all
-        parts = [part.flatten(1, 2).unsqueeze(2) for part in parts]
-    gap, outputs = _excess(*parts), parts[1]
+def _fields(spaces: Spaces, gap: Tensor, outputs: Tensor, tolerated: float) -> tuple[FieldVerdict, ...]:
     names = spaces.observation.slices() | {"reward": slice(spaces.observation.width, spaces.observation.width + 1)}
-    verdicts = [
+    return tuple(
         _field(name if name == "reward" else f"obs.{name}", gap[:, where], outputs[..., where], tolerated)
         for name, where in names.items()
-    ]
-    return ElementVerdict(element.name, False, tuple(verdicts))
+    )
 
 
 def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
@@ -85,29 +86,38 @@ def _field(name: str, excess: Tensor, outputs: Tensor, tolerated: float) -> Fiel
     return FieldVerdict(name, "broken" if gap > tolerated else "holds", gap, error)
 
 
-def _excess(inputs: Tensor, outputs: Tensor, copied_inputs: Tensor, copied_outputs: Tensor) -> Tensor:
-    """Return by how much copies worsen the prediction of each held-out episode, [M / 2, outputs].
+class _Plain:
+    """The regressions of the first half of the episodes, and how well they predict the second."""
 
-    Args:
-        inputs: [M, T, A, features], one regression for each of the A agents.
-        outputs: [M, T, A, outputs].
-        copied_inputs: the same of the transformed transitions.
-        copied_outputs: likewise.
-    """
-    half = len(inputs) // 2
-    own = _moments(inputs[:half], outputs[:half])
-    copied = _moments(copied_inputs[:half], copied_outputs[:half])
-    together = (own[0] + copied[0], own[1] + copied[1])
-    errors = []
-    for gram, cross in (own, together):
+    def __init__(self, inputs: Tensor, outputs: Tensor, shared: bool) -> None:
+        """Fit.
+
+        Args:
+            inputs: [M, T, A, features].
+            outputs: [M, T, A, outputs].
+            shared: one regression serves all agents; else each of the A agents has its own.
+        """
+        self._shared = shared
+        half = len(inputs) // 2
+        self._held = self._arranged(inputs[half:]), self._arranged(outputs[half:])
+        self._own = self._moments(inputs[:half], outputs[:half])
+        self._errors = self._error(*self._own)
+
+    def worsening(self, inputs: Tensor, outputs: Tensor) -> Tensor:
+        """Return by how much copies [M / 2, T, A, ...] worsen predictions of held-out episodes, [M / 2, outputs]."""
+        gram, cross = self._moments(inputs, outputs)
+        return self._error(self._own[0] + gram, self._own[1] + cross) - self._errors
+
+    def _error(self, gram: Tensor, cross: Tensor) -> Tensor:
         ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
         weights = torch.linalg.solve(gram + ridge, cross).float()
-        predicted = torch.einsum("mtaf,afo->mtao", inputs[half:], weights)
-        errors.append((predicted - outputs[half:]).double().square().mean((1, 2)))
-    return errors[1] - errors[0]
+        predicted = torch.einsum("mtaf,afo->mtao", self._held[0], weights)
+        return (predicted - self._held[1]).double().square().mean((1, 2))
 
+    def _moments(self, inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return X^T X and X^T Y of each regression, in float64."""
+        x, y = (self._arranged(part).flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
+        return (x.mT @ x).double(), (x.mT @ y).double()
 
-def _moments(inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return X^T X and X^T Y of each agent, in float64."""
-    x, y = (part.flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
-    return (x.mT @ x).double(), (x.mT @ y).double()
+    def _arranged(self, part: Tensor) -> Tensor:
+        return part.flatten(1, 2).unsqueeze(2) if self._shared else part

@@ -27,7 +27,7 @@ STATES = 10_000
 """On which the observations built from poses are compared with the task's."""
 TOLERANCE = 1e-5
 """Largest difference of an observation's number; float32 in metres gives 1e-6."""
-_WORLDS = 200
+_WORLDS = 100
 _JITTER_M = 0.001
 """Of positions that are met in the task: in a perfect square two robots are equally near."""
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0, "heading_offset_rad": 0.0, "blind_sector_rad": 0.0}
@@ -54,13 +54,13 @@ class Scenes:
 @torch.no_grad()
 def take_scenes(alone: TrainedPolicy, count: int = STATES) -> Scenes:
     """Put the task into states: one half that the policy meets, one half drawn anywhere in the arena."""
-    worlds = min(count, _WORLDS)
+    worlds = min(-(-count // 2), _WORLDS)
     exact = alone.config.model_copy(update={"task_settings": dict(alone.config.task_settings) | _EXACT})
     played, probe = build_environment(alone.config, worlds, "export"), build_environment(exact, worlds, "shape")
     observation, rng, parts = played.reset(), np.random.default_rng(0), []
     memory = alone.policy.initial_memory(worlds, observation.obs)
-    for k in range(-(-count // worlds)):
-        parts.append(_probe(probe, observation.state[0].numpy(), rng, met=k % 2 == 0))
+    for _ in range(-(-count // (2 * worlds))):
+        parts += [_probe(probe, observation.state[0].numpy(), rng, met) for met in (True, False)]
         for _ in range(5):
             action, memory = alone.policy.act(observation.obs, memory)
             observation = played.step(action).next

@@ -65,7 +65,7 @@ def paths(episode: Episode, title: str, size: int) -> Figure:
 
 
 def coverage(episode: Episode, title: str, size: int, period_s: float) -> Figure:
-    """Draw the paths of an episode, and below them by whom each body with a reach is covered at which time."""
+    """Draw the paths of an episode, and below them when each agent covers each body with a reach."""
     last = episode.scenes[-1]
     wanted = [k for k, body in enumerate(last.bodies) if body.reach is not None]
     rows = 0.28 * len(wanted) + 0.75
