@@ -4,9 +4,8 @@
 
 The older commit is checked out beside the working tree, in a temporary folder. Each round runs every case once with the
 old and once with the new code, each in a process of its own. A case of training is `esp train`; its rate is the median
-over its iterations, taken from the times in metrics.jsonl. A case "seconds to ..." counts from the start of the process
-to the evaluation that first reaches a return. The figure of a case is the median over the rounds of new / old rates, or
-of old / new seconds; above 1 the working tree is faster. Ratios mean something on an idle machine only.
+over its iterations, taken from the times in metrics.jsonl. The figure of a case is the median over the rounds of
+new / old; above 1 the working tree is faster. Ratios mean something on an idle machine only.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatch
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -52,7 +51,6 @@ class Training:
     seeds: int
     steps: int
     end_to_end: bool = False
-    unit: ClassVar[str] = "steps/s"
 
     def measure(self, tree: Path, folder: Path) -> float:
         """Return seed-steps per second with the code of `tree`."""
@@ -68,51 +66,10 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Solving:
-    """A run of `esp train` from nothing until its mean greedy return reaches a threshold.
-
-    Attributes:
-        options: of the command line.
-        seeds: trained at once.
-        threshold: return of the task's convention, mean over 320 episodes of all seeds together.
-        steps: environment steps per seed of the whole run, which schedules know.
-        every: environment steps per seed between evaluations.
-    """
-
-    options: str
-    seeds: int
-    threshold: float
-    steps: int = 1_000_000
-    every: int = 10_000
-    unit: ClassVar[str] = "s"
-
-    def measure(self, tree: Path, folder: Path) -> float:
-        """Return the seconds from the start of the process to the evaluation that reaches the threshold.
-
-        Raises:
-            RuntimeError: the run ends before.
-        """
-        size = ("--seeds", str(self.seeds), "--steps", str(self.steps), "--out", "run")
-        evaluation = f"--set evaluation.every_steps={self.every} --set evaluation.episodes={320 // self.seeds}"
-        begin = time.perf_counter()
-        command = [sys.executable, *ESP, "train", *self.options.split(), *evaluation.split(), *size]
-        quiet = subprocess.DEVNULL
-        with subprocess.Popen(command, cwd=folder, env=paths(tree), stdout=quiet, stderr=quiet) as process:
-            while not reaches(folder / "run" / "metrics.jsonl", self.threshold):
-                if process.poll() is not None:
-                    raise RuntimeError(f"esp train {self.options} ends without a return of {self.threshold:g}")
-                time.sleep(0.05)
-            seconds = time.perf_counter() - begin
-            process.terminate()
-        return seconds
-
-
-@dataclass(frozen=True)
 class Worlds:
     """The worlds of a task alone, measured by the tree's own env_speed.py."""
 
     task: str
-    unit: ClassVar[str] = "steps/s"
 
     def measure(self, tree: Path, folder: Path) -> float:
         """Return environment steps per second with the code of `tree`."""
@@ -121,7 +78,7 @@ class Worlds:
         return float(json.loads((folder / "speed.json").read_text())["records"][0]["steps_per_second"])
 
 
-Case = Training | Solving | Worlds
+Case = Training | Worlds
 
 
 def _cases() -> Iterator[tuple[str, Case]]:
@@ -148,23 +105,9 @@ def _cases() -> Iterator[tuple[str, Case]]:
     yield "formation, esp train end to end, 1 seed", Training("--task formation", 1, 48_000, end_to_end=True)
     for task in ("navigation", "predator-prey", "wildlife"):
         yield f"{task} worlds", Worlds(task)
-    for seeds in ("1 seed", "10 seeds"):
-        yield f"seconds to -115, navigation, {seeds}", Solving("", int(seeds.split()[0]), -115)
-    for algorithm in ("maddpg", "qmix"):
-        yield f"seconds to -115, navigation, {algorithm}, 1 seed", Solving(f"--algo {algorithm}", 1, -115)
-    yield "seconds to 85, predator-prey, 1 seed", Solving("--task predator-prey", 1, 85)
-    tight = "--task formation --set task.convention=tight"
-    yield "seconds to 218, formation, tight, 1 seed", Solving(tight, 1, 218, every=24_000)
 
 
 CASES: dict[str, Case] = dict(_cases())
-
-
-def reaches(metrics: Path, threshold: float) -> bool:
-    """Return whether a run has evaluated itself to a mean greedy return of at least `threshold`."""
-    lines = metrics.read_text().splitlines() if metrics.exists() else []
-    returns = [json.loads(line).get("eval/return_greedy") for line in lines if line.endswith("}")]
-    return any(statistics.fmean(values) >= threshold for values in returns if values and None not in values)
 
 
 def steps_per_second(rows: Iterable[Mapping[str, Any]]) -> float:
@@ -217,11 +160,6 @@ def measure(case: Case, tree: Path) -> float:
         return case.measure(tree, Path(folder))
 
 
-def speedup(case: Case, old: float, new: float) -> float:
-    """Return how many times as fast the new code is: by rates, or by seconds."""
-    return old / new if case.unit == "s" else new / old
-
-
 def use(tree: Path) -> None:
     """Check that Python finds the code of `tree`, and leave it compiled.
 
@@ -255,18 +193,16 @@ def main() -> None:
             for name in names:
                 for side, tree in trees.items():
                     rates[name][side].append(measure(CASES[name], tree))
-                last = speedup(CASES[name], rates[name]["old"][-1], rates[name]["new"][-1])
+                last = rates[name]["new"][-1] / rates[name]["old"][-1]
                 print(f"round {turn + 1} of {args.rounds}: {name}: {last:.2f}", file=sys.stderr, flush=True)
     ratios = {
-        name: statistics.median(speedup(CASES[name], *pair) for pair in zip(r["old"], r["new"], strict=True))
+        name: statistics.median(new / old for old, new in zip(r["old"], r["new"], strict=True))
         for name, r in rates.items()
     }
-    table = Table("case", "old", "new", "unit", "faster by", title=f"the working tree against {args.commit}")
+    table = Table("case", "old, steps/s", "new, steps/s", "faster by", title=f"the working tree against {args.commit}")
     for name, by_side in rates.items():
-        unit = CASES[name].unit
-        digits = 1 if unit == "s" else 0
-        old_rate, new_rate = (f"{statistics.median(values):,.{digits}f}" for values in by_side.values())
-        table.add_row(name, old_rate, new_rate, unit, f"{ratios[name]:.2f}")
+        old_rate, new_rate = (f"{statistics.median(values):,.0f}" for values in by_side.values())
+        table.add_row(name, old_rate, new_rate, f"{ratios[name]:.2f}")
     Console(width=100).print(table)
     if args.json:
         records = [{"case": name, "ratio": ratios[name], **rates[name]} for name in names]

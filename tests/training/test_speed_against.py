@@ -10,12 +10,9 @@ import pytest
 from tests.benchmarks.against import (
     CASES,
     NO_EVALUATION,
-    Solving,
     Training,
     measure,
     python,
-    reaches,
-    speedup,
     steps_per_second,
     use,
 )
@@ -51,32 +48,6 @@ def test_a_case_is_measured_with_the_code_of_a_tree(tmp_path: Path) -> None:
     assert measure(dataclasses.replace(training, end_to_end=True), ROOT) > 0
     with pytest.raises(RuntimeError, match="fails in"):
         python(ROOT, tmp_path, "-c", "raise SystemExit(1)")
-
-
-def test_a_run_is_solved_by_the_mean_of_an_evaluation_over_all_seeds(tmp_path: Path) -> None:
-    metrics = tmp_path / "metrics.jsonl"
-    assert not reaches(metrics, -100)
-    metrics.write_text(
-        '{"step":0,"eval/return_greedy":[-120,-90]}\n{"step":1,"train/return":[0,0]}\n{"step":2,"eval/re'
-    )
-    assert reaches(metrics, -105)
-    assert not reaches(metrics, -104.9)
-    metrics.write_text('{"step":0,"eval/return_greedy":[-1,null]}\n')
-    assert not reaches(metrics, -100), "a seed has stopped"
-
-
-def test_a_case_of_seconds_is_faster_by_old_over_new() -> None:
-    solving, training = (next(c for c in CASES.values() if isinstance(c, kind)) for kind in (Solving, Training))
-    assert speedup(solving, 30.0, 10.0) == 3.0
-    assert speedup(training, 10.0, 30.0) == 3.0
-
-
-@pytest.mark.slow
-def test_seconds_count_to_the_first_evaluation_that_reaches_the_threshold() -> None:
-    tiny = " ".join(f"--set {name}={value}" for name, value in TINY.items() if "eval" not in name)
-    assert 0 < measure(Solving(tiny, 1, -1000.0, steps=300, every=100), ROOT) < 100
-    with pytest.raises(RuntimeError, match="ends without a return of 0"):
-        measure(Solving(tiny, 1, 0.0, steps=300, every=100), ROOT)
 
 
 def test_code_from_elsewhere_is_not_taken_for_that_of_the_tree(tmp_path: Path) -> None:
