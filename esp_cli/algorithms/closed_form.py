@@ -79,8 +79,11 @@ def weights_of(config: Settings, entropy_coef: float, prior: PriorConfig, augmen
 
 
 def carries(transforms: Sequence[Transform]) -> bool:
-    """Return whether the closed forms know these transforms: where agents stay, and discrete actions change places."""
-    return all(g.agents is None and (g.action_index is None or isinstance(g.output_map, Gather)) for g in transforms)
+    """Return whether the closed forms know these transforms: all rows move, agents stay, discrete actions permute."""
+    return all(
+        g.is_uniform and g.agents is None and (g.action_index is None or isinstance(g.output_map, Gather))
+        for g in transforms
+    )
 
 
 def policy_gradient(

@@ -26,8 +26,8 @@ _HORIZON = 50
 def prepared(config: RunConfig) -> RunConfig:
     """Return a configuration with all that its prior leaves to be measured; others come back as they are.
 
-    Transforms "discovered" become what is found, and without a finding there is no prior. Where trust is "measured",
-    each element gets its weight. What was measured stands in the configuration: nothing is measured twice.
+    Transforms "discovered" become what is found, and without a finding there is no prior. Where trust is "measured" or
+    a "gate", each element gets its weight. What was measured stands in the configuration: nothing is measured twice.
     """
     prior = config.prior
     if prior.kind == "none":
@@ -38,7 +38,7 @@ def prepared(config: RunConfig) -> RunConfig:
             {"transforms": DISCOVERED + found} if found else {"kind": "none", "transforms": "d4"}
         )
         prior = prior.model_copy(update=change)
-    if prior.kind != "none" and prior.trust == "measured" and not prior.weights:
+    if prior.kind != "none" and prior.trust != "full" and not prior.weights:
         weights = {name: math.exp(-prior.doubt * gap) for name, gap in _breaking(_Maker(config), prior.transforms)}
         prior = prior.model_copy(update={"weights": weights})
     return config if prior is config.prior else config.model_copy(update={"prior": prior})
@@ -75,7 +75,7 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     elements = admitted_elements(transforms, spec)
     if isinstance(elements, Group):
         raise ValueError(
-            f"prior.trust=measured weighs each element, but '{transforms}' is sampled; choose a finite group"
+            f"prior.trust=measured or gate weighs each element, but '{transforms}' is sampled; choose a finite group"
         )
     if env.has("set_state"):
         return tuple((verdict.element, _worst(verdict)) for verdict in check_paired(make_worlds, elements))

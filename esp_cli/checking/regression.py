@@ -17,16 +17,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.checking.transitions import Transitions, regression_rows, turned
+from esp_cli.checking.transitions import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
+from esp_cli.prior.gate import inputs_of
 from esp_cli.symmetry import Element, build_transform
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Spaces
 
 TOLERATED = 2e-3
 """Gap below which an element counts as a symmetry of transitions."""
 _RIDGE = 1e-4
-_WIDEST = 160
-"""Up to so many numbers that all other agents see and do, what they see is looked at too; else what they do alone."""
 _STILL = 1e-10
 """Variance below which a field does not change, so that it says nothing."""
 
@@ -63,17 +62,12 @@ def _fields(spaces: Spaces, gap: Tensor, outputs: Tensor, tolerated: float) -> t
 
 
 def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
-    """Return `regression_rows` with what the other agents see and do, on which an agent's next observation depends.
+    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1].
 
-    Without it, others that prefer a direction would look like a task that does.
+    The inputs hold what the other agents see and do: else others that prefer a direction would look like a task that
+    does.
     """
-    inputs, outputs = regression_rows(spaces, data)
-    agents, width = spaces.num_agents, spaces.observation.width
-    acted = spaces.action.count - 1 if isinstance(spaces.action, Discrete) else spaces.action.width
-    first = 1 if (agents - 1) * (width + acted) <= _WIDEST else 1 + width
-    others = [[j for j in range(agents) if j != i] for i in range(agents)]
-    beside = inputs[..., first : 1 + width + acted][:, :, others].flatten(3)
-    return torch.cat([inputs, beside], -1), outputs
+    return inputs_of(spaces, data.obs, data.action), outputs_of(data)
 
 
 def _field(name: str, excess: Tensor, outputs: Tensor, tolerated: float) -> FieldVerdict:

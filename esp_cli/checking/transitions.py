@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
+from esp_cli.prior.gate import own_inputs
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment
 from esp_envs.spec import Discrete, Spaces
@@ -25,8 +25,6 @@ from esp_envs.spec import Discrete, Spaces
 EPISODES = 2048
 STEPS = 8
 """Steps of each episode that are looked at."""
-_WIDEST = 48
-"""Up to so many numbers of one agent, products of two of them are looked at too."""
 _ASYMMETRIC = 0.05
 """Shift of the starts, in standard deviations, from which an element is not covered."""
 _RIDGE = 1e-3
@@ -90,7 +88,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
         elements: to try.
     """
     half = len(data.obs) // 2
-    inputs, outputs = regression_rows(spaces, data)
+    inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
     model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
     held = Transitions(*(part[half:] for part in vars(data).values() if part is not None))
     return [_judge(element, spaces, held, model) for element in elements]
@@ -124,19 +122,11 @@ def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: 
     return judged(name, gap[:, live] / here[..., where].flatten(1).std(0)[live].clamp_min(1e-6), 1.0, moved)
 
 
-def regression_rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
-    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1] of each agent: change, reward and any mask."""
-    action = data.action
-    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
-    row = torch.cat([data.obs, acted], -1)
-    one = torch.ones_like(row[..., :1])
-    features = [one, row]
-    if row.shape[-1] <= _WIDEST:
-        first, second = torch.triu_indices(row.shape[-1], row.shape[-1])
-        features.append(row[..., first] * row[..., second])
+def outputs_of(data: Transitions) -> Tensor:
+    """Return what a regression predicts of each agent, [M, T, N, D + 1]: change, reward and any mask."""
     outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
     outputs += [] if data.action_mask is None else [data.action_mask.float()]
-    return torch.cat(features, -1), torch.cat(outputs, -1)
+    return torch.cat(outputs, -1)
 
 
 def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
@@ -149,7 +139,7 @@ def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
 
 def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
     """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1]."""
-    inputs, outputs = regression_rows(spaces, data)
+    inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
     residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
     action = spaces.action
     acted = action.count - 1 if isinstance(action, Discrete) else action.width

@@ -50,12 +50,13 @@ class PriorConfig(BaseModel):
         description="length of axes that policy and critic see too, and that turn with every transform; 0: none",
     )
 
-    trust: Literal["full", "measured"] = Field(
-        "full", description="weight of each element: 1, or by how far it is broken, measured before training"
+    trust: Literal["full", "measured", "gate"] = Field(
+        "full",
+        description="weight of a copy: 1, by how far its element is broken, or how far it is in this state and action",
     )
-    doubt: float = Field(2.0, ge=0, le=1000, description="an element that is off by b s.d. weighs exp(-doubt b)")
+    doubt: float = Field(2.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
-        {}, description="weight of each element by its name; filled in where trust is measured"
+        {}, description="weight of each element by its name; filled in where trust is measured or a gate"
     )
 
     @property
@@ -83,6 +84,6 @@ class PriorConfig(BaseModel):
         kind = self.kind
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
-        lost = loses[kind] | (set() if self.trust == "measured" else {"doubt", "weights"})
+        lost = loses[kind] | ({"doubt", "weights"} if self.trust == "full" else set())
         kept = {name: value for name, value in self if name not in lost}
         return PriorConfig(**{**kept, "kind": kind})

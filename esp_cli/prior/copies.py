@@ -72,8 +72,11 @@ class Copies(Generic[Rows]):
         """Cut the originals into pieces of at most `size`, each with its own copies."""
         if size >= self.originals.count:
             return [self]
-        parts = self.originals.chunks(size)
-        return [Copies(self.config, part, self.transforms, self.augments, self.adapt) for part in parts]
+        parts, starts = self.originals.chunks(size), range(0, self.originals.count, size)
+        return [
+            Copies(self.config, part, [g.part(at, at + size) for g in self.transforms], self.augments, self.adapt)
+            for at, part in zip(starts, parts, strict=True)
+        ]
 
     @property
     def batch(self) -> Rows:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.prior.copies import Copies, Divergent
-from esp_cli.prior.seed_batch import Rows
+from esp_cli.prior.gate import Gate, gated
+from esp_cli.prior.seed_batch import Rows, SeedBatch
 from esp_cli.symmetry import Transform, carried_groups, transform_set
 from esp_envs.spec import Spaces
 
@@ -38,6 +39,7 @@ class SymmetryPrior:
         augments: whether copies of a batch enter the learner's own loss.
         transforms: the elements that copies are made with; None without a prior.
         strength: the probability with which a drawn element is used, 0 to 1; see `begin`.
+        gate: says which rows are copied; whoever builds a learner that asks for one sets it.
 
     Raises:
         ValueError: the task cannot carry an element, all copies of an infinite group are asked for, or some element
@@ -56,6 +58,7 @@ class SymmetryPrior:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
         self._probe = _probe(spaces, device)
         self.strength = 1.0
+        self.gate: Gate | None = None
         self._weights = self._weigh()
 
     def begin(self, progress: float) -> None:
@@ -75,8 +78,8 @@ class SymmetryPrior:
         if self.config.trust == "full":
             return [1.0] * len(names)
         if set(self.config.weights) != set(names) and names:
-            told = ", ".join(names)
-            raise ValueError(f"prior.trust is measured, but prior.weights does not weigh just these elements: {told}")
+            told, trust = ", ".join(names), self.config.trust
+            raise ValueError(f"prior.trust is {trust}, but prior.weights does not weigh just these elements: {told}")
         return [self.config.weights[name] for name in names]
 
     @property
@@ -113,11 +116,11 @@ class SymmetryPrior:
             adapt: what the learner changes in a copy that transforming alone leaves wrong.
         """
         used = self.augments or self.config.coefficient > 0
-        return Copies(self.config, batch, self._draw(generators) if used else [], self.augments, adapt)
+        return Copies(self.config, batch, self._chosen(batch, generators) if used else [], self.augments, adapt)
 
     def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
         """Return the copies of new experience that a replay stores with it."""
-        return [batch.transformed(g) for g in self._draw(generators)] if self._stores else []
+        return [batch.transformed(g) for g in self._chosen(batch, generators)] if self._stores else []
 
     @torch.no_grad()
     def errors(self, batch: Rows, evaluate: Callable[[Rows], Answers]) -> dict[str, Tensor]:
@@ -136,12 +139,38 @@ class SymmetryPrior:
         copies = Copies(self.config, batch, self._probe, augments=True)
         return {f"{name}_symmetry_error": gap for name, gap in copies.gaps(**evaluate(copies.rows)).items()}
 
+    def _chosen(self, batch: SeedBatch, generators: Sequence[torch.Generator]) -> list[Transform]:
+        """Return one transform per copy of a batch, where trust is a gate of those rows alone that it lets through.
+
+        Raises:
+            ValueError: there is no gate.
+        """
+        drawn = self._draw(generators)
+        if self.config.trust != "gate" or all(weight == 1 for weight in self._weights):
+            return drawn
+        if self.gate is None:
+            raise ValueError(
+                "prior.trust=gate needs predictors of its task, which esp train fits; here choose measured"
+            )
+        return [self._gated(self.gate, g, batch, generators) for g in drawn]
+
+    def _gated(
+        self, gate: Gate, transform: Transform, batch: SeedBatch, generators: Sequence[torch.Generator]
+    ) -> Transform:
+        certain = gate.is_certain(transform)
+        if all(certain):
+            return transform
+        kept = gate.kept(transform, batch.obs[:, :, : batch.action.shape[2]], batch.action)
+        chance = torch.stack([torch.rand(kept.shape[1:], generator=g) for g in generators])
+        sure = torch.tensor(certain).view(-1, 1, 1).to(kept.device, non_blocking=True)
+        return gated(transform, (chance.to(kept.device, non_blocking=True) < kept) | sure)
+
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         """Return one transform per copy, each one element per seed."""
         if self.transforms is None or self.strength == 0:
             return []
         everyone = self.config.copies == "all" or self.transforms.size == 1
-        keep = [self.strength * weight for weight in self._weights]
+        keep = [self.strength * (1.0 if self.config.trust == "gate" else weight) for weight in self._weights]
         if all(share == 1 for share in keep):
             return self.transforms.each() if everyone else [self.transforms.draw(generators)]
         if not everyone:

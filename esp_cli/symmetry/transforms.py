@@ -57,6 +57,15 @@ class Transform:
         return len(self.elements)
 
     @property
+    def is_uniform(self) -> bool:
+        """Whether all rows of one seed are moved by the same element."""
+        return True
+
+    def part(self, start: int, stop: int) -> Transform:
+        """Return what acts on the rows from `start` to `stop` of a batch."""
+        return self
+
+    @property
     def num_outputs(self) -> int:
         """Numbers that a policy says of one agent: one per discrete action, or those of a continuous one."""
         return self.output_map.width // (1 if self.agents is None else self.agents.width)

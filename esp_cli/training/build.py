@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.prior.gate import fitted
 from esp_cli.training.config import RunConfig
 from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.compass import Compass
 from esp_envs.registry import make
+
+_GATE_WORLDS = 256
+"""In which the episodes are played that a gate's predictors are fitted to."""
 
 
 def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
@@ -29,7 +33,7 @@ def build_learner(config: RunConfig) -> Learner:
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, build_environment(config, 1, "shape").spec)
     env = build_environment(config, settings.num_envs, "training worlds")
-    return cls(
+    learner = cls(
         env,
         settings,
         config.network,
@@ -37,3 +41,25 @@ def build_learner(config: RunConfig) -> Learner:
         generators(config.seeds, "learner"),
         generators(config.seeds, "prior"),
     )
+    _set_gate(learner, config)
+    return learner
+
+
+def _set_gate(learner: Learner, config: RunConfig) -> None:
+    """Give a learner the gate that its prior asks for; it is the same for all seeds, and for whatever seeds there are.
+
+    Raises:
+        ValueError: the gate does not go with the rest of the configuration.
+    """
+    prior = config.prior.effective()
+    if prior.trust != "gate" or learner.prior.transforms is None:
+        return
+    if config.network.recurrent:
+        raise ValueError("prior.trust=gate copies single steps, which a recurrent network cannot take; use mlp")
+    if prior.compass:
+        raise ValueError("with prior.compass nothing is false that a gate could keep out; leave prior.trust=gate out")
+    certain = {name for name, weight in prior.weights.items() if weight == 1}
+    if certain != set(prior.weights):
+        worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)
+        exchanged = any("agents" in name for name in prior.weights)
+        learner.prior.gate = fitted(worlds, prior.doubt, certain, alike=not exchanged)

@@ -1,0 +1,230 @@
+"""A gate per state and action: copies only where one-step predictors with and without the symmetry agree.
+
+The idea is that of partially equivariant reinforcement learning (Chang et al., 2025, arXiv 2512.00915): P_N predicts
+change and reward of a step from what is seen and done, P_E does so under the symmetry. Where both agree, the update may
+use the symmetry; where they do not, it is the standard one. Here each element g has a P_E of its own,
+
+    P_E(s, a) = (P_N(s, a) + g^-1 P_N(g s, g a)) / 2,
+    b_g(s, a) = 2 |P_N - P_E|(s, a) = |g P_N(s, a) - P_N(g s, g a)|,
+
+and the copy of (s, a) by g is kept with probability exp(-doubt b_g(s, a)), b_g in standard deviations of the worst
+field. P_N is a ridge regression on products of two numbers, a class of functions that every element maps to itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from esp_cli.symmetry import Transform
+from esp_envs.base import Environment
+from esp_envs.spec import Continuous, Discrete, Kind, Spaces
+
+ROWS = 12_800
+"""Joint steps that the predictors are fitted to, about."""
+STEPS = 50
+"""Steps of an episode that are looked at, at most."""
+_WIDEST_PAIRS = 48
+"""Up to so many numbers of one agent, products of two of them are looked at too."""
+_WIDEST_OTHERS = 160
+"""Up to so many numbers that all other agents see and do, what they see is looked at too; else what they do alone."""
+_RIDGE = 1e-4
+_SIGNIFICANT = 4.0
+"""Standard errors of a prediction below which a gap counts as none."""
+_STILL = 1e-5
+"""Standard deviation below which a field does not change, so that it says nothing."""
+
+
+def own_inputs(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
+    """Return 1, what each agent sees and does, and the products of two of these numbers: [..., N, features]."""
+    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
+    row = torch.cat([obs, acted], -1)
+    features = [torch.ones_like(row[..., :1]), row]
+    if row.shape[-1] <= _WIDEST_PAIRS:
+        first, second = torch.triu_indices(row.shape[-1], row.shape[-1])
+        features.append(row[..., first] * row[..., second])
+    return torch.cat(features, -1)
+
+
+def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
+    """Return `own_inputs` with what the other agents see and do, on which an agent's next observation depends.
+
+    Args:
+        spaces: what the numbers are.
+        obs: [M, T, N, D].
+        action: [M, T, N] int64, or [M, T, N, width] float32.
+
+    Returns:
+        [M, T, N, features].
+    """
+    inputs = own_inputs(spaces, obs, action)
+    agents, width = spaces.num_agents, spaces.observation.width
+    acted = spaces.action.count - 1 if isinstance(spaces.action, Discrete) else spaces.action.width
+    first = 1 if (agents - 1) * (width + acted) <= _WIDEST_OTHERS else 1 + width
+    others = [[j for j in range(agents) if j != i] for i in range(agents)]
+    beside = inputs[..., first : 1 + width + acted][:, :, others].flatten(3)
+    return torch.cat([inputs, beside], -1)
+
+
+@dataclass(frozen=True)
+class GatedTransform(Transform):
+    """A transform of those rows alone whose gate is open; the others stay as they are.
+
+    Attributes:
+        open: [S, B, T] bool; a last state behind the T steps goes with the last step.
+    """
+
+    open: Tensor
+
+    @property
+    def is_uniform(self) -> bool:
+        """False: rows of one seed differ."""
+        return False
+
+    def part(self, start: int, stop: int) -> GatedTransform:
+        """Return the transform of some rows."""
+        return gated(self, self.open[:, start:stop])
+
+    def action(self, action: Tensor) -> Tensor:
+        """Apply K_g to actions."""
+        return self._mixed(super().action(action), action)
+
+    def _move(self, x: Tensor, move, width: int, agent_axis: int | None = None) -> Tensor:  # type: ignore[no-untyped-def]
+        return self._mixed(super()._move(x, move, width, agent_axis), x)
+
+    def _mixed(self, moved: Tensor, x: Tensor) -> Tensor:
+        rows = self.open
+        if x.shape[2] > rows.shape[2]:
+            rows = torch.cat([rows, rows[:, :, -1:]], 2)
+        return torch.where(rows.view(*rows.shape, *[1] * (x.dim() - 3)), moved, x)
+
+
+def gated(transform: Transform, rows: Tensor) -> GatedTransform:
+    """Return a transform of some rows, `open` of `GatedTransform`."""
+    return GatedTransform(**{f.name: getattr(transform, f.name) for f in fields(Transform)}, open=rows)
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One-step predictors of a task, and how far to trust a copy by what they say.
+
+    Attributes:
+        spaces: of the task.
+        weights: [N or 1, features, D + 1] regression of change and reward on `inputs_of`, for each agent or for all.
+        scale: [D + 1] standard deviation of each number's field.
+        noise: [D + 1] gap in that unit that counts as none.
+        doubt: a copy that is off by b standard deviations is kept with probability exp(-doubt b).
+        certain: names of elements that are not gated.
+    """
+
+    spaces: Spaces
+    weights: Tensor
+    scale: Tensor
+    noise: Tensor
+    doubt: float
+    certain: Collection[str] = ()
+
+    @torch.no_grad()
+    def kept(self, transform: Transform, obs: Tensor, action: Tensor) -> Tensor:
+        """Return the probability [S, B, T] with which the copy of each row is kept.
+
+        Args:
+            transform: one element per seed, or one for all.
+            obs: [S, B, T, N, D].
+            action: [S, B, T, N] int64, or [S, B, T, N, width] float32.
+        """
+        width, action = obs.shape[-1], _bounded(self.spaces, action)
+        here = self._predicted(obs, action)
+        there = self._predicted(transform.obs(obs), transform.action(action))
+        pushed = torch.cat([transform.obs(here[..., :width]), transform.per_agent(here[..., width]).unsqueeze(-1)], -1)
+        gap = (there - pushed).abs_().div_(self.scale)
+        gap = torch.where(gap > self.noise, gap, 0.0).amax((-2, -1))
+        return torch.exp(-self.doubt * gap)
+
+    def is_certain(self, transform: Transform) -> list[bool]:
+        """Return for each seed whether its element is not gated."""
+        return [element.is_identity or element.name in self.certain for element in transform.elements]
+
+    def _predicted(self, obs: Tensor, action: Tensor) -> Tensor:
+        inputs = inputs_of(self.spaces, obs.flatten(0, 1), action.flatten(0, 1))
+        return _predicted(inputs, self.weights).unflatten(0, obs.shape[:2])
+
+
+@torch.no_grad()
+def fitted(env: Environment, doubt: float, certain: Collection[str], alike: bool) -> Gate:
+    """Fit the predictors of a task to episodes of its worlds, half of them by the heuristic if there is one.
+
+    Args:
+        env: worlds of one seed.
+        doubt: see `Gate`.
+        certain: likewise.
+        alike: whether one regression serves all agents; not where elements exchange them.
+    """
+    spaces = env.spec
+    obs, action, outputs = _played(env)
+    half = len(obs) // 2
+    inputs = inputs_of(spaces, obs, _bounded(spaces, action))
+    parts = [_moments(inputs[part], outputs[part], alike) for part in (slice(half), slice(half, None))]
+    whole = _solved(parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
+    first, second = (_solved(*part) for part in parts)
+    spread = outputs.flatten(0, 2).std(0)
+    # The halves' predictions differ by twice the error of the whole's, and a gap has the errors of two predictions.
+    error = _predicted(inputs, first - second).square().mean((0, 1, 2)).sqrt() / 2**0.5
+    scale, noise = torch.empty_like(spread), torch.empty_like(spread)
+    width = spaces.observation.width
+    for where in (*spaces.observation.slices().values(), slice(width, width + 1)):
+        scale[where] = spread[where].max() if spread[where].max() > _STILL else torch.inf
+        noise[where] = _SIGNIFICANT * error[where].max() / scale[where]
+    return Gate(spaces, whole, scale, noise, doubt, frozenset(certain))
+
+
+def _played(env: Environment) -> tuple[Tensor, Tensor, Tensor]:
+    """Return observations [M, T, N, D], actions, and change and reward [M, T, N, D + 1] of episodes."""
+    found: list[tuple[Tensor, ...]] = []
+    steps = min(STEPS, env.spec.horizon)
+    for _ in range(max(1, ROWS // (env.num_envs * steps))):
+        seen, rows = env.reset(), []
+        for _ in range(steps):
+            action = env.random_action()
+            if env.heuristics:
+                half = env.num_envs // 2
+                action[:, :half] = env.heuristic()[:, :half]
+            step = env.step(action)
+            change = (step.final or step.next).obs - seen.obs
+            rows.append((seen.obs, action, torch.cat([change, step.reward.unsqueeze(-1)], -1)))
+            seen = step.next
+        found.append(tuple(torch.stack(part, 2).flatten(0, 1) for part in zip(*rows, strict=True)))
+    obs, action, outputs = (torch.cat(part) for part in zip(*found, strict=True))
+    return obs, action, outputs
+
+
+def _predicted(inputs: Tensor, weights: Tensor) -> Tensor:
+    return torch.einsum("mtnf,nfo->mtno", inputs, weights.expand(inputs.shape[2], -1, -1))
+
+
+def _moments(inputs: Tensor, outputs: Tensor, alike: bool) -> tuple[Tensor, Tensor]:
+    """Return X^T X [N, F, F] and X^T Y [N, F, O] of each agent, or [1, F, F] and [1, F, O] of all, in float64."""
+    x, y = (part.flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
+    gram, cross = (x.mT @ x).double(), (x.mT @ y).double()
+    return (gram.sum(0, keepdim=True), cross.sum(0, keepdim=True)) if alike else (gram, cross)
+
+
+def _solved(gram: Tensor, cross: Tensor) -> Tensor:
+    ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
+    return torch.linalg.solve(gram + ridge, cross).float()
+
+
+def _bounded(spaces: Spaces, action: Tensor) -> Tensor:
+    """Return actions as the task takes them: continuous ones within their bounds."""
+    if not isinstance(spaces.action, Continuous):
+        return action
+    bounded = action.clamp(-1, 1)
+    for field, where in zip(spaces.action.layout.fields, spaces.action.layout.slices().values(), strict=True):
+        if field.kind is Kind.VECTOR:
+            vector = action[..., where].unflatten(-1, (-1, 2))
+            bounded[..., where] = (vector / vector.norm(dim=-1, keepdim=True).clamp_min(1)).flatten(-2)
+    return bounded
