@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import typer
 
-from esp_cli.commands.study_options import StudyChoices, study_command
+from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 
 EPILOG = """Examples:\n
@@ -30,7 +31,30 @@ def ablate(
         ),
     ],
     choices: StudyChoices,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--methods",
+            help="What is compared, by the names in the table: 'plain,ESP,gate'; by default all.",
+            metavar="NAMES",
+        ),
+    ] = None,
+    broken_by: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--broken-by",
+            help="For breaking: the settings that break symmetry, as wind,mud; by default all.",
+            metavar="SETTINGS",
+        ),
+    ] = None,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""
-    kind = f"ablate-{part}"
-    run_study(kind, choices.request(kind, "ablate", part), choices)
+    kind, names, settings = f"ablate-{part}", parse_names(methods), parse_names(broken_by)
+    if settings and part != "breaking":
+        raise ValueError("--broken-by is for esp ablate breaking; leave it out")
+    words = [
+        *(("--methods", ",".join(names)) if names else ()),
+        *(("--broken-by", ",".join(settings)) if settings else ()),
+    ]
+    request = choices.request(kind, "ablate", part, *words)
+    run_study(kind, replace(request, variants=names, breakings=settings), choices)

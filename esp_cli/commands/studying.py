@@ -111,6 +111,8 @@ def run_cells(
 ) -> tuple[bool, list[str]]:
     """Run the cells of a study; return whether it came to its end, and which runs failed.
 
+    Of cells that train the same, the first is run, and the others take its run over.
+
     Args:
         folder: of the study, held by the caller's lock.
         study: the cells that are wanted.
@@ -128,7 +130,18 @@ def run_cells(
         if twin is not None:
             folder.adopt(cell, twin)
             console.note(f"taking over {twin} as {cell.name}")
-    return follow(Scheduler(folder, cells, min(jobs, len(cells)), engine), study.title, requests)
+    same = [
+        cell
+        for k, cell in enumerate(cells)
+        if any(cell.config == earlier.config for earlier in cells[:k]) and not folder.run_path(cell).exists()
+    ]
+    runs = [cell for cell in cells if cell not in same]
+    complete, failed = follow(Scheduler(folder, runs, min(jobs, len(runs)), engine), study.title, requests)
+    for cell in same:
+        if (twin := folder.find_twin(cell, [folder])) is not None:
+            folder.adopt(cell, twin)
+            console.note(f"taking over {twin} as {cell.name}, which trains the same")
+    return complete, failed
 
 
 def follow(scheduler: Scheduler, title: str, requests: Sequence[int]) -> tuple[bool, list[str]]:

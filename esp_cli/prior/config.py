@@ -84,6 +84,7 @@ class PriorConfig(BaseModel):
         kind = self.kind
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
-        lost = loses[kind] | ({"doubt", "weights"} if self.trust == "full" else set())
+        sure = bool(self.weights) and all(weight == 1 for weight in self.weights.values())
+        lost = loses[kind] | ({"trust", "doubt", "weights"} if self.trust == "full" or sure else set())
         kept = {name: value for name, value in self if name not in lost}
         return PriorConfig(**{**kept, "kind": kind})

@@ -11,7 +11,7 @@ import numpy as np
 from esp_cli.evaluation.statistics import Floats, difference, summarise
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import floats, returns_of
-from esp_cli.studies.kinds import KINDS
+from esp_cli.studies.kinds import KINDS, UNBROKEN
 
 PLAIN, ESP = "plain", "ESP"
 _Side = Literal["ahead", "behind", "level"]
@@ -53,14 +53,19 @@ def series_of(results: Results) -> list[Series]:
     """Return the series of a study of broken symmetry; none of other studies."""
     kind = KINDS.get(results.kind)
     found: dict[tuple[str, str], dict[float, dict[str, CellResult]]] = {}
+    heads = [
+        (task, setting, strength, f"{task}, {setting} {strength:g}, " if strength else f"{task}, {UNBROKEN}, ")
+        for task, settings in (kind.breakings if kind else {}).items()
+        for setting, strengths in settings.items()
+        for strength in (0.0, *strengths)
+    ]
     for cell in results.cells:
-        for task, (setting, values) in (kind.breakings if kind else {}).items():
-            for value in values:
-                head = f"{task}, {setting} {value:g}, "
-                if cell.panel.startswith(head):
-                    name = f"{task}, {cell.panel.removeprefix(head)}"
-                    found.setdefault((name, setting), {}).setdefault(value, {})[cell.variant] = cell
-    return [Series(name, setting, dict(sorted(cells.items()))) for (name, setting), cells in found.items()]
+        for task, setting, strength, head in heads:
+            if cell.panel.startswith(head):
+                name = f"{task}, {cell.panel.removeprefix(head)}"
+                found.setdefault((name, setting), {}).setdefault(strength, {})[cell.variant] = cell
+    whole = {key: dict(sorted(cells.items())) for key, cells in found.items() if set(cells) != {0.0}}
+    return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
 def verdicts(results: Results) -> list[Verdict]:

@@ -182,7 +182,9 @@ def _over_strength(results: Results, series: Sequence[Series], out: Path, label:
         drawn = [Sensitivity(method, values) for method, values in lines.items()]
         if drawn:
             order = [f"{strength:g}" for strength in one.cells]
-            pictures.append(sensitivity(drawn, out / f"breaking-{k}", one.name, one.setting, label, order))
+            pictures.append(
+                sensitivity(drawn, out / f"breaking-{k}", f"{one.name}, {one.setting}", one.setting, label, order)
+            )
     return pictures
 
 

@@ -9,7 +9,7 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
-from esp_cli.studies.kinds import GROUP, KINDS, Settings, StudyKind, Team
+from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team
 from esp_cli.studies.study import Cell, Study
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_envs.registry import task_names
@@ -30,6 +30,7 @@ class Request:
         episodes: per seed, of the final evaluation of a trained policy.
         variants: names of the variants, in order; the others are compared with the first.
         group: whose symmetry a study of networks is about.
+        breakings: names of the settings that break symmetry in a study of that; all by default.
         command: the command line behind it.
     """
 
@@ -43,6 +44,7 @@ class Request:
     episodes: int = 320
     variants: Sequence[str] | None = None
     group: str = "c4"
+    breakings: Sequence[str] | None = None
     command: str = ""
 
 
@@ -98,8 +100,10 @@ def _variants(
     kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
     """Yield the variants of each algorithm, which are compared with the first of them."""
-    setting, values = kind.breakings.get(task, ("", ()))
-    strengths = [Team(f"{setting} {value:g}", {f"task.{setting}": value}, ()) for value in values] or [Team("", {}, ())]
+    strengths = [Team(UNBROKEN if kind.breakings else "", {}, ())]
+    for setting, values in kind.breakings.get(task, {}).items():
+        if request.breakings is None or setting in request.breakings:
+            strengths += [Team(f"{setting} {value:g}", {f"task.{setting}": value}, ()) for value in values]
     for strength, algorithm, steps in (
         (team, a, s) for team in strengths for a in algorithms for s in _steps(kind, task, request)
     ):
@@ -149,7 +153,8 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
     settings |= choice
     config = resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
     # what trains the same is the same run
-    return prepared(config.model_copy(update={"prior": config.prior.effective()}))
+    config = prepared(config.model_copy(update={"prior": config.prior.effective()}))
+    return config.model_copy(update={"prior": config.prior.effective()})
 
 
 def _comparable(config: RunConfig, settings: Settings) -> bool:
@@ -168,6 +173,10 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
     unknown = [task for task in tasks if kind.breakings and task not in kind.breakings]
     if unknown:
         raise ValueError(f"this study knows no breaking of {unknown[0]}; its tasks are {', '.join(kind.breakings)}")
+    known = dict.fromkeys(setting for task in tasks for setting in kind.breakings.get(task, {}))
+    for setting in request.breakings or ():
+        if setting not in known:
+            raise ValueError(f"'{setting}' breaks none of these tasks here; choose from {', '.join(known)}")
     for name in request.overrides:
         section = name.rpartition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):

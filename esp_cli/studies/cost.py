@@ -44,6 +44,25 @@ class Cost:
     peak_bytes: int
 
 
+def cost_key(config: RunConfig) -> str:
+    """Return what decides the cost of a run: equal for runs that differ in numbers alone, as in the size of a wind.
+
+    Of a task's settings, fractions are left out; elsewhere it counts whether they are 0, which switches things off.
+    """
+    parts = config.model_dump(mode="json")
+    task = {name: value for name, value in parts["task_settings"].items() if not isinstance(value, float)}
+    prior = {name: value for name, value in parts["prior"].items() if name != "weights"}
+    parts |= {"task_settings": task, "prior": prior, "seeds": len(config.seeds)}
+    return json.dumps(_on_or_off(parts), sort_keys=True)
+
+
+def _on_or_off(value: object) -> object:
+    """Return nested settings with whether it is not 0 in the place of each fraction."""
+    if isinstance(value, dict):
+        return {name: _on_or_off(one) for name, one in value.items()}
+    return value != 0 if isinstance(value, float) else value
+
+
 def probe(config: RunConfig, episodes: int) -> Cost:
     """Measure a run by some of its iterations and an evaluation, without writing anything.
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from esp_cli.studies.cost import probe
+from esp_cli.studies.cost import Cost, cost_key, probe
 from esp_cli.studies.scheduler import Run, Status, makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.config import RunConfig
@@ -18,7 +18,7 @@ class RunForecast:
 
     Attributes:
         name: of its cell.
-        status: of its cell; "finished" also where another study has it.
+        status: of its cell; "finished" also where another study has it, or another run of this one trains the same.
         step: environment steps per seed that are done.
         seconds_left: alone on one thread.
         seconds: of the whole run; None where nothing is left of it, which is not measured.
@@ -67,7 +67,9 @@ class Forecast:
 def forecast(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of a study by a probe of each run that is not finished, without writing anything.
+    """Measure what is left of a study by probes of runs that are not finished, without writing anything.
+
+    Runs that cost the same, whatever the numbers in their settings, are measured once.
 
     Args:
         folder: of the study; need not exist.
@@ -75,12 +77,18 @@ def forecast(
         jobs: runs side by side.
         listener: told how many runs have been looked at.
     """
-    study = folder.study
-    found = []
+    study, costs = folder.study, dict[str, Cost]()
+    found: list[RunForecast] = []
     for cell in study.cells:
         run = Run.found(folder, cell)
         twin = folder.run_path(cell) if run.status == "finished" else folder.find_twin(cell, others)
-        found.append(_finished(run, twin) if twin is not None else _measured(run, study.episodes))
+        if twin is not None:
+            found.append(_finished(run, twin))
+        else:
+            if (key := cost_key(cell.config)) not in costs:
+                costs[key] = probe(cell.config, study.episodes)
+            again = any(cell.config == earlier.config for earlier in found)
+            found.append(_measured(run, costs[key], again))
         listener(len(found))
     disk = sum(run.disk_bytes for run in found)
     extra = sorted((run.peak_bytes - run.disk_bytes for run in found), reverse=True)
@@ -103,9 +111,11 @@ def _finished(run: Run, path: Path) -> RunForecast:
     return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, size, size, config)
 
 
-def _measured(run: Run, episodes: int) -> RunForecast:
+def _measured(run: Run, cost: Cost, again: bool) -> RunForecast:
+    """Return the forecast of a run by what one costs; `again`: an earlier run trains the same."""
     config = run.cell.config
-    cost = probe(config, episodes)
+    if again and not run.step:
+        return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, cost.disk_bytes, cost.disk_bytes, config)
     left = cost.training_s * (1 - run.step / config.steps) + cost.evaluation_s
     whole = cost.training_s + cost.evaluation_s
     return RunForecast(run.cell.name, run.status, run.step, left, whole, cost.disk_bytes, cost.peak_bytes, config)

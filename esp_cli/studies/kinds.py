@@ -18,13 +18,23 @@ ALGORITHMS = ("maddpg", "qmix", "mappo")
 PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
 """What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
 PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
-BREAKINGS: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    "navigation": ("wind", (0.0, 0.3, 0.6, 1.0)),
-    "predator-prey": ("wind", (0.0, 0.3, 0.6)),
-    "formation": ("slope", (0.0, 0.3, 0.6)),
-    "wildlife": ("wind", (0.0, 0.4, 0.8)),
+Breakings = Mapping[str, Mapping[str, tuple[float, ...]]]
+BREAKINGS: Breakings = {
+    "navigation": {
+        "action_turn_rad": (0.5, 1.57),
+        "reward_offset": (0.1, 0.3),
+        "mud": (0.5, 0.9),
+        "wind": (0.3, 0.6),
+    },
+    "predator-prey": {"action_turn_rad": (0.5, 1.57), "mud": (0.5, 0.9), "wind": (0.3, 0.6)},
+    "formation": {"slope": (0.3, 0.6)},
+    "wildlife": {"wind": (0.4, 0.8)},
 }
-"""By task the setting that breaks its symmetry, and its strengths."""
+"""By task the settings that break its symmetry, those that say most about a prior first, and their strengths.
+
+Beside them is the unbroken task, which all settings of a task share.
+"""
+UNBROKEN = "unbroken"
 COEFFICIENTS = (0.0, 0.01, 0.05, 0.1, 0.5, 1.0)
 
 
@@ -60,7 +70,7 @@ class StudyKind:
         all_rows: take every row of the paper's table, not only the first.
         only: the one task that the study is about.
         teams: rows beside the task itself.
-        breakings: by task the setting that breaks its symmetry, and its strengths; empty for other studies.
+        breakings: by task the settings that break its symmetry, and their strengths; empty for other studies.
         place: of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none.
         mode: evaluations that are reported, unless the user asks for others.
         thresholds: returns whose first passing is reported; by default that which the reference ended with.
@@ -78,7 +88,7 @@ class StudyKind:
     all_rows: bool = False
     only: str | None = None
     teams: tuple[Team, ...] = ()
-    breakings: Mapping[str, tuple[str, tuple[float, ...]]] = field(default_factory=dict)
+    breakings: Breakings = field(default_factory=dict)
     place: tuple[str, ...] = ()
     mode: Mode = "greedy"
     thresholds: tuple[float, ...] = ()
@@ -159,14 +169,30 @@ KINDS: Mapping[str, StudyKind] = {
         "Methods for imperfect symmetry over the strength of breaking",
         rows="variants",
         varies=frozenset(
-            {"prior.kind", "prior.fade", "prior.trust", "prior.compass", *(f"task.{s}" for s, _ in BREAKINGS.values())}
+            {
+                "prior.kind",
+                "prior.fade",
+                "prior.trust",
+                "prior.compass",
+                "network.name",
+                "network.group",
+                "network.relax",
+            }
+            | {f"task.{setting}" for settings in BREAKINGS.values() for setting in settings}
         ),
         variants={
             "plain": {"prior.kind": "none"},
             "ESP": {"prior.kind": "esp"},
             "ESP that fades": {"prior.kind": "esp", "prior.fade": 0.5},
             "measured weights": {"prior.kind": "esp", "prior.trust": "measured"},
+            "gate": {"prior.kind": "esp", "prior.trust": "gate"},
             "compass": {"prior.kind": "esp", "prior.compass": 1.0},
+            "relaxed network": {
+                "prior.kind": "none",
+                "network.name": "equivariant",
+                "network.group": "d4",
+                "network.relax": 0.1,
+            },
         },
         tasks=("navigation", "predator-prey", "formation"),
         algorithms=("mappo",),

@@ -104,6 +104,21 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     assert "| navigation, 100 |" in page.read_text()
 
 
+@pytest.mark.usefixtures("forked_jobs")
+def test_a_study_of_breakings_is_run_in_pieces_and_runs_once_what_trains_the_same(tmp_path: Path) -> None:
+    out = tmp_path / "s"
+    study = ("ablate", "breaking", "--tasks", "navigation", "--methods", "ESP,measured weights", "--seeds", "2")
+    study += ("--episodes", "4", "--steps", 100, *TINY_OPTIONS, "--set", "prior.transforms=rot180", "--out", out)
+    first = esp(*study, "--broken-by", "wind", "--jobs", 2)
+    assert "5 runs, 0 of them finished" in first.stderr
+    assert first.stderr.count(", which trains the same") == 1, "where nothing is broken"
+    assert "--methods 'ESP,measured weights' --broken-by wind" in StudyFolder.open(out).study.command
+    more = esp(*study, "--broken-by", "mud", "--dry-run", "--jobs", 2)
+    assert "4 runs to do" in more.stdout, "the unbroken ones are there"
+    assert refused("ablate", "modules", "--broken-by", "wind") == "--broken-by is for esp ablate breaking; leave it out"
+    assert "name each variant of this study once" in refused(*study, "--methods", "luck")
+
+
 def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Path) -> None:
     told = esp(
         "report", f"ours={finished}", f"again={finished}", "--out", tmp_path / "page", "--results", tmp_path / "r"

@@ -19,41 +19,76 @@ from esp_envs import make
 from tests.studies.small_studies import request, small_study, write_run, write_study
 
 METHODS = list(KINDS["ablate-breaking"].variants)
-BASE = {"plain": -150.0, "ESP": -120.0, "ESP that fades": -120.5, "measured weights": -120.0, "compass": -125.0}
+BASE = {
+    "plain": -150.0,
+    "ESP": -120.0,
+    "ESP that fades": -120.5,
+    "measured weights": -120.0,
+    "gate": -120.0,
+    "compass": -125.0,
+    "relaxed network": -120.0,
+}
 """Returns where nothing is broken; the standard error is 1."""
-BROKEN = {"plain": -150.0, "ESP": -180.0, "ESP that fades": -150.0, "measured weights": -140.0, "compass": -130.0}
+BROKEN = {
+    "plain": -150.0,
+    "ESP": -180.0,
+    "ESP that fades": -150.0,
+    "measured weights": -140.0,
+    "gate": -140.0,
+    "compass": -130.0,
+    "relaxed network": -200.0,
+}
 NOISE = (-1.0, 0.0, 1.0)
 
 
 def study(**choice):
-    return small_study("ablate-breaking", **{"tasks": ("navigation",), **choice})
+    return small_study("ablate-breaking", **{"tasks": ("navigation",), "breakings": ("wind",), **choice})
 
 
 def test_every_method_meets_every_strength_of_its_task(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(measured, "_breaking", lambda *_: (("rot90", 0.5),))
-    cells = plan("ablate-breaking", request(tasks=tuple(BREAKINGS), seeds=(0,))).cells
-    for task, (setting, values) in BREAKINGS.items():
+    cells = plan("ablate-breaking", request(tasks=("navigation", "predator-prey"), seeds=(0,))).cells
+    for task in ("navigation", "predator-prey"):
         own = [cell for cell in cells if cell.config.task == task]
-        found = [(cell.config.task_settings[setting], cell.variant) for cell in own]
-        assert found == [(value, method) for value in values for method in METHODS]
-        assert values[0] == 0
-        assert setting in {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
-    priors = {cell.variant: cell.config.prior for cell in cells}
-    assert [priors[m].kind for m in METHODS] == ["none", "esp", "esp", "esp", "esp"]
-    assert priors["ESP that fades"].fade > 0
-    assert priors["compass"].compass > 0
+        known = {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
+        broken = [{s: v for s in known if (v := cell.config.task_settings[s])} for cell in own]
+        expected = [{}, *({s: value} for s, values in BREAKINGS[task].items() for value in values)]
+        assert list(zip(broken, (cell.variant for cell in own), strict=True)) == [
+            (one, method) for one in expected for method in METHODS
+        ]
+    for task, settings in BREAKINGS.items():
+        assert set(settings) <= {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
+        assert all(0 < low < high for low, high in settings.values())
+    configs = {cell.variant: cell.config for cell in cells}
+    assert [configs[m].prior.kind for m in METHODS] == ["none", "esp", "esp", "esp", "esp", "esp", "none"]
+    assert configs["ESP that fades"].prior.fade > 0
+    assert configs["compass"].prior.compass > 0
+    assert (configs["gate"].prior.trust, configs["relaxed network"].network.relax) == ("gate", 0.1)
     assert all(cell.reference is None or cell.reference.endswith("-plain") for cell in cells)
 
 
-def test_weights_are_measured_when_the_study_is_planned():
+def test_weights_are_measured_when_the_study_is_planned_and_methods_that_train_as_esp_does_are_one_run():
+    cells = study(variants=("ESP", "measured weights", "gate", "compass")).cells
     weights = {
         cell.config.task_settings["wind"]: cell.config.prior.weights
-        for cell in study().cells
+        for cell in cells
         if cell.variant == "measured weights"
     }
-    assert set(weights[0.0].values()) == {1.0}
-    assert weights[1.0]["rot180"] < weights[0.3]["rot180"] < 1
-    assert weights[1.0]["flip-x"] == 1
+    assert weights[0.0] == {}
+    assert weights[0.6]["rot180"] < weights[0.3]["rot180"] < 1
+    assert weights[0.6]["flip-x"] == 1
+    whole = {cell.variant: cell.config for cell in cells if "unbroken" in cell.panel}
+    assert whole["measured weights"] == whole["gate"] == whole["ESP"]
+    assert whole["compass"] != whole["ESP"]
+
+
+def test_some_methods_and_some_breakings_can_be_chosen(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(measured, "_breaking", lambda *_: (("rot90", 0.5),))
+    cells = study(variants=("ESP", "gate"), breakings=("mud", "wind")).cells
+    assert {cell.variant for cell in cells} == {"ESP", "gate"}
+    assert len(cells) == 2 * (1 + 2 + 2)
+    with pytest.raises(ValueError, match="'slope' breaks none of these tasks here; choose from action_turn_rad, "):
+        study(breakings=("slope",))
 
 
 @pytest.mark.parametrize("setting", ["prior.compass", "task.wind", "prior.kind"])
@@ -83,22 +118,24 @@ def test_each_method_gets_its_verdict(folder: StudyFolder):
     """Fading: not ahead of plain, but level. Compass: 5 below ESP unbroken. Measured: as ESP, then ahead."""
     results = collect(folder).results
     (one,) = series_of(results)
-    assert (one.name, one.setting, list(one.cells)) == ("navigation, MAPPO, 200", "wind", [0.0, 0.3, 0.6, 1.0])
+    assert (one.name, one.setting, list(one.cells)) == ("navigation, MAPPO, 200", "wind", [0.0, 0.3, 0.6])
     assert verdicts(results) == [
         Verdict("ESP that fades", True, True, True),
         Verdict("measured weights", True, True, True),
+        Verdict("gate", True, True, True),
         Verdict("compass", False, True, True),
+        Verdict("relaxed network", True, False, False),
     ]
     table = verdicts_table(results)
     assert table is not None
-    assert table.rows[2] == ("compass", "no", "yes", "yes")
+    assert table.rows[3] == ("compass", "no", "yes", "yes")
 
 
 def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
     worse = StudyFolder.create(tmp_path / "study", study())
     for cell in worse.study.cells:
         wind = cell.config.task_settings["wind"]
-        mean = (BASE if wind == 0 else BROKEN)[cell.variant] - (60 if wind == 1 and cell.variant == "compass" else 0)
+        mean = (BASE if wind == 0 else BROKEN)[cell.variant] - (60 if wind == 0.6 and cell.variant == "compass" else 0)
         mean -= 60 if wind == 0.3 and cell.variant == "measured weights" else 0
         ends = [mean + x for x in NOISE]
         write_run(worse, cell, [ends, ends, ends], ends)
@@ -110,13 +147,13 @@ def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
 def test_the_table_has_returns_at_a_fifth_and_at_the_end(folder: StudyFolder):
     table = breaking_table(collect(folder).results)
     assert table is not None
-    assert len(table.rows) == 4 * len(METHODS)
+    assert len(table.rows) == 3 * len(METHODS)
     first = dict(zip(table.headings, table.rows[0], strict=True))
     assert first["breaking"] == "wind 0"
     assert first["at 20 %>"].startswith("-170.00")
     assert first["at 100 %>"].startswith("-150.00")
     rows = {(row[1], row[2]): row for row in table.rows}
-    assert rows["wind 1", "compass"][-2:] == ("yes", "yes")
+    assert rows["wind 0.6", "compass"][-2:] == ("yes", "yes")
     assert rows["wind 0.3", "ESP"][-2:] == ("no", "")
     assert rows["wind 0", "measured weights"][-1] == "not told apart"
 
@@ -135,6 +172,13 @@ def test_equal_runs_are_level_and_one_seed_says_nothing(folder: StudyFolder):
     assert side(results, cells["plain"], cells["ESP"]) == "behind"
     alone = {name: cell.model_copy(update={"returns": {"greedy": (-1.0,)}}) for name, cell in cells.items()}
     assert side(results, alone["plain"], alone["ESP"]) is None
+
+
+def test_all_settings_of_a_task_share_its_unbroken_runs(tmp_path: Path):
+    empty = StudyFolder.create(tmp_path / "empty", study(breakings=("wind", "mud"), variants=("plain", "ESP")))
+    mud, wind = sorted(series_of(collect(empty).results), key=lambda one: one.setting)
+    assert (list(wind.cells), list(mud.cells)) == ([0.0, 0.3, 0.6], [0.0, 0.5, 0.9])
+    assert wind.cells[0.0] == mud.cells[0.0]
 
 
 def test_without_runs_nothing_is_said_and_other_studies_have_no_such_table(tmp_path: Path):

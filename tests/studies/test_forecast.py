@@ -37,6 +37,18 @@ def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed
     assert not folder.path.exists()
 
 
+def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_once(tmp_path, probed) -> None:
+    """Three runs of each method: the gate, which is ESP where nothing is broken, has another gradient elsewhere."""
+    study = small_study(
+        "ablate-breaking", tasks=("navigation",), variants=("plain", "ESP", "gate"), breakings=("wind",)
+    )
+    found = forecast(StudyFolder(tmp_path / "s", study), [], 1, lambda done: None)
+    assert probed == ["none", "esp", "esp"]
+    assert [run.name for run in found.runs if run.status == "finished"] == ["navigation-unbroken-mappo-200-gate"]
+    assert found.core_seconds == 8 * 104.0
+    assert [run.seconds_left for run in found.runs].count(104.0) == 8
+
+
 def test_a_finished_run_is_not_measured_and_takes_the_place_that_it_takes(tmp_path: Path, probed: list[str]) -> None:
     folder = StudyFolder.create(tmp_path / "s", small_study())
     plain = folder.study.cells[0]
