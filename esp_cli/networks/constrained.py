@@ -18,6 +18,8 @@ from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
 
+Relaxation = Literal["residual", "weights"]
+
 
 def copies_for(width: int, group: FiniteGroup) -> int:
     """Return how many regular features have about as many weights between two layers as `width` plain numbers.
@@ -39,8 +41,11 @@ class ConstrainedLinear(nn.Module):
         outputs: how y transforms.
         gain: the initial weights are orthogonal ones of this gain, projected onto what is allowed and scaled to keep
             their size.
-        relax: weight of a plain layer beside it, which begins at 0 and need not commute: y = x (W + relax F) + ..., the
-            layer of residual pathway priors (Finzi et al., 2021). 0 leaves it out.
+        relax: how fast it leaves the symmetry; it begins with it. 0: never.
+        relaxation: what is relaxed. "residual": a plain layer beside it, which begins at 0 and need not commute,
+            y = x (W + relax F) + ..., the layer of residual pathway priors (Finzi et al., 2021). "weights": a number
+            v(h) of each output h of a feature, which begins at 0, in two filter banks that commute, W(h) = W_1(h) (1 +
+            relax v_1(h)) + W_2(h) relax v_2(h): relaxed weights (Wang et al., 2022; in learners Park et al., 2024).
 
     Shape:
         x: [S, B, in] -> [S, B, out].
@@ -53,9 +58,10 @@ class ConstrainedLinear(nn.Module):
         outputs: Sequence[Block],
         gain: float,
         relax: float = 0.0,
+        relaxation: Relaxation = "residual",
     ) -> None:
         super().__init__()
-        self.inputs, self.outputs, self.relax = list(inputs), list(outputs), relax
+        self.inputs, self.outputs, self.relax, self.relaxation = list(inputs), list(outputs), relax, relaxation
         full = orthogonal(generators, block_width(inputs), block_width(outputs), gain)
         one = Block(np.ones((len(inputs[0].matrices), 1, 1)), 1)
         self.weights, self.biases = nn.ParameterDict(), nn.ParameterDict()
@@ -79,7 +85,12 @@ class ConstrainedLinear(nn.Module):
                 self.biases[str(b)] = nn.Parameter(torch.zeros(len(generators), target.copies, len(basis)))
                 self.register_buffer(f"constant-{b}", basis.flatten(1), False)
         self.num_seeds = len(generators)
-        if relax:
+        if relax and relaxation == "weights":
+            self.bank = ConstrainedLinear(generators, inputs, outputs, gain)
+            self.bank.biases = nn.ParameterDict()  # one bias is enough
+            shares = [torch.zeros(len(generators), 2, 1, target.size) for target in self.outputs]
+            self.shares = nn.ParameterList(shares)
+        elif relax:
             self.free = nn.Parameter(torch.zeros_like(full))
             self.free_bias = nn.Parameter(torch.zeros(len(generators), 1, full.shape[2]))
 
@@ -99,7 +110,13 @@ class ConstrainedLinear(nn.Module):
                     parts.append(like.new_zeros(self.num_seeds, source.width, target.width))
             rows.append(torch.cat(parts, 2) if len(parts) > 1 else parts[0])
         held = torch.cat(rows, 1) if len(rows) > 1 else rows[0]
-        return held + self.relax * self.free if self.relax else held
+        if not self.relax:
+            return held
+        if self.relaxation == "residual":
+            return held + self.relax * self.free
+        shares = zip(self.shares, self.outputs, strict=True)
+        first, second = torch.cat([v.repeat(1, 1, 1, target.copies) for v, target in shares], 3).unbind(1)
+        return held + self.relax * (held * first + self.bank.weight() * second)
 
     def bias(self) -> Tensor:
         """Return b: [S, 1, out]."""
@@ -111,7 +128,7 @@ class ConstrainedLinear(nn.Module):
             else:
                 parts.append(like.new_zeros(self.num_seeds, target.width))
         held = torch.cat(parts, 1).unsqueeze(1)
-        return held + self.relax * self.free_bias if self.relax else held
+        return held + self.relax * self.free_bias if self.relax and self.relaxation == "residual" else held
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer."""
@@ -125,7 +142,10 @@ class EquivariantConfig(NetworkConfig):
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
     group: str = Field("c4", max_length=100, description="the layers commute with this group")
     relax: float = Field(
-        0.0, ge=0, le=10, description="weight of a plain layer beside each, which begins at 0; 0: exactly equivariant"
+        0.0, ge=0, le=10, description="how fast each layer can leave the symmetry; 0: exactly equivariant"
+    )
+    relaxation: Relaxation = Field(
+        "residual", description="by a plain layer beside each, or by weights that differ between a feature's outputs"
     )
 
     def build(
@@ -155,7 +175,7 @@ class Equivariant(Memoryless):
         blocks = [io.inputs(self.group), *hidden, io.outputs(self.group)]
         gains = [GAINS[config.activation]] * len(hidden) + [output_gain]
         self.layers = nn.ModuleList(
-            ConstrainedLinear(generators, a, b, gain, config.relax)
+            ConstrainedLinear(generators, a, b, gain, config.relax, config.relaxation)
             for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
         )
         self.activation = config.activation

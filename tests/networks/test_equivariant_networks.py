@@ -315,8 +315,8 @@ def test_what_does_not_fit_is_refused(task, overrides, message) -> None:
         build_learner(resolve_config(task, overrides={"mappo.num_envs": 2} | overrides))
 
 
-def relaxed(spec: TaskSpec, relax: float) -> nn.Module:
-    config = NETWORKS["equivariant"](hidden=(16, 16), group="d4", relax=relax)
+def relaxed(spec: TaskSpec, relax: float, relaxation: str = "residual") -> nn.Module:
+    config = NETWORKS["equivariant"](hidden=(16, 16), group="d4", relax=relax, relaxation=relaxation)
     return build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
 
 
@@ -330,19 +330,23 @@ def symmetry_gap(network: nn.Module, spec: TaskSpec, obs: Tensor) -> float:
     return gap
 
 
-def test_a_relaxed_network_begins_equivariant_and_can_give_it_up() -> None:
+@pytest.mark.parametrize("relaxation", ["residual", "weights"])
+def test_a_relaxed_network_begins_equivariant_and_can_give_it_up(relaxation: str) -> None:
     spec, obs, _ = scene("navigation")
-    network = relaxed(spec, 0.5)
+    network = relaxed(spec, 0.5, relaxation)
     assert symmetry_gap(network, spec, obs) < EXACT
-    assert torch.equal(network(obs.flatten(1, 2)), relaxed(spec, 0.0)(obs.flatten(1, 2)))
+    if relaxation == "residual":  # relaxed weights draw a second bank
+        assert torch.equal(network(obs.flatten(1, 2)), relaxed(spec, 0.0)(obs.flatten(1, 2)))
     network(obs.flatten(1, 2)).square().sum().backward()
-    assert all(layer.free.grad.abs().max() > 0 for layer in network.layers)
+    for layer in network.layers:
+        own = [layer.free] if relaxation == "residual" else [v for v in layer.shares if v.shape[-1] > 1]
+        assert all(parameter.grad.abs().max() > 0 for parameter in own)
     stir(network)
     assert symmetry_gap(network, spec, obs) > 0.1
-    strict = relaxed(spec, 0.0)
+    strict = relaxed(spec, 0.0, relaxation)
     stir(strict)
     assert symmetry_gap(strict, spec, obs) < 10 * EXACT
-    assert not any("free" in name for name, _ in strict.named_parameters())
+    assert len(list(strict.parameters())) < len(list(network.parameters()))
 
 
 def test_a_relaxed_layer_by_hand() -> None:
@@ -357,3 +361,29 @@ def test_a_relaxed_layer_by_hand() -> None:
     assert (soft.bias() - strict.bias()).flatten().tolist() == [2.0, -2.0]
     x = torch.randn(1, 3, 2)
     torch.testing.assert_close(soft(x), x @ soft.weight() + soft.bias())
+
+
+def test_relaxed_weights_by_hand() -> None:
+    """The first output of each feature has 1.5 times the first bank, the second that and as much of the second bank."""
+    group = cyclic(2)
+    blocks = [regular(group, 1)], [regular(group, 2)]
+    soft = ConstrainedLinear(generators(0), *blocks, 1.0, 0.5, "weights")
+    first = soft.weight().detach()
+    assert torch.equal(first, ConstrainedLinear(generators(0), *blocks, 1.0).weight())
+    with torch.no_grad():
+        soft.shares[0][0, :, 0] = torch.tensor([[1.0, 0.0], [0.0, 2.0]])
+    second = soft.bank.weight()
+    torch.testing.assert_close(soft.weight()[..., 0::2], 1.5 * first[..., 0::2])
+    torch.testing.assert_close(soft.weight()[..., 1::2], first[..., 1::2] + second[..., 1::2])
+
+
+@torch.no_grad()
+def test_weights_that_are_the_same_for_all_outputs_of_a_feature_keep_the_symmetry() -> None:
+    spec, obs, _ = scene("navigation")
+    network = relaxed(spec, 0.5, "weights")
+    for layer in network.layers[:-1]:
+        for share in layer.shares:
+            share.fill_(0.7)
+    assert symmetry_gap(network, spec, obs) < 10 * EXACT
+    network.layers[0].shares[0][..., 0] += 1.0
+    assert symmetry_gap(network, spec, obs) > 1e-3
