@@ -65,7 +65,8 @@ def test_the_command_of_a_manifest_resolves_to_its_configuration(entry: Entry) -
         overrides,
     )
     later = resolve_task_settings(config.task, config.task_settings)  # settings that are newer have their default
-    assert resolved == config.model_copy(update={"task_settings": later})
+    assert (config.init_from.source if config.init_from else None) == given.get("--init-from")
+    assert resolved == config.model_copy(update={"task_settings": later, "init_from": None})
     assert config.command() == entry.command
     assert entry.seed in config.seeds
     assert len(config.seeds) == entry.chosen_from
