@@ -24,8 +24,8 @@ MOVES = ("navigation", {})
 CHASE = ("predator-prey", {"actions": "continuous"})
 STILL = ("predator-prey", {"prey": "still", "actions": "continuous"})
 HUNTED = ("predator-prey", {"control": "prey", "actions": "continuous"})
-ROBOTS = ("formation", {"horizon": 40, "num_agents": 4, "num_obstacles": 2})
-NOISY = ("formation", {"horizon": 40, "num_agents": 4, "num_obstacles": 2, "sensor_noise_m": 0.01})
+ROBOTS = ("formation", {"horizon": 20, "num_agents": 4, "num_obstacles": 2})
+NOISY = ("formation", {"horizon": 20, "num_agents": 4, "num_obstacles": 2, "sensor_noise_m": 0.01})
 DRONES = ("wildlife", {"width": 5, "height": 5, "horizon": 30})
 
 OBSERVED = [
@@ -122,7 +122,7 @@ CLEAN = (
        for p in ("random", "fleeing", "still") for a in ("discrete", "continuous") for n in (1, 3)]
     + [("predator-prey", {"control": "prey", "actions": a}) for a in ("discrete", "continuous")]
     + [("predator-prey", {"convention": "pettingzoo", "num_obstacles": n}) for n in (0, 3)]
-    + [("formation", {"horizon": 40, "num_agents": 4, "num_obstacles": 2, **more}) for more in (
+    + [("formation", {"horizon": 20, "num_agents": 4, "num_obstacles": 2, **more}) for more in (
         {}, {"physics": "pymunk"}, {"actions": "discrete"}, {"convention": "tight"}, {"sensor_noise_m": 0.01},
         {"heading_noise_rad": 0.1}, {"sensor_noise_m": 0.05, "heading_noise_rad": 0.05}, {"wheel_mismatch": 0.1},
         {"neighbours": 2}, {"mass_spread": 0.3, "friction_spread": 0.3})]
