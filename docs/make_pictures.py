@@ -1,4 +1,7 @@
-"""Draw the pictures of the explanations: scenes under a group, and boxes with arrows: python docs/make_pictures.py."""
+"""Draw the pictures of the explanations: scenes under a group, boxes with arrows, and how far elements are trusted.
+
+python docs/make_pictures.py
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from esp_cli.checking.measured import prepared
 from esp_cli.symmetry import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
+from esp_cli.training.config import resolve_config
 
 PICTURES = Path(__file__).parent / "pictures"
 AGENTS = np.array([[-0.65, -0.35], [0.1, -0.75], [0.35, 0.5]])
 LANDMARKS = np.array([[-0.3, 0.45], [0.75, -0.45], [0.75, 0.8]])
 MOVES = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
+
+STRENGTHS = {
+    "action_turn_rad": (0.0, 0.25, 0.5, 1.0, 1.57),
+    "reward_offset": (0.0, 0.1, 0.2, 0.3, 0.5),
+    "mud": (0.0, 0.25, 0.5, 0.75, 1.0),
+    "wind": (0.0, 0.15, 0.3, 0.6, 1.0),
+}
+"""Settings of navigation that break its symmetry."""
+ELEMENTS = {"rot90": "o-", "rot180": "s-", "flip-x": "^--", "flip-y": "v--", "flip-diagonal": "d--"}
+"""What stands for the elements of d4, and how it is drawn."""
 
 Box = tuple[float, float, str]
 Arrow = tuple[str, str]
@@ -133,6 +148,25 @@ def boxes(nodes: dict[str, Box], arrows: Sequence[Arrow], size: tuple[float, flo
     return figure
 
 
+def trust() -> Figure:
+    """Draw the measured weight of each element over the size of what breaks navigation."""
+    figure = Figure(figsize=(8.0, 2.6), layout="constrained")
+    axes = figure.subplots(1, len(STRENGTHS), sharey=True)
+    for ax, (setting, strengths) in zip(axes, STRENGTHS.items(), strict=True):
+        weights = [
+            prepared(resolve_config("navigation", overrides={"prior.trust": "measured", f"task.{setting}": size}))
+            for size in strengths
+        ]
+        for name, style in ELEMENTS.items():
+            ax.plot(strengths, [run.prior.weights[name] for run in weights], style, label=name, markersize=4)
+        ax.set(title=setting, xlabel="size", ylim=(-0.05, 1.05))
+        ax.grid(alpha=0.4)
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel("weight of its copies")
+    axes[-1].legend(fontsize=7)
+    return figure
+
+
 def main() -> None:
     """Draw every picture."""
     mpl.rcParams.update({"font.size": 9})
@@ -144,6 +178,7 @@ def main() -> None:
         "eight-images": scenes([still, *named.values()], ["identity", *named], 2),
         "esp-update": boxes(*UPDATE, size=(8.0, 2.6)),
         "rooms": boxes(*ROOMS, size=(8.0, 6.5)),
+        "trust": trust(),
     }
     for name, figure in figures.items():
         figure.savefig(PICTURES / f"{name}.png", dpi=150, metadata={"Software": None})

@@ -113,6 +113,11 @@ def _numpy(job: _Job) -> Files:
 def _epuck(job: _Job, kind: str) -> Files:
     """Return the numpy policy with what a robot's program needs around it."""
     spec = job.alone.spec
+    if compass := job.alone.config.prior.effective().compass:
+        raise ValueError(
+            f"webots and ros2 build what a robot sees from poses, and know no compass; train without prior.compass, or "
+            f"export numpy or c and end each observation with {compass:g}, 0, 0, {compass:g}"
+        )
     if "robot" not in job.description:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
     if job.program.memory_width:

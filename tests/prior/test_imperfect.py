@@ -20,7 +20,7 @@ from esp_cli.training.policy_file import read_policy
 from esp_envs import make
 from esp_envs.compass import Compass, framed
 from esp_envs.spec import joint_layout
-from tests.cli.running import esp
+from tests.cli.running import esp, refused
 from tests.learning.golden import digest
 from tests.prior.test_copies import SPACES, Squared, rows
 
@@ -250,6 +250,15 @@ def test_every_learner_sees_the_compass(algorithm: str) -> None:
     learner = build_learner(config)
     assert learner.spec.observation.width == 18
     assert learner.spec == build_environment(config, 1, "x").spec
+
+
+def test_a_robots_program_takes_no_policy_with_a_compass(tmp_path: Path) -> None:
+    small = ("--set", "mappo.num_envs=2", "--set", "mappo.num_minibatches=1", "--set", "mappo.num_epochs=1")
+    esp("train", "--task", "formation", "--steps", "600", "--seeds", "1", "--out", tmp_path / "run", *small,
+        "--set", "prior.compass=0.5", "--set", "evaluation.episodes=2")  # fmt: skip
+    said = refused("export", tmp_path / "run", "-f", "webots", "-o", tmp_path / "out")
+    assert "know no compass" in said
+    assert "end each observation with 0.5, 0, 0, 0.5" in said
 
 
 def test_a_policy_with_a_compass_is_evaluated_drawn_and_exported_as_any_other(tmp_path: Path) -> None:
