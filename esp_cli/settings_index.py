@@ -26,7 +26,7 @@ class Setting:
         bounds: of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none.
         unit: of its value; empty for a bare number.
         description: what it does.
-        presets: values that a preset sets instead, by preset.
+        presets: values that a preset sets instead, by preset; "fast on navigation" on this task alone.
         tasks: values that the preset default sets on a task instead, by task.
     """
 

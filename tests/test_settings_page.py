@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from esp_cli.algorithms.presets import PRESETS, TUNED
+from esp_cli.algorithms.presets import FAST, PRESETS, TUNED, Sections
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
@@ -21,6 +21,7 @@ SHARED: dict[str, tuple[type[BaseModel], ...]] = {
     "evaluation": (EvaluationConfig,),
 }
 TUNED_ROW = re.compile(r"^\| ([\w-]+) \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
+FAST_ROW = re.compile(r"^\| ([\w-]+), fast \| `(\w+\.\w+)` \| (\S+) \|$", re.MULTILINE)
 ROW = re.compile(r"\| `(\w+)\.(\w+)` \| ([^|]+) \| ([^|]+) \|")
 
 
@@ -48,11 +49,14 @@ def expected(algorithm: str) -> dict[str, tuple[str, ...]]:
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_what_a_task_changes_stands_on_the_page(algorithm: str) -> None:
-    rows = TUNED_ROW.findall((DOCS / f"{algorithm}.md").read_text(encoding="utf-8"))
+@pytest.mark.parametrize(("pattern", "changes"), [(TUNED_ROW, TUNED), (FAST_ROW, FAST)], ids=["default", "fast"])
+def test_what_a_preset_changes_on_a_task_stands_on_the_page(
+    algorithm: str, pattern: re.Pattern[str], changes: dict[str, dict[str, Sections]]
+) -> None:
+    rows = pattern.findall((DOCS / f"{algorithm}.md").read_text(encoding="utf-8"))
     changed = {
         (task, f"{section}.{name}", written(value))
-        for task, sections in TUNED.get(algorithm, {}).items()
+        for task, sections in changes.get(algorithm, {}).items()
         for section, values in sections.items()
         for name, value in values.items()
     }

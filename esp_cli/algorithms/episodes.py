@@ -36,7 +36,7 @@ class EpisodeCollector:
         """
         env, policy, head = self.env, self.policy, self.policy.head
         steps, agents = env.spec.horizon, env.spec.num_agents
-        noise = head.noise((steps, env.num_envs, agents), self.generators).to(env.device)
+        noise = head.noise((steps, env.num_envs, agents), self.generators).to(env.device, non_blocking=True)
         observation = env.reset()
         memory = policy.initial_memory(env.num_envs, observation.obs)
         running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)

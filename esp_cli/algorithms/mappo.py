@@ -136,7 +136,8 @@ class Mappo(Learner):
         config = self.config
         reward = rollout.reward.mean(-1, keepdim=True) if self.num_values == 1 else rollout.reward
         with torch.no_grad():
-            raw_value, raw_next = values_along(self.critic, rollout, self.spec.horizon if self.recurrent else None)
+            episode = self.spec.horizon if self.recurrent else None
+            raw_value, raw_next = values_along(self.critic, rollout, episode, self.spec.terminates)
         value, next_value = self.normaliser.denormalise(raw_value), self.normaliser.denormalise(raw_next)
         ended = rollout.ended.unsqueeze(-1)
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended

@@ -1,7 +1,8 @@
 """Presets: what `--preset` and the task change in the defaults of an algorithm, a network, the prior and evaluation.
 
 `PRESETS` holds settings by algorithm, preset and section. `TUNED` holds what the preset `default` changes on a task:
-the settings that measured best there. A setting that neither table names keeps the default of its config class.
+the settings that measured best there. `FAST` holds what the preset `fast` changes in `default` on a task: fewer
+seconds to the same return. A setting that no table names keeps the default of its config class.
 """
 
 from __future__ import annotations
@@ -155,3 +156,42 @@ TUNED: dict[str, dict[str, Sections]] = {
         },
     },
 }
+
+_FAST_ON_PARTICLES: Sections = {
+    "mappo": {
+        "num_envs": 128,
+        "num_epochs": 5,
+        "num_minibatches": 5,
+        "learning_rate": 4e-3,
+        "gamma": 0.95,
+        "gae_lambda": 0.9,
+    },
+}
+
+# Acting takes a tenth of the time of ten epochs, so more worlds and fewer passes over what they bring save seconds.
+# What this loses per step, a larger rate and a nearer horizon bring back.
+FAST: dict[str, dict[str, Sections]] = {
+    "mappo": {
+        "navigation": _FAST_ON_PARTICLES,
+        "predator-prey": _FAST_ON_PARTICLES,
+        "formation": {"mappo": {"num_epochs": 3, "learning_rate": 2e-3, "gamma": 0.98, "gae_lambda": 0.95}},
+    },
+}
+
+
+def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
+    """Return the settings of a preset on a task, layer by layer; a later one has the last word.
+
+    Raises:
+        ValueError: the algorithm has no such preset, or has none called fast for this task.
+    """
+    presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
+    if preset == "fast" and fast:
+        if task not in fast:
+            raise ValueError(f"{algorithm} has no preset 'fast' for {task}; it has one for {', '.join(fast)}")
+        return [presets["default"], TUNED.get(algorithm, {}).get(task, {}), fast[task]]
+    if preset not in presets:
+        raise ValueError(
+            f"{algorithm} has no preset '{preset}'; it has {', '.join([*presets, *['fast'][: len(fast)]])}"
+        )
+    return [presets[preset], TUNED.get(algorithm, {}).get(task, {})] if preset == "default" else [presets[preset]]

@@ -80,7 +80,8 @@ class Collector:
         """Act for `num_steps` steps in every world with actions drawn from the policy."""
         spec, device = self.env.spec, self.env.device
         lead = (self.env.num_seeds, self.env.num_envs, num_steps)
-        noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators).to(device)
+        noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators)
+        noise = noise.to(device, non_blocking=True)
         obs = torch.empty(*lead, spec.num_agents, spec.observation.width, device=device)
         state = torch.empty(*lead, spec.state.width, device=device)
         reward = torch.empty(*lead, spec.num_agents, device=device)
@@ -168,13 +169,16 @@ def stacked(flags: Sequence[Tensor | None]) -> Tensor | None:
     return torch.stack(known, 2) if known else None
 
 
-def values_along(critic: Critic, rollout: Rollout, episode: int | None) -> tuple[Tensor, Tensor]:
+def values_along(
+    critic: Critic, rollout: Rollout, episode: int | None, terminates: bool = True
+) -> tuple[Tensor, Tensor]:
     """Return V(s_t) and V of what really followed, each [S, E, T, C], in the critic's units.
 
     Args:
         critic: the networks.
         rollout: what they are asked about.
         episode: steps of the whole episodes that a recurrent critic is unrolled over; None of one without memory.
+        terminates: whether an episode may terminate before the horizon; asking which did makes a GPU be waited for.
     """
     if episode is not None:
         finals = [rollout.finals[t] for t in sorted(rollout.finals)]
@@ -185,9 +189,9 @@ def values_along(critic: Critic, rollout: Rollout, episode: int | None) -> tuple
     value = critic.unroll(rollout.obs, rollout.state)
     next_value = torch.cat([value[:, :, 1:], _value_of(critic, rollout.last).unsqueeze(2)], 2)
     # An episode that terminated has no value behind its end: only truncated ones are worth a look at their last state.
-    cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist()
+    cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist() if terminates else None
     for t, final in rollout.finals.items():
-        if cut[t]:
+        if cut is None or cut[t]:
             next_value[:, :, t] = _value_of(critic, final)
     return value, next_value
 

@@ -39,7 +39,7 @@ def configured(_: typer.Context, incomplete: str) -> list[str]:
 
 def presets(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the presets."""
-    return _starting(incomplete, ["default", "paper"])
+    return _starting(incomplete, ["default", "fast", "paper"])
 
 
 def settings(context: typer.Context, incomplete: str) -> list[str]:

@@ -89,7 +89,8 @@ def _print(section: Section) -> None:
 
 def _meaning(setting: Setting) -> str:
     """Return what a setting does, and what presets and tasks set it to instead."""
-    changed = {} if "paper:" in setting.description else dict(setting.presets)
+    told = "paper" if "paper:" in setting.description else None
+    changed = {name: value for name, value in setting.presets.items() if name != told}
     texts = [f"{name} {_written(value)}" for name, value in {**changed, **setting.tasks}.items()]
     return f"{setting.description} ({'; '.join(texts)})" if texts else setting.description
 

@@ -56,7 +56,11 @@ StudyOutOption = Annotated[
     Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.", metavar="DIR")
 ]
 PresetOption = Annotated[
-    str, typer.Option("--preset", help="'default' (measured best) or 'paper' (the paper's settings).")
+    str,
+    typer.Option(
+        "--preset",
+        help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
+    ),
 ]
 JobsOption = Annotated[
     int | None,

@@ -49,7 +49,11 @@ def train(
     task: TaskOption = "navigation",
     algo: AlgoOption = "mappo",
     preset: Annotated[
-        str, typer.Option("--preset", help="'default' (measured best) or 'paper' (the paper's settings).")
+        str,
+        typer.Option(
+            "--preset",
+            help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
+        ),
     ] = "default",
     prior: Annotated[
         Literal["esp", "augment", "consistency", "none"] | None,

@@ -219,7 +219,7 @@ def train(
         algo: "mappo", "maddpg" or "qmix", "module:Class", or the class of one.
         steps: environment steps per seed.
         seeds: the run's seeds.
-        preset: "default" or "paper".
+        preset: "default", "fast" or "paper".
         settings: dotted names to values, as `--set` takes them: {"prior.kind": "none", "task.num_agents": 4}.
         device: "cpu", "cuda", or "auto" for the latter where there is one.
         out: the run folder; by default a new one in runs/.

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from esp_cli.algorithms.presets import PRESETS, TUNED, Sections
+from esp_cli.algorithms.presets import FAST, PRESETS, TUNED, Sections
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
@@ -65,7 +65,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             bounds=_bounds(schema[name]),
             unit=str(schema[name].get("unit", "")) or _unit(name),
             description=field.description or "",
-            presets=_changes(section, name, PRESETS),
+            presets=_changes(section, name, PRESETS) | _changes(section, name, FAST, "fast on "),
             tasks=_changes(section, name, TUNED),
         )
         for name, field in model.model_fields.items()
@@ -73,10 +73,10 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
     )
 
 
-def _changes(section: str, name: str, layers: Mapping[str, Mapping[str, Sections]]) -> dict[str, Any]:
+def _changes(section: str, name: str, layers: Mapping[str, Mapping[str, Sections]], prefix: str = "") -> dict[str, Any]:
     """Return the values that presets or tasks set; in a section that algorithms share, with the algorithm before."""
     return {
-        layer if algorithm == section else f"{algorithm} {layer}": values[section][name]
+        f"{prefix}{layer}" if algorithm == section else f"{algorithm} {prefix}{layer}": values[section][name]
         for algorithm, by_layer in layers.items()
         for layer, values in by_layer.items()
         if name in values.get(section, {})

@@ -71,7 +71,7 @@ CASES = {
     "predator-prey, mappo, 1 seed": Case("--task predator-prey", 1, 85.0, every=10_000),
     # an episode has 300 steps of physics: 320 of them would take longer than the training between two evaluations
     "formation, tight, mappo, 1 seed": Case(
-        "--task formation --set task.convention=tight", 1, 218.0, every=48_000, episodes=64
+        "--task formation --set task.convention=tight", 1, 218.0, every=24_000, episodes=32
     ),
 }
 

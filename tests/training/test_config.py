@@ -135,7 +135,7 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
     [
         ({"task": "chess"}, "unknown task 'chess'; the tasks are navigation, predator-prey"),
         ({"algorithm": "magic"}, "unknown algorithm 'magic'; the algorithms are mappo"),
-        ({"preset": "best"}, "mappo has no preset 'best'; it has default, paper"),
+        ({"preset": "best"}, "mappo has no preset 'best'; it has default, paper, fast"),
         (
             {"overrides": {"speed": 1}},
             "cannot set 'speed': a setting is SECTION.NAME with a section of task, mappo, network, prior, evaluation",

@@ -1,0 +1,45 @@
+"""The preset `fast` is the preset `default` of a task with the changes that its table states."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.algorithms.presets import FAST, PRESETS, preset_layers
+from esp_cli.training.config import resolve_config
+
+
+@pytest.mark.parametrize(("algorithm", "task"), [(algorithm, task) for algorithm in FAST for task in FAST[algorithm]])
+def test_fast_is_the_default_of_the_task_but_for_what_its_table_states(algorithm: str, task: str) -> None:
+    default, fast = (
+        resolve_config(task, algorithm, preset).model_dump(mode="json", exclude={"preset"})
+        for preset in ("default", "fast")
+    )
+    for section, values in FAST[algorithm][task].items():
+        part = "algorithm_settings" if section == algorithm else section
+        for name, value in values.items():
+            assert fast[part][name] == value
+            assert default[part].pop(name) != fast[part].pop(name), f"{section}.{name} is stated though it is the same"
+    assert fast == default
+
+
+def test_fast_keeps_what_the_task_changes() -> None:
+    assert resolve_config("formation", "mappo", "fast").algorithm_settings["num_steps"] == 300
+
+
+def test_an_override_has_the_last_word_over_fast() -> None:
+    config = resolve_config("navigation", "mappo", "fast", overrides={"mappo.num_envs": 16})
+    assert config.algorithm_settings["num_envs"] == 16
+    assert "--preset fast" in config.command()
+    assert "num_epochs" not in config.command(), "the preset says it"
+
+
+def test_a_task_that_fast_was_not_tuned_on_is_refused() -> None:
+    with pytest.raises(ValueError, match="mappo has no preset 'fast' for wildlife; it has one for navigation, "):
+        preset_layers("wildlife", "mappo", "fast")
+
+
+def test_a_learner_without_fast_settings_is_told_what_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(FAST, "qmix", {})
+    with pytest.raises(ValueError, match=r"^qmix has no preset 'fast'; it has default, paper$"):
+        preset_layers("navigation", "qmix", "fast")
+    assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"]]
