@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -83,16 +85,17 @@ def probe(config: RunConfig, episodes: int) -> Cost:
 
 def _probe(config: RunConfig, episodes: int) -> Cost:
     learner = build_learner(config)
+    clock = _clock(config)
     iterations = -(-config.steps // learner.steps_per_iteration)
-    begun = time.monotonic()
+    begun = clock()
     metrics = learner.iterate(0.0).metrics
-    per_iteration = time.monotonic() - begun
+    per_iteration = clock() - begun
     if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
-        done, begun = 0, time.monotonic()
-        while done == 0 or (time.monotonic() - begun < PROBE_SECONDS and done < iterations):
+        done, begun = 0, clock()
+        while done == 0 or (clock() - begun < PROBE_SECONDS and done < iterations):
             metrics = learner.iterate(done / iterations).metrics
             done += 1
-        per_iteration = (time.monotonic() - begun) / done
+        per_iteration = (clock() - begun) / done
     per_episode = _seconds_per_episode(config, learner)
     evaluations = 1 + config.steps // config.evaluation.every_steps
     weights = sum(tensor.nbytes for tensor in learner.policy.state_dict().values())
@@ -106,13 +109,23 @@ def _probe(config: RunConfig, episodes: int) -> Cost:
     )
 
 
+def _clock(config: RunConfig) -> Callable[[], float]:
+    """Return what seconds are read from: the processor time of this process, to which other work adds little.
+
+    Where a GPU or processes of their own for the worlds work, this one waits, and time is what a watch says.
+    """
+    alone = config.device == "cpu" and not multiprocessing.active_children()
+    return time.process_time if alone else time.monotonic
+
+
 def _seconds_per_episode(config: RunConfig, learner: Learner) -> float:
     """Return the seconds that one greedy episode of every seed takes, played side by side with others."""
     count = min(config.evaluation.episodes, _PROBED_EPISODES)
     env = build_environment(config, count, "probe")
-    begun = time.monotonic()
+    clock = _clock(config)
+    begun = clock()
     play(env, PolicyController(learner.policy, generators(config.seeds, "probe")))
-    return (time.monotonic() - begun) / count
+    return (clock() - begun) / count
 
 
 def _bytes(learner: Learner, complete: bool = False) -> int:

@@ -21,13 +21,21 @@ def short(monkeypatch):
 def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeypatch):
     # a clock that ticks once at every look: an iteration and an evaluation cost the same in both
     ticks = iter(range(10**6))
-    monkeypatch.setattr(cost.time, "monotonic", lambda: float(next(ticks)))
+    monkeypatch.setattr(cost.time, "process_time", lambda: float(next(ticks)))
     one, two = cost.probe(tiny_config(steps=1000), 4), cost.probe(tiny_config(steps=2000), 4)
     # 20 and 40 iterations; 11 and 21 evaluations of 2 x 2 episodes; an episode takes half a tick
     iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
     assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
     # greedy, drawn, random, and the two heuristics of navigation, four episodes each
     assert one.evaluation_s == two.evaluation_s == 5 * 4 * 0.5
+
+
+def test_other_work_on_the_machine_costs_a_run_nothing(monkeypatch):
+    """The processor time of a process does not pass while it sleeps; a GPU's time does."""
+    monkeypatch.setattr(cost.time, "process_time", lambda: 7.0)
+    monkeypatch.setattr(cost.time, "monotonic", lambda: pytest.fail("a watch was read"))
+    assert cost.probe(tiny_config(steps=100), 4).training_s == 0.0
+    assert cost._clock(tiny_config().model_copy(update={"device": "cuda"})) is cost.time.monotonic
 
 
 def test_the_replay_is_counted_as_full_as_it_will_be():
