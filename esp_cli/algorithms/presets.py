@@ -174,7 +174,6 @@ FAST: dict[str, dict[str, Sections]] = {
     "mappo": {
         "navigation": _FAST_ON_PARTICLES,
         "predator-prey": _FAST_ON_PARTICLES,
-        "formation": {"mappo": {"num_epochs": 3, "learning_rate": 2e-3, "gamma": 0.98, "gae_lambda": 0.95}},
     },
 }
 

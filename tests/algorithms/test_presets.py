@@ -22,8 +22,10 @@ def test_fast_is_the_default_of_the_task_but_for_what_its_table_states(algorithm
     assert fast == default
 
 
-def test_fast_keeps_what_the_task_changes() -> None:
-    assert resolve_config("formation", "mappo", "fast").algorithm_settings["num_steps"] == 300
+def test_fast_keeps_what_the_task_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(FAST["mappo"], "formation", {"mappo": {"num_epochs": 3}})
+    settings = resolve_config("formation", "mappo", "fast").algorithm_settings
+    assert (settings["num_steps"], settings["num_epochs"]) == (300, 3)
 
 
 def test_an_override_has_the_last_word_over_fast() -> None:
