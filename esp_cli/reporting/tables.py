@@ -167,8 +167,8 @@ def verdicts_table(results: Results) -> Table | None:
     said = {True: "yes", False: "no", None: NOTHING}
     rows = tuple((v.method, said[v.unbroken], said[v.largest], said[v.between]) for v in verdicts(results))
     caption = (
-        "A default is within one standard error of ESP where nothing is broken, not behind the plain learner at the "
-        "largest strength, and in between ahead of both or level with them; in every task. "
+        "Where nothing is broken, a default is within one standard error of ESP. At the largest strength it is not "
+        "behind the plain learner. In between it is ahead of both or level with them. All of it holds in every task. "
         f"{NOTHING}: runs are missing."
     )
     headings = ("method", "as ESP unbroken", "not behind plain at the largest", "ahead or level in between")
