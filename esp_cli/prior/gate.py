@@ -15,14 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from esp_cli.symmetry import Transform
-from esp_envs.base import Environment
 from esp_envs.spec import Continuous, Discrete, Kind, Spaces
+
+if TYPE_CHECKING:  # a loop of one's own brings no environment of ours
+    from esp_envs.base import Environment
 
 ROWS = 12_800
 """Joint steps that the predictors are fitted to, about."""
