@@ -10,10 +10,10 @@ DEMO := runs/demo
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench docs site torture clean
+.PHONY: help demo test test-slow check bench docs site torture clean
 
 help: ## list what make can do
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-7s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/.installed ## teach eight robots to change places, evaluate and draw them as a GIF (about 3 minutes)
 	@if [ -f $(DEMO)/config.json ]; then \
@@ -26,8 +26,11 @@ demo: $(VENV)/.installed ## teach eight robots to change places, evaluate and dr
 	$(BIN)/esp render $(DEMO) -o $(DEMO)/demo.gif
 	@echo "Look at $(DEMO)/demo.gif"
 
-test: $(VENV)/.installed-test ## run the whole test suite
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+test: $(VENV)/.installed-test ## run the tests (4 minutes), but for those marked slow
+	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
+
+test-slow: $(VENV)/.installed-test ## run the tests marked slow (3 minutes)
+	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## lint, format and types over every package
 	$(BIN)/ruff check .

@@ -95,6 +95,7 @@ def test_an_iteration_reads_nothing_back(algorithm: str, task: str) -> None:
     assert result.finite.device == META, "else this test would say nothing"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gru", "mlp"])
 @pytest.mark.usefixtures("meta")
 def test_nor_does_one_with_memory_or_all_copies(name: str) -> None:

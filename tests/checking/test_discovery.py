@@ -54,6 +54,7 @@ def discovered(task: str, settings, transforms: str | None = None, logs_alone: b
     return discover_in_task(worlds, transforms, logs_alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "settings", "group"), FOUND, ids=str)
 def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> None:
     robots = "d4,agents-1-0-2-3,agents-0-2-1-3,agents-0-1-3-2" if task == "formation" else None
@@ -62,6 +63,7 @@ def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> 
     assert bool(found.transforms) == (group != "c1")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "settings", "group"), [*FOUND[:2], *FOUND[3:5]], ids=str)
 def test_logs_alone_show_the_same(task, settings, group) -> None:
     found = discovered(task, settings, logs_alone=True)

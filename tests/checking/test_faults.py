@@ -99,6 +99,7 @@ def test_there_are_fifty_faults() -> None:
     assert len(FAULTS) == 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "fault"), [(t, f) for t, _, f in FAULTS], ids=[f"{t[0]}-{n}" for t, n, _ in FAULTS])
 def test_a_fault_is_found(task, fault: Fault) -> None:
     report = check_symmetry(with_fault(*task, fault), elements_of(*task))
@@ -135,6 +136,7 @@ def test_there_are_fifty_clean_cases() -> None:
     assert len(CLEAN) == 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "settings"), CLEAN, ids=str)
 def test_a_clean_task_is_not_accused(task: str, settings) -> None:
     elements = elements_of(task, settings).replace("rot90", "rot180" if settings.get("width") == 7 else "rot90")

@@ -129,6 +129,7 @@ def test_a_half_done_study_is_planned_and_reported(tmp_path: Path) -> None:
     assert (folder / "report" / "report.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("like_machine")
 def test_a_finished_study_has_the_numbers_of_the_old_one(study: Path, tmp_path: Path) -> None:
     esp("report", study, "--results", tmp_path / "new.json")

@@ -237,6 +237,7 @@ def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     assert runs[1].cell.name not in screen
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("forked_jobs")
 def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_path: Path) -> None:
     out = tmp_path / "s"

@@ -184,6 +184,7 @@ def with_hostile_tensor(tensors: dict[str, Tensor], draw: random.Random) -> dict
     return changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["choice", "wheels", "values, recurrent"])
 def test_files_written_on_purpose_give_a_sentence_or_a_policy(kind: str, tmp_path: Path) -> None:
     original = drawn_policy(kind, seeds=(3, 7), hidden=(4,))

@@ -68,6 +68,7 @@ def both(program: Program, rows: np.ndarray) -> list[np.ndarray]:
     return [numpy_policy(program).outputs(rows, np.zeros((len(rows), 0)))[0], through_torch]
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_those_just_three_cells_away_both_ways_are_not_heard_by_any_of_them(tmp_path: Path) -> None:
     alone = drawn_policy("team")
@@ -119,6 +120,7 @@ def test_a_drawn_network_as_layers_and_its_costs() -> None:
     assert second.flops == 2 * 16 * 25 * 32 * 16
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
 def test_the_worked_example_is_a_whole_world(tmp_path: Path) -> None:
     export(drawn_policy("team"), ["c", "numpy"], tmp_path)

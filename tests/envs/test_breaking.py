@@ -50,6 +50,7 @@ def carried(spec: Spaces) -> set[str]:
     return {element.name for element in (elements.generators() if isinstance(elements, Group) else elements)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "settings", "left"), BROKEN, ids=str)
 def test_the_check_finds_the_group_that_is_declared_to_be_left(task: str, settings, left: str) -> None:
     settings = settings | (SMALL if task == "formation" else {})

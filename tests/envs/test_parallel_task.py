@@ -296,6 +296,7 @@ def test_the_spread_of_the_page_agrees_with_mpe2_step_by_step(page: None) -> Non
     np.testing.assert_array_equal(step.final.obs[0, 0].numpy(), np.float32(list(seen.values())))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "package"), [("spread:Spread", "mpe2"), ("pendulum:Pendulum", "gymnasium")])
 def test_the_tasks_of_the_page_keep_every_promise(page: None, task: str, package: str) -> None:
     pytest.importorskip(package, reason=f"the package {package} is missing")

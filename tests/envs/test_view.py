@@ -218,11 +218,13 @@ def run_without(missing: str, script: str, **variables: str) -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_physics_first_does_not_stop_drawing_later(painter: SpacePainter) -> None:
     physics = "import mujoco; m = mujoco.MjSpec().compile(); mujoco.mj_step(m, mujoco.MjData(m))"
     assert run_without("", physics + _DRAW).startswith("drawn True None")
 
 
+@pytest.mark.slow
 def test_without_osmesa_egl_draws_and_the_package_is_named() -> None:
     told = run_without("OSMesa", _DRAW)
     if told.startswith("not drawn"):
@@ -232,6 +234,7 @@ def test_without_osmesa_egl_draws_and_the_package_is_named() -> None:
     assert "dnf install mesa-libOSMesa" in told
 
 
+@pytest.mark.slow
 def test_without_any_library_one_sentence_says_what_to_install() -> None:
     told = run_without("OSMesa EGL", _DRAW)
     assert told.startswith(
@@ -241,6 +244,7 @@ def test_without_any_library_one_sentence_says_what_to_install() -> None:
     assert told.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_variable_that_names_a_missing_library_stops_nothing() -> None:
     trap = run_without("OSMesa EGL", "import mujoco", MUJOCO_GL="osmesa")
     assert "AttributeError" in trap, "else there is nothing to guard against"

@@ -18,6 +18,7 @@ def test_every_case_has_weights_on_file_and_no_two_are_equal() -> None:
     assert len(set(ON_FILE["weights"].values())) == len(CASES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.usefixtures("like_machine")
 def test_weights_are_those_on_file(case: str, tmp_path: Path) -> None:

@@ -87,6 +87,7 @@ def test_a_squash_that_commutes_leaves_the_divergence_exact() -> None:
         assert got.isfinite().all(), "a turned action outside of the box is clipped to it"
 
 
+@pytest.mark.slow
 def test_samples_agree_with_the_closed_form_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     g, scale = element("rot90", FORCE), torch.tensor([0.3, 0.6])

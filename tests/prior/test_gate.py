@@ -150,6 +150,7 @@ def test_who_differs_is_seen_where_agents_are_exchanged() -> None:
     assert kept(0.0) > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", SMALL)
 def test_training_with_a_gate_is_esp_where_nothing_is_broken_and_differs_where_something_is(
     algorithm: str, tmp_path: Path

@@ -93,6 +93,7 @@ def test_who_takes_a_worker_over_before_its_job_begins_sends_all_files_anew(work
     assert (Path(lease["folder"]) / "checkpoints" / "step-000000000100.safetensors").read_bytes() == b"weights"
 
 
+@pytest.mark.slow
 def test_a_worker_that_nobody_calls_ends_itself_and_its_job(tmp_path):
     program = (sys.executable, "-S", "-c", "import time; time.sleep(60)")
     code = (

@@ -44,12 +44,14 @@ def kills(tmp_path_factory):
     return Kills(tmp_path_factory.mktemp("kills"), 1)
 
 
+@pytest.mark.slow
 def test_runs_that_were_killed_end_as_runs_that_were_not(kills, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert [kills.run(number) for number in range(4)] == [None] * 4
     assert kills.count() >= 4
 
 
+@pytest.mark.slow
 def test_a_study_of_real_processes_loses_nothing_when_any_or_all_of_them_are_killed(tmp_path):
     whole, path = tmp_path / "whole" / "study", tmp_path / "killed" / "study"
     for folder in (whole, path):
@@ -63,6 +65,7 @@ def test_a_study_of_real_processes_loses_nothing_when_any_or_all_of_them_are_kil
     assert study_state(path) == study_state(whole)
 
 
+@pytest.mark.slow
 def test_a_run_folder_that_forgets_a_checkpoint_is_found(kills, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_folder.RunFolder, "truncate_metrics", lambda self, after_step: 0)

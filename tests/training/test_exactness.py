@@ -23,6 +23,7 @@ def weights(algorithm, network, seeds, threads=1):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "network"), LEARNERS)
 def test_a_seed_alone_equals_itself_among_ten_to_rounding(algorithm, network):
     ten = weights(algorithm, network, range(10))
@@ -31,6 +32,7 @@ def test_a_seed_alone_equals_itself_among_ten_to_rounding(algorithm, network):
     assert (ten[6] - alone[0]).abs().max() > 1000 * ROUNDING  # negative control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algorithm", "network"), LEARNERS)
 def test_one_thread_equals_itself_bit_for_bit_and_two_to_rounding(algorithm, network):
     one = weights(algorithm, network, (0, 1))
@@ -45,6 +47,7 @@ def test_two_hundred_seeds_train_and_each_equals_itself_alone():
     assert many.isfinite().all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="counts by /proc, which Linux has")
 def test_training_takes_no_more_memory_and_no_more_files_the_longer_it_lasts(tmp_path):
     folder = tiny_folder(tmp_path / "run", steps=6000)

@@ -24,6 +24,7 @@ def measured(tmp_path, *command):
     return exit_code, json.loads(record.read_text())["growth"]
 
 
+@pytest.mark.slow
 def test_a_command_that_holds_what_it_holds_does_not_grow(tmp_path, capsys):
     code, found = measured(tmp_path, "sleep", "60")
     assert code == 0
@@ -31,6 +32,7 @@ def test_a_command_that_holds_what_it_holds_does_not_grow(tmp_path, capsys):
     assert "after 0.008 min: RSS +0.00 MB/hour" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leak", [LEAKS_MEMORY, IN_A_CHILD])
 def test_memory_that_leaks_is_found_in_the_command_and_in_its_children(tmp_path, leak):
     code, found = measured(tmp_path, sys.executable, "-c", leak)
@@ -39,6 +41,7 @@ def test_memory_that_leaks_is_found_in_the_command_and_in_its_children(tmp_path,
     assert found["files"] == 0
 
 
+@pytest.mark.slow
 def test_files_that_leak_are_found(tmp_path):
     code, found = measured(tmp_path, sys.executable, "-c", LEAKS_FILES)
     assert code == 1

@@ -350,6 +350,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 def test_a_run_killed_again_and_again_equals_one_that_ran_through(tmp_path):
     through = RunFolder.create(tmp_path / "through", CONFIG)
     killed = RunFolder.create(tmp_path / "killed", CONFIG)
