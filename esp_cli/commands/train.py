@@ -56,10 +56,10 @@ def train(
         ),
     ] = "default",
     prior: Annotated[
-        Literal["esp", "augment", "consistency", "none"] | None,
+        Literal["esp", "auto", "augment", "consistency", "none"] | None,
         typer.Option(
             "--prior",
-            help="esp: both parts of the prior; augment or consistency: one of them; none: the plain learner.",
+            help="esp: both parts; auto: as far as the task is symmetric; augment, consistency: one part; none: plain.",
         ),
     ] = None,
     transforms: TransformsOption = None,

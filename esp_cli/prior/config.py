@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+_AUTO = {"kind": "esp", "trust": "measured", "fade": 0.5}
+"""What `kind` "auto" stands for, under what else the user chooses."""
 
 
 class PriorConfig(BaseModel):
     """The symmetry prior: which elements, and how they enter learning.
 
     `kind` "esp" has both parts, copies and consistency losses; "augment" and "consistency" have one of them; "none" is
-    the plain learner.
+    the plain learner. "auto" is short for "esp" with trust "measured" that fades: elements that hold stay, the others
+    count by how nearly they hold, and only for the first half of the run.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: Literal["esp", "augment", "consistency", "none"] = Field(
-        "esp", description="copies and consistency losses, one of them alone, or neither: the plain learner"
+    kind: Literal["esp", "augment", "consistency", "none", "auto"] = Field(
+        "esp", description="copies and losses, one of them alone, neither (plain), or auto: what holds in the task"
     )
     transforms: str = Field(
         "d4", description="elements, a group, or discovered; paper: rot90; ours: measured best on navigation"
@@ -41,7 +46,7 @@ class PriorConfig(BaseModel):
     )
 
     fade: float = Field(
-        0.0, ge=0, le=1, description="share of the run over which copies and c fall to 0, linearly; 0: they stay"
+        0.0, ge=0, le=1, description="share of the run over which what is not certain falls to 0, linearly; 0: it stays"
     )
     compass: float = Field(
         0.0,
@@ -54,10 +59,17 @@ class PriorConfig(BaseModel):
         "full",
         description="weight of a copy: 1, by how far its element is broken, or how far it is in this state and action",
     )
-    doubt: float = Field(2.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
+    doubt: float = Field(8.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
         {}, description="weight of each element by its name; filled in where trust is measured or a gate"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _written_out(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or data.get("kind") != "auto":
+            return data
+        return {**_AUTO, **{name: value for name, value in data.items() if name != "kind"}}
 
     @property
     def augments(self) -> bool:
@@ -85,6 +97,8 @@ class PriorConfig(BaseModel):
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
         sure = bool(self.weights) and all(weight == 1 for weight in self.weights.values())
-        lost = loses[kind] | ({"trust", "doubt", "weights"} if self.trust == "full" or sure else set())
+        lost = loses[kind]
+        if self.trust == "full" or sure:
+            lost = lost | {"trust", "doubt", "weights"} | ({"fade"} if self.trust != "full" else set())
         kept = {name: value for name, value in self if name not in lost}
         return PriorConfig(**{**kept, "kind": kind})

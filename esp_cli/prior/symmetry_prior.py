@@ -64,8 +64,10 @@ class SymmetryPrior:
     def begin(self, progress: float) -> None:
         """Set how strong the prior is from here on: 1 - progress / fade, or 1 where it does not fade.
 
-        With probability 1 - strength x weight the identity takes the place of a drawn element. Such a copy adds nothing
-        to a mean loss, and its consistency terms are 0: the share of copies and c fall in proportion, in expectation.
+        Where trust is not full, elements of weight 1 are certain and do not fade; the others do. Elements are drawn in
+        proportion to strength x weight, and the identity takes their place with 1 minus the largest of these. A copy by
+        the identity adds nothing to a mean loss, and its consistency terms are 0: the share of copies and c fall in
+        proportion, in expectation.
 
         Args:
             progress: share of the run that is done, 0 to 1.
@@ -97,7 +99,8 @@ class SymmetryPrior:
     @property
     def augmented_share(self) -> float:
         """Share of the rows in a learner's own loss that are copies."""
-        kept = self.strength * sum(self._weights) / max(1, len(self._weights))
+        keep = self._keep()
+        kept = max(keep, default=0.0) if self._draws_one else sum(keep) / max(1, len(keep))
         return kept * self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
 
     @property
@@ -167,15 +170,25 @@ class SymmetryPrior:
 
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         """Return one transform per copy, each one element per seed."""
-        if self.transforms is None or self.strength == 0:
+        keep = self._keep()
+        if self.transforms is None or not any(keep):
             return []
-        everyone = self.config.copies == "all" or self.transforms.size == 1
-        keep = [self.strength * (1.0 if self.config.trust == "gate" else weight) for weight in self._weights]
         if all(share == 1 for share in keep):
-            return self.transforms.each() if everyone else [self.transforms.draw(generators)]
-        if not everyone:
+            return [self.transforms.draw(generators)] if self._draws_one else self.transforms.each()
+        if self._draws_one:
             return [self.transforms.draw(generators, keep)]
         return [self.transforms.kept(index, share, generators) for index, share in enumerate(keep)]
+
+    @property
+    def _draws_one(self) -> bool:
+        return self.config.copies == "draw" and self.transforms is not None and self.transforms.size != 1
+
+    def _keep(self) -> list[float]:
+        """Return for each element how likely it is used now, beside the others."""
+        if self.config.trust == "full":
+            return [self.strength] * len(self._weights)
+        gate = self.config.trust == "gate"  # which weighs rows instead
+        return [1.0 if weight == 1 else self.strength * (1.0 if gate else weight) for weight in self._weights]
 
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:

@@ -229,16 +229,21 @@ class TransformSet:
 
         Args:
             generators: one per seed, on the CPU.
-            keep: by listed element (one number for a sampled group) the probability with which it stays when it is
-                drawn; otherwise the identity takes its place. Empty: all stay.
+            keep: by listed element (one number for a sampled group) how likely it is beside the others, 0 to 1. With
+                probability 1 - max(keep) the identity takes the place of the drawn one. Empty: all alike, and all stay.
         """
         if self._group is not None:
             drawn = ((_draw_moving(self._group, g), g) for g in generators)
             return self._build([e if not keep or _stays(keep[0], g) else identity_of(e) for e, g in drawn])
-        picks = [int(torch.randint(self.size, (), generator=g)) for g in generators]
-        if keep:
-            picks = [i if _stays(keep[i], g) else self.size for i, g in zip(picks, generators, strict=True)]
-        return self._picked(picks)
+        return self._picked([self._pick(keep, g) for g in generators])
+
+    def _pick(self, keep: Sequence[float], generator: torch.Generator) -> int:
+        most = max(keep, default=1.0)
+        while most > 0:
+            index = int(torch.randint(self.size, (), generator=generator))
+            if not keep or (keep[index] == most or _stays(keep[index] / most, generator)):
+                return index if not keep or _stays(most, generator) else self.size
+        return self.size
 
     def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:
         """Return one of the listed elements, for each seed with probability `strength`, else the identity."""

@@ -61,34 +61,54 @@ def test_elements_stay_with_the_probability_that_the_strength_says(choice) -> No
     assert moving.mean(0) == pytest.approx(torch.full((2,), 0.3), abs=4 * error)
 
 
-def test_each_element_stays_with_its_weight_times_the_strength() -> None:
-    spec = make("navigation", 1, [0]).spec
-    weights = {"rot90": 0.2, "rot180": 1.0, "flip-x": 0.0}
+@pytest.mark.parametrize(
+    ("certain", "strength", "expected", "share"),
+    [
+        (1.0, 1.0, {"rot90": 1 / 6, "rot180": 5 / 6, "flip-x": 0, "identity": 0}, 0.5),
+        (1.0, 0.5, {"rot90": 1 / 11, "rot180": 10 / 11, "flip-x": 0, "identity": 0}, 0.5),
+        (1.0, 0.0, {"rot90": 0, "rot180": 1, "flip-x": 0, "identity": 0}, 0.5),
+        (0.6, 1.0, {"rot90": 0.15, "rot180": 0.45, "flip-x": 0, "identity": 0.4}, 0.3),
+        (0.6, 0.5, {"rot90": 0.075, "rot180": 0.225, "flip-x": 0, "identity": 0.7}, 0.15),
+    ],
+)
+def test_elements_are_drawn_by_their_weights_and_those_of_weight_1_do_not_fade(
+    certain: float, strength: float, expected: dict[str, float], share: float
+) -> None:
+    weights = {"rot90": 0.2, "rot180": certain, "flip-x": 0.0}
     config = PriorConfig(transforms="rot90,rot180,flip-x", trust="measured", weights=weights, fade=1.0)
-    prior = SymmetryPrior(config, spec)
-    for strength in (1.0, 0.5):
-        prior.begin(1 - strength)
-        own = generators(1)
-        names = [prior._draw(own)[0].elements[0].name for _ in range(1500)]
-        for name, weight in weights.items():
-            expected = weight * strength / 3
-            error = (expected * (1 - expected) / 1500) ** 0.5
-            assert names.count(name) / 1500 == pytest.approx(expected, abs=4 * error)
-        assert prior.augmented_share == pytest.approx(0.4 * strength / 2)
+    prior = SymmetryPrior(config, make("navigation", 1, [0]).spec)
+    prior.begin(1 - strength)
+    own = generators(1)
+    names = [prior._draw(own)[0].elements[0].name for _ in range(1500)]
+    for name, chance in expected.items():
+        error = (chance * (1 - chance) / 1500) ** 0.5
+        assert names.count(name) / 1500 == pytest.approx(chance, abs=4 * error)
+    assert prior.augmented_share == pytest.approx(share)
+
+
+def test_auto_is_short_for_measured_weights_that_fade_and_what_a_user_chooses_wins() -> None:
+    auto = PriorConfig.model_validate({"kind": "auto"})
+    assert auto == PriorConfig(kind="esp", trust="measured", fade=0.5)
+    assert PriorConfig.model_validate({"kind": "auto", "fade": 0.2, "transforms": "c4"}).fade == 0.2
+    assert PriorConfig.model_validate(auto.model_dump()) == auto
 
 
 def test_weights_of_1_are_the_prior_as_it_is_bit_for_bit(tmp_path: Path) -> None:
     measured = ("--set", "prior.trust=measured")
-    assert train_small(tmp_path / "a", "mappo", *measured) == train_small(tmp_path / "b", "mappo")
-    config = json.loads((tmp_path / "a" / "config.json").read_text())
+    assert (
+        train_small(tmp_path / "a", "mappo", *measured)
+        == train_small(tmp_path / "b", "mappo")
+        == train_small(tmp_path / "auto", "mappo", "--prior", "auto")
+    )
+    config = json.loads((tmp_path / "auto" / "config.json").read_text())
     assert set(config["prior"]["weights"].values()) == {1.0}
     windy = ("--set", "task.wind=0.3")
     broken = train_small(tmp_path / "c", "mappo", *measured, *windy)
     assert broken != train_small(tmp_path / "d", "mappo", *windy)
     weights = json.loads((tmp_path / "c" / "config.json").read_text())["prior"]["weights"]
     assert weights["flip-x"] == 1
-    assert weights["rot180"] < weights["rot90"] < 0.7
-    assert weights["rot90"] == pytest.approx(math.exp(-2 * 0.285), abs=0.02), "off by 0.285 s.d. of the velocity"
+    assert weights["rot180"] < weights["rot90"] < 0.2
+    assert weights["rot90"] == pytest.approx(math.exp(-8 * 0.285), abs=0.02), "off by 0.285 s.d. of the velocity"
 
 
 @pytest.mark.parametrize("weights", [{}, {"rot90": 0.5}, {"rot90": 1.0, "rot180": 1.0, "flip-y": 0.5}], ids=str)

@@ -23,6 +23,7 @@ BASE = {
     "plain": -150.0,
     "ESP": -120.0,
     "ESP that fades": -120.5,
+    "auto": -120.0,
     "measured weights": -120.0,
     "gate": -120.0,
     "compass": -125.0,
@@ -33,6 +34,7 @@ BROKEN = {
     "plain": -150.0,
     "ESP": -180.0,
     "ESP that fades": -150.0,
+    "auto": -140.0,
     "measured weights": -140.0,
     "gate": -140.0,
     "compass": -130.0,
@@ -60,7 +62,7 @@ def test_every_method_meets_every_strength_of_its_task(monkeypatch: pytest.Monke
         assert set(settings) <= {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
         assert all(0 < low < high for low, high in settings.values())
     configs = {cell.variant: cell.config for cell in cells}
-    assert [configs[m].prior.kind for m in METHODS] == ["none", "esp", "esp", "esp", "esp", "esp", "none"]
+    assert [configs[m].prior.kind for m in METHODS] == ["none", *["esp"] * (len(METHODS) - 2), "none"]
     assert configs["ESP that fades"].prior.fade > 0
     assert configs["compass"].prior.compass > 0
     assert (configs["gate"].prior.trust, configs["relaxed network"].network.relax) == ("gate", 0.1)
@@ -121,6 +123,7 @@ def test_each_method_gets_its_verdict(folder: StudyFolder):
     assert (one.name, one.setting, list(one.cells)) == ("navigation, MAPPO, 200", "wind", [0.0, 0.3, 0.6])
     assert verdicts(results) == [
         Verdict("ESP that fades", True, True, True),
+        Verdict("auto", True, True, True),
         Verdict("measured weights", True, True, True),
         Verdict("gate", True, True, True),
         Verdict("compass", False, True, True),
@@ -128,7 +131,7 @@ def test_each_method_gets_its_verdict(folder: StudyFolder):
     ]
     table = verdicts_table(results)
     assert table is not None
-    assert table.rows[3] == ("compass", "no", "yes", "yes")
+    assert table.rows[4] == ("compass", "no", "yes", "yes")
 
 
 def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):

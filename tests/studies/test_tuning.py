@@ -93,6 +93,14 @@ def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
         tuning(**changes).check()
 
 
+def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
+    found = tuning(overrides={"task.wind": 0.3}, priors=("auto",))
+    found.check()
+    prior = found.config("auto", {}).prior
+    assert (prior.kind, prior.trust, prior.weights["flip-x"]) == ("esp", "measured", 1.0)
+    assert prior.weights["rot180"] < 0.1
+
+
 def test_a_curve_is_scored_by_its_end_or_by_when_it_reaches_a_return():
     curve = points(-30.0, -20.0, -10.0, -12.0)
     assert score(curve, tuning()) == -12.0
