@@ -61,11 +61,12 @@ clean: ## remove the demo run, builds and caches (runs and .venv stay)
 # --- the environment ---------------------------------------------------------------------------------------------
 
 # torch comes first and alone, in the exact version that is pinned: a looser request could fetch another build.
+# Python compiles what is imported; compiling all of it here would take half a minute.
 define install
 	@.ci/make-venv "$(PYTHON)" $(VENV)
 	@echo "Installing $(1) into $(VENV) ..."
-	@$(BIN)/python -m pip install --quiet "$$(grep '^torch==' constraints.txt)" \
-	    && $(BIN)/python -m pip install --quiet -c constraints.txt -e "$(1)" \
+	@$(BIN)/python -m pip install --quiet --no-compile "$$(grep '^torch==' constraints.txt)" \
+	    && $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e "$(1)" \
 	    || { echo "make: installing failed; see pip's message above (is there a network connection and free disk?)" >&2; exit 1; }
 	@.ci/install-osmesa $(BIN)/python
 	@touch $@
