@@ -93,7 +93,7 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (["--task", "chess"], "unknown task 'chess'; the tasks are navigation, predator-prey"),
         (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper, fast"),
-        (["--prior", "some"], "'some' is not one of 'esp', 'augment', 'consistency', 'none'"),
+        (["--prior", "some"], "'some' is not one of 'esp', 'auto', 'augment', 'consistency', 'none'"),
         (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
         (["--consistency-coef", "-1"], "--consistency-coef"),
