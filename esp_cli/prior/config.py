@@ -98,7 +98,9 @@ class PriorConfig(BaseModel):
             kind = "augment" if kind == "esp" else "none"
         sure = bool(self.weights) and all(weight == 1 for weight in self.weights.values())
         lost = loses[kind]
-        if self.trust == "full" or sure:
-            lost = lost | {"trust", "doubt", "weights"} | ({"fade"} if self.trust != "full" else set())
+        if self.trust == "full":
+            lost = lost | {"doubt", "weights"}
+        elif sure:  # what is certain does not fade
+            lost = lost | {"trust", "doubt", "weights", "fade"}
         kept = {name: value for name, value in self if name not in lost}
         return PriorConfig(**{**kept, "kind": kind})

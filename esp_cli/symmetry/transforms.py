@@ -238,11 +238,12 @@ class TransformSet:
         return self._picked([self._pick(keep, g) for g in generators])
 
     def _pick(self, keep: Sequence[float], generator: torch.Generator) -> int:
+        """Draw the place of an element by rejection, so that equal chances draw as none at all."""
         most = max(keep, default=1.0)
         while most > 0:
             index = int(torch.randint(self.size, (), generator=generator))
-            if not keep or (keep[index] == most or _stays(keep[index] / most, generator)):
-                return index if not keep or _stays(most, generator) else self.size
+            if not keep or _stays(keep[index] / most, generator):
+                return index if _stays(most, generator) else self.size
         return self.size
 
     def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:

@@ -103,7 +103,8 @@ def test_nor_does_one_with_memory_or_all_copies(name: str) -> None:
     with NoWaiting(copies=True):
         trained = learner("navigation", "mappo", "meta", **others)
     with NoWaiting():
-        trained.iterate(0.0)
+        result = trained.iterate(0.0)
+    assert result.finite.device == META, "else this test would say nothing"
 
 
 READS: Mapping[str, Callable[[torch.Tensor], object]] = {
