@@ -58,7 +58,7 @@ class Discovery:
 
     Attributes:
         source: the task, run or file.
-        method: "paired states" or "transitions".
+        method: "paired states", "transitions", or that of `blind`.
         group: the name of what was found: "d4*agents", "flip-x", "c1" for nothing.
         transforms: what `--transforms` takes to use it; empty where nothing was found.
         tried: one entry for each element.
@@ -80,7 +80,7 @@ def discover_in_task(make: MakeWorlds, transforms: str | None = None, logs_alone
         logs_alone: use transitions of the random policy even where the task can be set to states.
     """
     probe = make(1, [0])
-    spec, elements = probe.spec, _candidates(probe.spec, transforms)
+    spec, elements = probe.spec, default_candidates(probe.spec, transforms)
     if probe.has("set_state") and not logs_alone:
         verdicts = check_paired(make, elements)
         return _concluded(spec.name, "paired states", spec, elements, verdicts, _TOLERATED_SD)
@@ -90,7 +90,7 @@ def discover_in_task(make: MakeWorlds, transforms: str | None = None, logs_alone
 
 def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, transforms: str | None = None) -> Discovery:
     """Find the symmetries of transitions of any policy; see `discover_in_task`."""
-    elements = _candidates(spaces, transforms)
+    elements = default_candidates(spaces, transforms)
     verdicts = check_by_regression(spaces, data, elements)
     return _concluded(source, "transitions", spaces, elements, verdicts, 2 * TOLERATED)
 
@@ -169,7 +169,7 @@ def _listed(text: str) -> tuple[Element, ...]:
     return elements
 
 
-def _candidates(spaces: Spaces, transforms: str | None) -> list[Element]:
+def default_candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try that actions and layouts can carry, whatever the task declares.
 
     By default turns and mirrors of a 16-gon, two that stand for all angles, and exchanges of two agents.
@@ -200,12 +200,17 @@ def _concluded(
     verdicts: Sequence[ElementVerdict],
     tolerance: float,
 ) -> Discovery:
+    tried = judged_elements(verdicts, tolerance)
+    kept = [element for element, one in zip(elements, tried, strict=True) if one.accepted]
+    group, transforms = named(kept, elements, spaces.num_agents)
+    return Discovery(source, method, group, transforms, tried)
+
+
+def judged_elements(verdicts: Sequence[ElementVerdict], tolerance: float) -> tuple[Tried, ...]:
+    """Return what becomes of each element, if a field may be off by a tolerance."""
     p_values = [_p_value(verdict, tolerance) for verdict in verdicts]
     accepted = accepted_of(p_values) if p_values else []
-    tried = [_tried(verdict, p, holds) for verdict, p, holds in zip(verdicts, p_values, accepted, strict=True)]
-    kept = [element for element, holds in zip(elements, accepted, strict=True) if holds]
-    group, transforms = named(kept, elements, spaces.num_agents)
-    return Discovery(source, method, group, transforms, tuple(tried))
+    return tuple(_tried(verdict, p, holds) for verdict, p, holds in zip(verdicts, p_values, accepted, strict=True))
 
 
 def _p_value(verdict: ElementVerdict, tolerance: float) -> float:

@@ -44,6 +44,13 @@ def prepared(config: RunConfig) -> RunConfig:
     return config if prior is config.prior else config.model_copy(update={"prior": prior})
 
 
+def planned(config: RunConfig) -> RunConfig:
+    """Return `prepared`, with settings of the prior that have no effect at their defaults: equal runs are one run."""
+    for _ in range(2):  # what was measured can leave other settings without effect
+        config = prepared(config.model_copy(update={"prior": config.prior.effective()}))
+    return config
+
+
 class _Maker:
     """Makes the worlds of a configuration; equal for equal tasks, so that nothing is measured twice."""
 

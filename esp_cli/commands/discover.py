@@ -15,10 +15,12 @@ if TYPE_CHECKING:
     from esp_cli.checking.discovery import Discovery
     from esp_envs import Environment
 
+_WORLDS = 512
+"""Worlds that collect transitions for a blind search."""
 EPILOG = """Examples:\n
     esp discover navigation --set task.wind=0.3\n
     esp discover runs/navigation --json found.json\n
-    esp discover transitions.npz --task rendezvous:Rendezvous\n
+    esp discover transitions.npz --task rendezvous:Rendezvous --blind\n
     esp train --task navigation --transforms discovered"""
 
 
@@ -38,6 +40,9 @@ def discover(
     logs: Annotated[
         bool, typer.Option("--logs", help="Judge from transitions alone, also where states can be set.")
     ] = False,
+    blind: Annotated[
+        bool, typer.Option("--blind", help="Judge from transitions alone, and without knowing what any number means.")
+    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
@@ -45,7 +50,9 @@ def discover(
     What the task declares is not looked at. An element is accepted where it is shown to hold; of all accepted elements
     at most 5 % are false, in expectation.
     """
-    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs)
+    if blind and transforms is not None:
+        raise ValueError("--blind searches for maps by itself; leave --transforms out")
+    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, blind)
     if json != "-":
         _print(found)
     if json is not None:
@@ -53,8 +60,9 @@ def discover(
 
 
 def _discovery(
-    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool
+    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, blind: bool
 ) -> Discovery:
+    from esp_cli.checking.blind import discover_blindly, transitions_of
     from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
     from esp_cli.checking.logs import read_transitions
     from esp_envs.registry import make
@@ -65,7 +73,8 @@ def _discovery(
         if task is None:
             raise ValueError(f"{what} does not say what its numbers are; name the task that has its layout with --task")
         spec = make(task, 1, [0], settings).spec
-        return discover_in_transitions(what, spec, read_transitions(path, spec), transforms)
+        data = read_transitions(path, spec)
+        return discover_blindly(what, spec, data) if blind else discover_in_transitions(what, spec, data, transforms)
     name = what
     if path.is_dir():
         from esp_cli.training.loading import parse_config
@@ -79,6 +88,9 @@ def _discovery(
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
 
+    if blind:
+        env = worlds(_WORLDS, [0])
+        return discover_blindly(env.spec.name, env.spec, transitions_of(env))
     return discover_in_task(worlds, transforms, logs)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.checking.measured import prepared
+from esp_cli.checking.measured import planned
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team
@@ -151,10 +151,7 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
         elif section == algorithm or section not in (*ALGORITHMS, *task_names()):
             settings[name] = value
     settings |= choice
-    config = resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
-    # what trains the same is the same run
-    config = prepared(config.model_copy(update={"prior": config.prior.effective()}))
-    return config.model_copy(update={"prior": config.prior.effective()})
+    return planned(resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings))
 
 
 def _comparable(config: RunConfig, settings: Settings) -> bool:

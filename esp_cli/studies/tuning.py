@@ -10,7 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from esp_cli.checking.measured import prepared
+from esp_cli.checking.measured import planned
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
@@ -72,8 +72,9 @@ class Tuning(BaseModel):
         """
         chosen = {**self.overrides, "prior.kind": prior, **settings}
         run_seeds = self.trial_seeds if seeds is None else seeds
-        config = resolve_config(self.task, self.algorithm, self.preset, self.steps, run_seeds, self.device, chosen)
-        config = prepared(config.model_copy(update={"prior": config.prior.effective()}))
+        config = planned(
+            resolve_config(self.task, self.algorithm, self.preset, self.steps, run_seeds, self.device, chosen)
+        )
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
 
     def check(self) -> None:

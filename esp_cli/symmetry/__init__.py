@@ -15,7 +15,8 @@ from esp_cli.symmetry.groups import (
 )
 from esp_cli.symmetry.parse import parse_elements, parse_group
 from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
-from esp_cli.symmetry.transforms import Transform, TransformSet, build_transform, transform_set
+from esp_cli.symmetry.transform_set import TransformSet, transform_set
+from esp_cli.symmetry.transforms import Transform, build_transform
 
 __all__ = [
     "Element",
