@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from esp_cli.checking.discovery import Discovery, default_candidates, judged_elements, named
-from esp_cli.checking.numbers import STILL, Moments, NumberMap
+from esp_cli.checking.numbers import Moments, NumberMap, changing
 from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import NEGLIGIBLE, SIGNIFICANT, ElementVerdict, FieldVerdict, Outcome
 from esp_cli.symmetry import Element, build_transform
@@ -35,6 +35,8 @@ EPISODES, STEPS = 65_536, 2
 """Many short episodes say more than few long ones, whose steps look alike."""
 _ANGLE = math.radians(57.0)
 """Angle of the turn that stands for all."""
+_STILL = 1e-6
+"""Standard deviation below which a change or reward says nothing."""
 _HIDDEN, _ROUNDS, _UPDATES, _BATCH, _STEP = 256, 16, 500, 1024, 4e-3
 
 
@@ -64,17 +66,20 @@ def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discover
     _refuse_wide(data.obs.shape[-1] + _done(spaces))
     if data.action_mask is not None:
         raise ValueError("--blind does not look at masks of actions, which these transitions have; leave --blind out")
-    tried = search(data, spaces.action.count if isinstance(spaces.action, Discrete) else None)
+    tried, is_complete = search(data, spaces.action.count if isinstance(spaces.action, Discrete) else None)
     results = judged_elements([verdict for _, verdict in tried], TOLERATED)
     maps = [one for (one, _), result in zip(tried, results, strict=True) if result.accepted]
     generators = [Permutation(points) for one in maps if (points := _points(one.matrix))]
     group = PermutationGroup(generators or [Permutation(1)])
     plane, transforms = named(_held(spaces, data, maps, group), default_candidates(spaces), 1)
-    return Discovery(source, BLIND, f"{plane} among {group.order()} maps of numbers", transforms, results)
+    found = f"{plane} among {'' if is_complete else 'at least '}{group.order()} maps of numbers"
+    return Discovery(source, BLIND, found, transforms, results)
 
 
-def search(data: Transitions, actions: int | None) -> list[tuple[NumberMap, ElementVerdict]]:
-    """Return maps that were tested, and what was found of each; those that hold generate a group of symmetries.
+def search(data: Transitions, actions: int | None) -> tuple[list[tuple[NumberMap, ElementVerdict]], bool]:
+    """Return maps that were tested with what was found of each, and whether all were looked at.
+
+    Those that hold generate a group of symmetries.
 
     Args:
         data: of a policy that prefers no direction, from starts that prefer none.
@@ -96,12 +101,13 @@ def search(data: Transitions, actions: int | None) -> list[tuple[NumberMap, Elem
                     orbit = _orbit((number, 1), held)
                     break
     if actions is None:
-        products = (first.matrix @ second.matrix for first, second in itertools.product(held, held))
-        for matrix in (*(one.matrix for one in held), *products):
-            if turn := _any_angle(matrix, moments):
+        turns: dict[str, NumberMap] = {}
+        for first, second in itertools.product([None, *held], held):
+            matrix = second.matrix if first is None else first.matrix @ second.matrix
+            if (turn := _any_angle(matrix, moments)) and turn.name not in turns:
+                turns[turn.name] = turn
                 tried.append((turn, predictor.verdict(turn, moves_starts=True)))
-                break
-    return tried
+    return tried, not moments.gave_up
 
 
 def _refuse_wide(numbers: int) -> None:
@@ -118,11 +124,10 @@ def _held(spaces: Spaces, data: Transitions, maps: Sequence[NumberMap], group: P
     """Return the elements that are products of maps that were found."""
     matrices = {e.name: (e, _matrix(e, spaces, data)) for e in default_candidates(spaces) if e.permutation is None}
     held = [e for e, matrix in matrices.values() if (points := _points(matrix)) and group.contains(Permutation(points))]
-    _, turn = matrices.get("rot57", (None, torch.empty(0)))
-    for one in maps:
-        if _points(one.matrix) is None and (torch.allclose(turn, one.matrix) or torch.allclose(turn, one.matrix.mT)):
-            mirrored = any(element.name.startswith("flip") for element in held)
-            held += [matrices[name][0] for name in ("rot57", "flip23") if name == "rot57" or mirrored]
+    turn = matrices.get("rot57")
+    if turn and any(torch.allclose(turn[1], way, atol=1e-5) for one in maps for way in (one.matrix, one.matrix.mT)):
+        mirrored = any(element.name.startswith("flip") for element in held)
+        held += [matrices[name][0] for name in ("rot57", "flip23") if name == "rot57" or mirrored]
     return held
 
 
@@ -135,13 +140,15 @@ def _matrix(element: Element, spaces: Spaces, data: Transitions) -> Tensor:
     else:
         done = transform.push_outputs(torch.eye(spaces.action.width))
     matrix = torch.block_diag(seen, done)
-    matrix[: len(seen)][data.obs.flatten(0, 2).std(0) <= STILL] = 0.0
+    matrix[: len(seen)][~changing(data.obs)] = 0.0
     return matrix + torch.diag((matrix == 0).all(1).float())
 
 
 def _points(matrix: Tensor) -> list[int] | None:
     """Return a signed permutation as one of the points +0, -0, +1, -1, ..., or None if it is none."""
     places = matrix.abs().argmax(1)
+    if len(places.unique()) < len(places):
+        return None
     signs = matrix.gather(1, places.unsqueeze(1)).squeeze(1)
     if not torch.allclose(matrix, signs.round().unsqueeze(1) * F.one_hot(places, len(places)), atol=1e-5):
         return None
@@ -187,7 +194,7 @@ class _Predictor:
         self._held = Transitions(*(part[half:] for part in parts))
         self._actions = actions
         x, y = (part.flatten(0, 2) for part in (self._inputs(fitted), _outputs(fitted)))
-        self._x, self._y = ((part.mean(0), part.std(0).clamp_min(STILL)) for part in (x, y))
+        self._x, self._y = ((part.mean(0), part.std(0).clamp_min(_STILL)) for part in (x, y))
         self._net = self._fitted((x - self._x[0]) / self._x[1], (y - self._y[0]) / self._y[1])
         self._errors = self._error(self._held)
         self._variance = _outputs(self._held).flatten(0, 2).var(0)
@@ -214,7 +221,8 @@ class _Predictor:
 
     def _inputs(self, data: Transitions) -> Tensor:
         acted = data.action if self._actions is None else F.one_hot(data.action, self._actions).float()
-        return torch.cat([data.obs, acted], -1)
+        agents = torch.eye(acted.shape[2]).expand(*acted.shape[:3], -1)  # what one does need not be what another does
+        return torch.cat([data.obs, acted, agents], -1)
 
     @staticmethod
     def _fitted(x: Tensor, y: Tensor) -> nn.Module:
@@ -249,7 +257,7 @@ def _outputs(data: Transitions) -> Tensor:
 
 def _judged(name: str, excess: Tensor, variance: float, moves_starts: bool) -> FieldVerdict:
     """Judge one number by the excess of squared error [M] of each held-out episode."""
-    if variance < STILL**2:
+    if variance < _STILL**2:
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
     gap, error = float(excess.mean()) / variance, float(excess.std()) / len(excess) ** 0.5 / variance
     surely = not moves_starts and gap > max(SIGNIFICANT * error, NEGLIGIBLE)

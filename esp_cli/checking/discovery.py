@@ -117,13 +117,15 @@ def named(accepted: Sequence[Element], tried: Sequence[Element], num_agents: int
     agents_text = ""
     if exchanges:
         group = FiniteGroup.generated_by("found", exchanges) if num_agents <= 6 else None
-        everyone = len(exchanges) == len([e for e in tried if e.permutation is not None and e.in_place.is_identity])
+        others = [e for e in tried if e.permutation is not None and e.in_place.is_identity]
+        moved = {agent for e in exchanges for agent, place in enumerate(e.permutation or ()) if agent != place}
+        everyone = len(exchanges) == len(others) and len(moved) == num_agents
         whole = everyone or (group is not None and group.order == math.factorial(num_agents))
         agents_text = "agents" if whole else ",".join(e.name for e in exchanges)
     if not agents_text:
         return plane, plane_text
-    if agents_text == "agents":
-        return f"{plane}*agents", f"{plane_text}*agents" if plane_text and "," not in plane_text else "agents"
+    if agents_text == "agents" and "," not in plane_text:
+        return f"{plane}*agents", f"{plane_text}*agents" if plane_text else "agents"
     return f"{plane} and {agents_text}", ",".join(text for text in (plane_text, agents_text) if text)
 
 
@@ -220,6 +222,8 @@ def _p_value(verdict: ElementVerdict, tolerance: float) -> float:
     worst = 0.0
     for field in verdict.fields:
         if field.outcome == "holds":
+            if not math.isfinite(field.gap + field.error):
+                return 1.0
             score = (tolerance - field.gap) / max(field.error, 1e-12)
             worst = max(worst, 0.5 * math.erfc(score / math.sqrt(2)))
     return worst

@@ -24,10 +24,11 @@ _LEAVES = 16
 """Maps that are tested for one number and one place, at most."""
 _NODES = 20_000
 """Partial maps that are looked at for one number and one place, at most."""
+_ROUNDING = 1e-6
 _EPISODES = 16_384
 """Episodes whose moments are taken, at most."""
-STILL = 1e-5
-"""Standard deviation below which a number does not change."""
+_STILL = 1e-5
+"""Spread of a number, against its largest value, below which it does not change."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,19 @@ class NumberMap:
         return Transitions(obs, action, data.reward, next_obs)
 
 
+def changing(rows: Tensor) -> Tensor:
+    """Return which numbers of rows [..., D] are not always the same, [D] bool."""
+    rows = rows.flatten(0, -2)
+    return rows.std(0) > _STILL * rows.abs().amax(0)
+
+
 class Moments:
-    """Moments of what is seen and done, and the maps that leave them as they are, up to chance."""
+    """Moments of what is seen and done, and the maps that leave them as they are, up to chance.
+
+    Attributes:
+        live: the numbers that change, in order.
+        gave_up: whether a search ended early, so that there may be maps that it did not find.
+    """
 
     def __init__(self, data: Transitions, actions: int | None) -> None:
         self.width, self._discrete = data.obs.shape[-1], actions is not None
@@ -65,7 +77,8 @@ class Moments:
         self.centre = torch.where(mean.abs() > SIGNIFICANT * error, mean, 0.0)
         seen = data.obs - self.centre
         self.size = self.width + acted.shape[-1]
-        live = torch.cat([data.obs, acted], -1).flatten(0, 2).std(0) > STILL
+        live = changing(torch.cat([data.obs, acted], -1))
+        self.gave_up = False
         self.live = [number for number in range(self.size) if live[number]]
         z = torch.cat([seen, acted, torch.ones_like(seen[..., :1])], -1)
         change = F.pad(data.next_obs - data.obs, (0, z.shape[-1] - self.width))
@@ -87,8 +100,10 @@ class Moments:
         budget = [_NODES]
         for leaves, chosen in enumerate(self._extended([*first, place], budget)):
             if leaves == _LEAVES:
+                self.gave_up = True
                 return
             yield self._map(chosen)
+        self.gave_up |= budget[0] < 0
 
     def _extended(self, chosen: list[tuple[int, int]], budget: list[int]) -> Iterator[list[tuple[int, int]]]:
         budget[0] -= 1
@@ -118,8 +133,8 @@ class Moments:
         for kind, (mean, covariance) in enumerate(zip(self._means, self._covariances, strict=True)):
             way = 1 if kind == 3 else sign
             variance = covariance[here, here] + covariance[there, there] - 2 * way * covariance[here, there]
-            gap = float((mean[here] - way * mean[there]).abs())
-            if gap > SIGNIFICANT * float(variance.clamp_min(0).sqrt()) + 1e-7:
+            gap, size = float((mean[here] - way * mean[there]).abs()), float(mean[here].abs() + mean[there].abs())
+            if gap > SIGNIFICANT * float(variance.clamp_min(0).sqrt()) + _ROUNDING * size + 1e-12:
                 return False
         return True
 

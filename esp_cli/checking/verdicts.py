@@ -22,7 +22,7 @@ class FieldVerdict:
     Attributes:
         field: its name, with the space before it: "obs.velocity", "state.position", "reward", "end".
         outcome: whether it transforms as it says; "not covered" where the data cannot tell.
-        gap: how far it is from that, in standard deviations of the field.
+        gap: how far it is from that, in standard deviations of the field or, from transitions, as a share of variance.
         error: standard error of the gap.
     """
 
@@ -37,7 +37,7 @@ class ElementVerdict:
     """What was found of one element.
 
     Attributes:
-        element: its name, as `--transforms` takes it.
+        element: its name, as `--transforms` takes it; of a map of numbers what each becomes.
         declared: whether the task's declared symmetry holds it.
         fields: one verdict for each field.
         reason: why the whole element is not covered, if so.

@@ -76,14 +76,14 @@ def _discovery(
         data = read_transitions(path, spec)
         return discover_blindly(what, spec, data) if blind else discover_in_transitions(what, spec, data, transforms)
     name = what
+    if task is not None:
+        raise ValueError(f"--task is for a file of transitions, and there is no file {what}; leave it out")
     if path.is_dir():
         from esp_cli.training.loading import parse_config
         from esp_cli.training.run_folder import RunFolder
 
         config = parse_config(RunFolder.open(path).config, path)
         name, settings = config.task, config.task_settings | settings
-    elif task is not None:
-        raise ValueError(f"--task is for a file of transitions, and there is no file {what}; leave it out")
 
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
@@ -111,4 +111,4 @@ def _print(found: Discovery) -> None:
     if found.transforms:
         console.note(f"use it with: --transforms {found.transforms}")
     else:
-        console.note("nothing was found: train with --prior none, or with prior.compass")
+        console.note("nothing that --transforms can name was found: train with --prior none, or with prior.compass")

@@ -169,9 +169,9 @@ def fitted(env: Environment, doubt: float, certain: Collection[str], alike: bool
     """
     spaces = env.spec
     obs, action, outputs = _played(env)
-    half = len(obs) // 2
     inputs = inputs_of(spaces, obs, _bounded(spaces, action))
-    parts = [_moments(inputs[part], outputs[part], alike) for part in (slice(half), slice(half, None))]
+    # every second episode: the first and the last half may be of two policies
+    parts = [_moments(inputs[part], outputs[part], alike) for part in (slice(0, None, 2), slice(1, None, 2))]
     whole = _solved(parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
     first, second = (_solved(*part) for part in parts)
     spread = outputs.flatten(0, 2).std(0)

@@ -60,7 +60,8 @@ def plan(name: str, request: Request) -> Study:
     """
     kind = KINDS[name]
     for setting in request.overrides:
-        if setting in kind.varies:
+        section, _, rest = setting.rpartition(".")
+        if (f"task.{rest}" if section in task_names() else setting) in kind.varies:
             raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
     if not variants or len(set(variants)) < len(variants) or not set(variants) <= set(kind.variants):

@@ -12,6 +12,9 @@ from esp_cli.checking import Transitions, blind, collect
 from esp_cli.checking.blind import discover_blindly, search
 from esp_cli.checking.numbers import NumberMap
 from esp_envs import make
+from esp_envs.moves import discrete_moves
+from esp_envs.mpe.task import FORCE
+from esp_envs.spec import Field, Kind, Spaces, layout
 from tests.cli.running import refused
 
 MOVES = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
@@ -46,7 +49,9 @@ def scene(wind: float = 0.0, forces: bool = False, shift: float = 0.0, prefers: 
 
 def group_of(data: Transitions, actions: int | None) -> tuple[list[str], int]:
     """Return the names of the maps that hold, and the order of the group of those that are permutations."""
-    held = [one for one, verdict in search(data, actions) if verdict.outcome == "holds"]
+    tried, is_complete = search(data, actions)
+    assert is_complete
+    held = [one for one, verdict in tried if verdict.outcome == "holds"]
     points = [Permutation(found) for one in held if (found := blind._points(one.matrix))]
     return [one.name for one in held], PermutationGroup(points or [Permutation(1)]).order()
 
@@ -85,6 +90,43 @@ def test_a_map_turns_transitions_about_its_centre() -> None:
     assert image.obs.flatten().tolist() == [-1.0, -4.0]
     assert image.next_obs.flatten().tolist() == [-2.0, -5.0]
     assert (image.action.item(), image.reward.item()) == (2, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "group", "transforms"),
+    [
+        ({}, "d4 among 8 maps of numbers", "d4"),
+        ({"wind": 0.3}, "flip-y among 2 maps of numbers", "flip-y"),
+        ({"forces": True}, "o2 among 8 maps of numbers", "o2"),
+        ({"forces": True, "wind": 0.3}, "flip-y among 2 maps of numbers", "flip-y"),
+        ({"wind": 0.3, "prefers": 0.3}, "c1 among 1 maps of numbers", ""),
+    ],
+)
+def test_what_is_found_gets_a_name_where_there_is_one(settings, group: str, transforms: str) -> None:
+    row = layout(Field("point", Kind.VECTOR), Field("goal", Kind.VECTOR), Field("mark", Kind.SCALAR))
+    moves = FORCE if settings.get("forces") else discrete_moves(("stay", "left", "right", "down", "up"))
+    spaces = Spaces(num_agents=1, observation=row, state=row, action=moves, symmetry="c1")
+    found = discover_blindly("scene", spaces, scene(**settings))
+    assert (found.group, found.transforms) == (group, transforms)
+
+
+def test_a_point_on_a_rail_has_mirrors_alone() -> None:
+    """Its other coordinate never changes, so that no turn of the vector can be a map of what does."""
+    data = scene()
+    obs, next_obs = (part[..., :4] * torch.tensor([1.0, 0.0, 1.0, 0.0]) for part in (data.obs, data.next_obs))
+    reward = -(next_obs[..., 0] - next_obs[..., 2]).abs()
+    row = layout(Field("point", Kind.VECTOR), Field("goal", Kind.VECTOR))
+    moves = discrete_moves(("stay", "left", "right", "down", "up"))
+    spaces = Spaces(num_agents=1, observation=row, state=row, action=moves, symmetry="c1")
+    found = discover_blindly("rail", spaces, replace(data, obs=obs, next_obs=next_obs, reward=reward))
+    assert found.transforms == "d2"
+
+
+def test_agents_whose_winds_oppose_each_other_have_no_mirror_together() -> None:
+    here, there = scene(wind=0.3), scene(wind=-0.3)
+    names = ("obs", "action", "reward", "next_obs")
+    both = Transitions(*(torch.cat([getattr(data, name) for data in (here, there)], 2) for name in names))
+    assert group_of(both, 5)[1] == 2
 
 
 @pytest.mark.slow

@@ -15,11 +15,13 @@ from esp_cli.checking.discovery import (
     accepted_of,
     discover_in_task,
     discover_in_transitions,
+    judged_elements,
     named,
 )
 from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
 from esp_cli.checking.regression import check_by_regression
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.symmetry import parse_elements
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -145,6 +147,11 @@ def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
         ("d4,agents-1-0-2,agents-0-2-1,agents-2-1-0", "d4*agents", "d4*agents"),
         ("flip-x,agents-1-0-2", "flip-x and agents-1-0-2", "flip-x,agents-1-0-2"),
         ("agents-1-0-2,agents-2-1-0", "c1*agents", "agents"),
+        (
+            "rot180,flip45,flip135,agents-1-0-2,agents-0-2-1,agents-2-1-0",
+            "rot180,flip-diagonal,flip-antidiagonal and agents",
+            "rot180,flip-diagonal,flip-antidiagonal,agents",
+        ),
     ],
 )
 def test_accepted_elements_close_to_the_largest_group(accepted: str, group: str, transforms: str | None) -> None:
@@ -203,6 +210,18 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "there is no file" in refused("discover", tmp_path / "none.npz", "--task", "navigation")
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
+    assert "is for a file of transitions" in refused("discover", tmp_path, "--task", "navigation")
+
+
+def test_a_gap_that_is_no_number_is_not_accepted() -> None:
+    verdicts = [ElementVerdict("a", False, (FieldVerdict("reward", "holds", gap, 0.01),)) for gap in (0.0, np.nan)]
+    assert [one.accepted for one in judged_elements(verdicts, 0.15)] == [True, False]
+
+
+def test_agents_that_were_never_exchanged_are_not_claimed() -> None:
+    """Agent 3 of four is in no exchange that was tried."""
+    tried = parse_elements("agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3", 4)
+    assert named(tried, tried, 4)[1] == "agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3"
 
 
 def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settings(tmp_path: Path) -> None:

@@ -154,6 +154,7 @@ def test_a_setting_reaches_the_runs_that_it_concerns():
     [
         ("table1", {"overrides": {"prior.kind": "augment"}}, "prior.kind is what this study varies by itself"),
         ("ablate-transforms", {"overrides": {"prior.copies": "all"}}, "prior.copies is what this study varies"),
+        ("ablate-breaking", {"overrides": {"navigation.wind": 0.3}}, "navigation.wind is what this study varies"),
         ("table1", {"overrides": {"qmix.gamma": 0.9}}, "--set qmix.gamma concerns no run of this study"),
         ("table1", {"overrides": {"formation.physics": "pymunk"}}, "concerns no run"),
         ("table1", {"tasks": ("navigation",) * 2}, "task navigation is named twice"),
