@@ -130,21 +130,16 @@ def test_agents_whose_winds_oppose_each_other_have_no_mirror_together() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("settings", "name", "order"), [({}, "d4", 96), ({"wind": 0.3}, "flip-x", 24)], ids=["whole", "wind"]
-)
-def test_navigation_is_found_with_its_exchanges_of_landmarks(
-    monkeypatch: pytest.MonkeyPatch, settings, name: str, order: int
-) -> None:
-    """Eight elements of d4 (two with wind), six orders of the landmarks, two of the other agents."""
+def test_navigation_is_found_with_its_exchanges_of_landmarks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight elements of d4, six orders of the landmarks, two of the other agents."""
     monkeypatch.setattr(blind, "_HIDDEN", 256)
     monkeypatch.setattr(blind, "_ROUNDS", 12)
     monkeypatch.setattr(blind, "_UPDATES", 500)
     torch.manual_seed(0)
-    env = make("navigation", 512, [0], settings)
+    env = make("navigation", 512, [0])
     found = discover_blindly("navigation", env.spec, collect(env, 32_768, 2))
-    assert found.group == f"{name} among {order} maps of numbers"
-    assert found.transforms == name
+    assert found.group == "d4 among 96 maps of numbers"
+    assert found.transforms == "d4"
 
 
 def test_what_it_cannot_look_at_is_refused() -> None:
