@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from esp_cli.checking.discovery import Discovery, default_candidates, judged_elements, named
-from esp_cli.checking.numbers import Moments, NumberMap, changing
-from esp_cli.checking.transitions import Transitions, collect
+from esp_cli.checking.numbers import Moments, NumberMap, changing, done
+from esp_cli.checking.paired import MakeWorlds
+from esp_cli.checking.transitions import Transitions, collect, outputs_of
 from esp_cli.checking.verdicts import NEGLIGIBLE, SIGNIFICANT, ElementVerdict, FieldVerdict, Outcome
 from esp_cli.symmetry import Element, build_transform
-from esp_envs.base import Environment
 from esp_envs.spec import Discrete, Spaces
 
 BLIND = "transitions whose numbers nobody explained"
@@ -31,7 +31,7 @@ WIDEST = 64
 """Numbers that an agent sees and does, at most."""
 TOLERATED = 0.05
 """Excess of squared error, as a share of the variance, up to which a map that is not found broken holds."""
-EPISODES, STEPS = 65_536, 2
+_WORLDS, _EPISODES, _STEPS = 512, 65_536, 2
 """Many short episodes say more than few long ones, whose steps look alike."""
 _ANGLE = math.radians(57.0)
 """Angle of the turn that stands for all."""
@@ -40,14 +40,11 @@ _STILL = 1e-6
 _HIDDEN, _ROUNDS, _UPDATES, _BATCH, _STEP = 256, 16, 500, 1024, 4e-3
 
 
-def transitions_of(env: Environment) -> Transitions:
-    """Return transitions of the random policy to look at.
-
-    Raises:
-        ValueError: there are too many numbers.
-    """
-    _refuse_wide(env.spec.observation.width + _done(env.spec))
-    return collect(env, EPISODES, STEPS)
+def discover_blindly_in_task(make: MakeWorlds) -> Discovery:
+    """Find the symmetries of a task by transitions of the random policy; see `discover_blindly`."""
+    env = make(_WORLDS, [0])
+    _refuse_wide(env.spec)
+    return discover_blindly(env.spec.name, env.spec, collect(env, _EPISODES, _STEPS))
 
 
 def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discovery:
@@ -63,7 +60,7 @@ def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discover
     Raises:
         ValueError: there are too many numbers, or masks of actions.
     """
-    _refuse_wide(data.obs.shape[-1] + _done(spaces))
+    _refuse_wide(spaces)
     if data.action_mask is not None:
         raise ValueError("--blind does not look at masks of actions, which these transitions have; leave --blind out")
     tried, is_complete = search(data, spaces.action.count if isinstance(spaces.action, Discrete) else None)
@@ -71,7 +68,8 @@ def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discover
     maps = [one for (one, _), result in zip(tried, results, strict=True) if result.accepted]
     generators = [Permutation(points) for one in maps if (points := _points(one.matrix))]
     group = PermutationGroup(generators or [Permutation(1)])
-    plane, transforms = named(_held(spaces, data, maps, group), default_candidates(spaces), 1)
+    known = [element for element in default_candidates(spaces) if element.permutation is None]
+    plane, transforms = named(_held(known, spaces, data, maps, group), known, 1)
     found = f"{plane} among {'' if is_complete else 'at least '}{group.order()} maps of numbers"
     return Discovery(source, BLIND, found, transforms, results)
 
@@ -101,34 +99,30 @@ def search(data: Transitions, actions: int | None) -> tuple[list[tuple[NumberMap
                     orbit = _orbit((number, 1), held)
                     break
     if actions is None:
-        turns: dict[str, NumberMap] = {}
-        for first, second in itertools.product([None, *held], held):
-            matrix = second.matrix if first is None else first.matrix @ second.matrix
-            if (turn := _any_angle(matrix, moments)) and turn.name not in turns:
-                turns[turn.name] = turn
-                tried.append((turn, predictor.verdict(turn, moves_starts=True)))
+        products = [first.matrix @ second.matrix for first, second in itertools.product(held, held)]
+        turns = (_any_angle(matrix, moments) for matrix in [*(one.matrix for one in held), *products])
+        different = {turn.name: turn for turn in turns if turn}.values()
+        tried += [(turn, predictor.verdict(turn, moves_starts=True)) for turn in different]
     return tried, not moments.gave_up
 
 
-def _refuse_wide(numbers: int) -> None:
-    if numbers > WIDEST:
+def _refuse_wide(spaces: Spaces) -> None:
+    acts = spaces.action.count if isinstance(spaces.action, Discrete) else spaces.action.width
+    if (numbers := spaces.observation.width + acts) > WIDEST:
         raise ValueError(f"--blind searches up to {WIDEST} numbers that an agent sees and does, not {numbers}")
 
 
-def _done(spaces: Spaces) -> int:
-    """Return how many numbers say what an agent does."""
-    return spaces.action.count if isinstance(spaces.action, Discrete) else spaces.action.width
-
-
-def _held(spaces: Spaces, data: Transitions, maps: Sequence[NumberMap], group: PermutationGroup) -> list[Element]:
-    """Return the elements that are products of maps that were found."""
-    matrices = {e.name: (e, _matrix(e, spaces, data)) for e in default_candidates(spaces) if e.permutation is None}
-    held = [e for e, matrix in matrices.values() if (points := _points(matrix)) and group.contains(Permutation(points))]
+def _held(
+    known: Sequence[Element], spaces: Spaces, data: Transitions, maps: Sequence[NumberMap], group: PermutationGroup
+) -> list[Element]:
+    """Return those of some elements that are products of maps that were found."""
+    matrices = {element.name: _matrix(element, spaces, data) for element in known}
+    held = {name for name, m in matrices.items() if (points := _points(m)) and group.contains(Permutation(points))}
     turn = matrices.get("rot57")
-    if turn and any(torch.allclose(turn[1], way, atol=1e-5) for one in maps for way in (one.matrix, one.matrix.mT)):
-        mirrored = any(element.name.startswith("flip") for element in held)
-        held += [matrices[name][0] for name in ("rot57", "flip23") if name == "rot57" or mirrored]
-    return held
+    turns = [way for one in maps for way in (one.matrix, one.matrix.mT)]
+    if turn is not None and any(torch.allclose(turn, way, atol=1e-5) for way in turns):
+        held |= {"rot57", "flip23"} if any(name.startswith("flip") for name in held) else {"rot57"}
+    return [element for element in known if element.name in held]
 
 
 def _matrix(element: Element, spaces: Spaces, data: Transitions) -> Tensor:
@@ -136,10 +130,10 @@ def _matrix(element: Element, spaces: Spaces, data: Transitions) -> Tensor:
     transform = build_transform([element], spaces)
     seen = transform.obs(torch.eye(spaces.observation.width))
     if isinstance(spaces.action, Discrete):
-        done = F.one_hot(transform.action(torch.arange(spaces.action.count)), spaces.action.count).float()
+        act = F.one_hot(transform.action(torch.arange(spaces.action.count)), spaces.action.count).float()
     else:
-        done = transform.push_outputs(torch.eye(spaces.action.width))
-    matrix = torch.block_diag(seen, done)
+        act = transform.push_outputs(torch.eye(spaces.action.width))
+    matrix = torch.block_diag(seen, act)
     matrix[: len(seen)][~changing(data.obs)] = 0.0
     return matrix + torch.diag((matrix == 0).all(1).float())
 
@@ -189,15 +183,13 @@ class _Predictor:
 
     def __init__(self, data: Transitions, actions: int | None) -> None:
         half = len(data.obs) // 2
-        parts = [part for part in vars(data).values() if part is not None]
-        fitted = Transitions(*(part[:half] for part in parts))
-        self._held = Transitions(*(part[half:] for part in parts))
+        fitted, self._held = data.episodes(slice(half)), data.episodes(slice(half, None))
         self._actions = actions
-        x, y = (part.flatten(0, 2) for part in (self._inputs(fitted), _outputs(fitted)))
+        x, y = (part.flatten(0, 2) for part in (self._inputs(fitted), outputs_of(fitted)))
         self._x, self._y = ((part.mean(0), part.std(0).clamp_min(_STILL)) for part in (x, y))
         self._net = self._fitted((x - self._x[0]) / self._x[1], (y - self._y[0]) / self._y[1])
         self._errors = self._error(self._held)
-        self._variance = _outputs(self._held).flatten(0, 2).var(0)
+        self._variance = outputs_of(self._held).flatten(0, 2).var(0)
 
     def verdict(self, one: NumberMap, moves_starts: bool = False) -> ElementVerdict:
         """Judge a map by how much more the network errs on images, as shares of the variance.
@@ -217,10 +209,10 @@ class _Predictor:
     def _error(self, data: Transitions) -> Tensor:
         """Return the mean squared error of each episode and output, [M, D + 1]."""
         predicted = self._net((self._inputs(data) - self._x[0]) / self._x[1]) * self._y[1] + self._y[0]
-        return (predicted - _outputs(data)).square().mean((1, 2))
+        return (predicted - outputs_of(data)).square().mean((1, 2))
 
     def _inputs(self, data: Transitions) -> Tensor:
-        acted = data.action if self._actions is None else F.one_hot(data.action, self._actions).float()
+        acted = done(data, self._actions)
         agents = torch.eye(acted.shape[2]).expand(*acted.shape[:3], -1)  # what one does need not be what another does
         return torch.cat([data.obs, acted, agents], -1)
 
@@ -249,10 +241,6 @@ class _Predictor:
                 errors = (net(x) - y).square().mean(1)
             chances = errors + errors.mean()
         return net
-
-
-def _outputs(data: Transitions) -> Tensor:
-    return torch.cat([data.next_obs - data.obs, data.reward.unsqueeze(-1)], -1)
 
 
 def _judged(name: str, excess: Tensor, variance: float, moves_starts: bool) -> FieldVerdict:

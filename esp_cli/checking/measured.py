@@ -46,9 +46,11 @@ def prepared(config: RunConfig) -> RunConfig:
 
 def planned(config: RunConfig) -> RunConfig:
     """Return `prepared`, with settings of the prior that have no effect at their defaults: equal runs are one run."""
-    for _ in range(2):  # what was measured can leave other settings without effect
-        config = prepared(config.model_copy(update={"prior": config.prior.effective()}))
-    return config
+    return _effective(prepared(_effective(config)))  # what was measured can leave other settings without effect
+
+
+def _effective(config: RunConfig) -> RunConfig:
+    return config.model_copy(update={"prior": config.prior.effective()})
 
 
 class _Maker:

@@ -61,6 +61,11 @@ def changing(rows: Tensor) -> Tensor:
     return rows.std(0) > _STILL * rows.abs().amax(0)
 
 
+def done(data: Transitions, actions: int | None) -> Tensor:
+    """Return the numbers that say what each agent does, [M, T, N, A]; a discrete action as one number per choice."""
+    return data.action if actions is None else F.one_hot(data.action, actions).float()
+
+
 class Moments:
     """Moments of what is seen and done, and the maps that leave them as they are, up to chance.
 
@@ -71,7 +76,7 @@ class Moments:
 
     def __init__(self, data: Transitions, actions: int | None) -> None:
         self.width, self._discrete = data.obs.shape[-1], actions is not None
-        acted = data.action if actions is None else F.one_hot(data.action, actions).float()
+        acted = done(data, actions)
         mean = data.obs.mean((0, 1, 2))
         error = data.obs.mean((1, 2)).std(0) / len(data.obs) ** 0.5
         self.centre = torch.where(mean.abs() > SIGNIFICANT * error, mean, 0.0)
@@ -83,8 +88,8 @@ class Moments:
         z = torch.cat([seen, acted, torch.ones_like(seen[..., :1])], -1)
         change = F.pad(data.next_obs - data.obs, (0, z.shape[-1] - self.width))
         reward = (data.reward - data.reward.mean()).unsqueeze(-1)
-        pairs = ((z, z), (change, z), (reward * z, z), (reward * z.square(), z.square()))
-        self._means, self._covariances = zip(*(_moments(left, right) for left, right in pairs), strict=True)
+        signed = [_moments(left, z) for left in (z, change, reward * z)]
+        self._kinds = [(kind, True) for kind in signed] + [(_moments(reward * z.square(), z.square()), False)]
 
     def places(self, number: int) -> list[tuple[int, int]]:
         """Return the places, with signs, that a number can become at all."""
@@ -128,10 +133,10 @@ class Moments:
         )
 
     def _same(self, i: int, j: int, a: int, b: int, sign: int) -> bool:
-        """Return whether the moments of (i, j) are those of (a, b), the last without a sign."""
+        """Return whether the moments of (i, j) are those of (a, b), those of squares without a sign."""
         here, there = i * (self.size + 1) + j, a * (self.size + 1) + b
-        for kind, (mean, covariance) in enumerate(zip(self._means, self._covariances, strict=True)):
-            way = 1 if kind == 3 else sign
+        for (mean, covariance), is_signed in self._kinds:
+            way = sign if is_signed else 1
             variance = covariance[here, here] + covariance[there, there] - 2 * way * covariance[here, there]
             gap, size = float((mean[here] - way * mean[there]).abs()), float(mean[here].abs() + mean[there].abs())
             if gap > SIGNIFICANT * float(variance.clamp_min(0).sqrt()) + _ROUNDING * size + 1e-12:

@@ -42,7 +42,7 @@ def check_by_regression(
         tolerated: gap up to which a field holds.
     """
     half = len(data.obs) // 2
-    first = Transitions(*(part[:half] for part in vars(data).values() if part is not None))
+    first = data.episodes(slice(half))
     rows = _rows(spaces, data)
     for_each, for_all = _Plain(*rows, shared=False), _Plain(*rows, shared=True)
     verdicts = []

@@ -47,6 +47,10 @@ class Transitions:
     next_obs: Tensor
     action_mask: Tensor | None = None
 
+    def episodes(self, where: slice) -> Transitions:
+        """Return some of the episodes."""
+        return Transitions(*(part[where] for part in vars(self).values() if part is not None))
+
 
 def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> Transitions:
     """Return the first steps of episodes of the random policy.
@@ -90,7 +94,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     half = len(data.obs) // 2
     inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
     model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
-    held = Transitions(*(part[half:] for part in vars(data).values() if part is not None))
+    held = data.episodes(slice(half, None))
     return [_judge(element, spaces, held, model) for element in elements]
 
 

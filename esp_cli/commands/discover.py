@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from esp_cli.checking.discovery import Discovery
     from esp_envs import Environment
 
-_WORLDS = 512
-"""Worlds that collect transitions for a blind search."""
 EPILOG = """Examples:\n
     esp discover navigation --set task.wind=0.3\n
     esp discover runs/navigation --json found.json\n
@@ -62,7 +60,6 @@ def discover(
 def _discovery(
     what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, blind: bool
 ) -> Discovery:
-    from esp_cli.checking.blind import discover_blindly, transitions_of
     from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
     from esp_cli.checking.logs import read_transitions
     from esp_envs.registry import make
@@ -74,7 +71,11 @@ def _discovery(
             raise ValueError(f"{what} does not say what its numbers are; name the task that has its layout with --task")
         spec = make(task, 1, [0], settings).spec
         data = read_transitions(path, spec)
-        return discover_blindly(what, spec, data) if blind else discover_in_transitions(what, spec, data, transforms)
+        if blind:
+            from esp_cli.checking.blind import discover_blindly
+
+            return discover_blindly(what, spec, data)
+        return discover_in_transitions(what, spec, data, transforms)
     name = what
     if task is not None:
         raise ValueError(f"--task is for a file of transitions, and there is no file {what}; leave it out")
@@ -89,8 +90,9 @@ def _discovery(
         return make(name, num_envs, seeds, settings)
 
     if blind:
-        env = worlds(_WORLDS, [0])
-        return discover_blindly(env.spec.name, env.spec, transitions_of(env))
+        from esp_cli.checking.blind import discover_blindly_in_task
+
+        return discover_blindly_in_task(worlds)
     return discover_in_task(worlds, transforms, logs)
 
 
