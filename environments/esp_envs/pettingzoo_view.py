@@ -3,7 +3,7 @@
     from esp_envs.pettingzoo_view import ParallelView
     env = ParallelView("navigation", seed=0, num_agents=4)
 
-Needs the optional extra `pettingzoo` (pip install "esp-marl[pettingzoo]").
+Needs the optional extra `pettingzoo` of this package.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from esp_envs.base import Observation
 from esp_envs.drawing import draw
+from esp_envs.extras import install
 from esp_envs.registry import make
 from esp_envs.spec import Continuous
 
@@ -24,8 +25,7 @@ try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
     raise ImportError(
-        f"the PettingZoo view needs a package that is missing ({error.name}); "
-        'install it with: pip install "esp-marl[pettingzoo]"'
+        f"the PettingZoo view needs a package that is missing ({error.name}): {install('pettingzoo')}"
     ) from error
 
 _Array = NDArray[Any]

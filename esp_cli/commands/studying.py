@@ -17,6 +17,7 @@ from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.machine import busy_with
+from esp_envs.extras import install
 
 if TYPE_CHECKING:
     from esp_cli.evaluation.final import Mode
@@ -96,7 +97,7 @@ def open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
     try:
         from esp_cli.studies.engine_ray import RayEngine
     except ImportError:
-        raise ValueError("Ray is not installed: pip install 'esp-marl[cluster]', or use --engine local") from None
+        raise ValueError(f"Ray is not installed: {install('cluster')}, or use --engine local") from None
     with RayEngine(out, choices.address, choices.gpu_share) as engine:
         yield engine
 

@@ -14,6 +14,7 @@ from esp_cli.commands.options import check_finite
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import follow, open_engine, report_study, run_cells
+from esp_envs.extras import install
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
@@ -121,7 +122,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
     try:
         from esp_cli.studies.tuner import Trials, Tuner, write_presets
     except ImportError:
-        raise ValueError("Optuna is not installed: pip install 'esp-marl[tune]'") from None
+        raise ValueError(f"Optuna is not installed: {install('tune')}") from None
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TuningFolder, fresh_study
 

@@ -11,6 +11,7 @@ import numpy as np
 from esp_cli import __version__
 from esp_cli.deploy import layers
 from esp_cli.deploy.program import Program
+from esp_envs.extras import install
 
 OPSET = 17
 """The first with layer normalisation; runtimes since 2022 read it."""
@@ -26,9 +27,7 @@ def library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise ValueError(
-            f"an ONNX export needs the package {name}; install the extra with pip install 'esp-marl[export]'"
-        ) from None
+        raise ValueError(f"an ONNX export needs the package {name}: {install('export')}") from None
 
 
 def onnx_model(program: Program, description: str) -> bytes:

@@ -8,6 +8,7 @@ from importlib import import_module
 from importlib.util import find_spec
 
 from esp_cli.trackers.sink import Guarded, Sink, TrackedRun
+from esp_envs.extras import install
 
 __all__ = ["TRACKERS", "Guarded", "Sink", "TrackedRun", "open_trackers", "require"]
 
@@ -29,7 +30,7 @@ def require(names: Sequence[str]) -> None:
         if name not in TRACKERS:
             raise ValueError(f"there is no tracker '{name}'; the trackers are {', '.join(TRACKERS)}")
         if find_spec(name) is None:
-            raise ValueError(f"{name} is not installed: pip install 'esp-marl[{name}]', or leave out --track {name}")
+            raise ValueError(f"{name} is not installed: {install(name)}, or leave out --track {name}")
 
 
 def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:

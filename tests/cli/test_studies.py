@@ -166,7 +166,7 @@ def test_without_ray_a_cluster_is_refused_in_one_sentence(tmp_path: Path, monkey
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "esp_cli.studies.engine_ray", raising=False)
     told = refused(*TINY, "--steps", 200, *TINY_OPTIONS, "--out", tmp_path / "s", "--engine", "ray")
-    assert told == "Ray is not installed: pip install 'esp-marl[cluster]', or use --engine local"
+    assert told == "Ray is not installed: pip install 'ray>=2.40', or use --engine local"
     assert not (tmp_path / "s").exists()
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("optuna", reason="needs Optuna: pip install 'esp-marl[tune]'")
+pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
 
 from esp_cli.studies.study import StudyFolder
 from tests.cli.running import TINY_OPTIONS, esp, refused
@@ -54,7 +54,7 @@ def test_without_optuna_tuning_is_refused_in_one_sentence(
 ) -> None:
     monkeypatch.setitem(sys.modules, "optuna", None)
     monkeypatch.delitem(sys.modules, "esp_cli.studies.tuner", raising=False)
-    assert refused(*command, "--steps", "300") == "Optuna is not installed: pip install 'esp-marl[tune]'"
+    assert refused(*command, "--steps", "300") == "Optuna is not installed: pip install 'optuna>=4.2'"
     assert not (tmp_path / "t").exists()
 
 

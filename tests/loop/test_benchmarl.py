@@ -13,10 +13,10 @@ import torch
 
 from esp_cli import Continuous, Discrete, Field, Kind, Symmetry, layout
 
-pytest.importorskip("vmas", reason="needs BenchMARL and VMAS: pip install 'esp-marl[benchmarl]'")
+pytest.importorskip("vmas", reason="needs BenchMARL and VMAS, of the extra benchmarl")
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # of gym, which VMAS imports
-    pytest.importorskip("benchmarl", reason="needs BenchMARL and VMAS: pip install 'esp-marl[benchmarl]'")
+    pytest.importorskip("benchmarl", reason="needs BenchMARL and VMAS, of the extra benchmarl")
 
 from benchmarl.algorithms import IppoConfig, MaddpgConfig, MappoConfig, QmixConfig
 from benchmarl.environments import VmasTask

@@ -10,7 +10,7 @@ from torch import nn
 
 from esp_cli import Continuous, Field, Items, Kind, Symmetry, discrete_moves, layout
 
-pytest.importorskip("torchrl", reason="needs TorchRL: pip install 'esp-marl[torchrl]'")
+pytest.importorskip("torchrl", reason="needs TorchRL, of the extra torchrl")
 
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential

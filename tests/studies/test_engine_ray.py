@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("ray", reason="needs Ray: pip install 'esp-marl[cluster]'")
+pytest.importorskip("ray", reason="needs Ray, of the extra cluster")
 
 import ray
 from ray.cluster_utils import Cluster

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("optuna", reason="needs Optuna: pip install 'esp-marl[tune]'")
+pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
 
 from optuna.trial import TrialState
 

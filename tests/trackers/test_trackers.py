@@ -76,7 +76,7 @@ def test_a_missing_package_is_one_sentence_before_there_is_a_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: Path
 ) -> None:
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
-    sentence = "mlflow is not installed: pip install 'esp-marl[mlflow]', or leave out --track mlflow"
+    sentence = "mlflow is not installed: pip install 'mlflow-skinny>=2.16', or leave out --track mlflow"
     assert refused("train", "--out", tmp_path / "run", "--track", "mlflow") == sentence
     assert not (tmp_path / "run").exists()
     assert refused("train", "--resume", copied, "--track", "mlflow") == sentence

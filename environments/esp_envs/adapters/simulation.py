@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import Observation
+from esp_envs.extras import install
 from esp_envs.spec import Field, Items, Kind, Layout
 
 Tensors = dict[str, Tensor]
@@ -35,9 +36,7 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
     try:
         import vmas  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise ValueError(
-            f'a VMAS task needs a package that is missing ({error.name}); install it with: pip install "esp-marl[vmas]"'
-        ) from error
+        raise ValueError(f"a VMAS task needs a package that is missing ({error.name}): {install('vmas')}") from error
 
     def make() -> Any:
         try:
