@@ -80,10 +80,17 @@ def verdicts(results: Results) -> list[Verdict]:
     ]
 
 
-def side(results: Results, cell: CellResult, other: CellResult | None) -> _Side | None:
-    """Return whether a cell is ahead of another, by the 95 % interval of the difference of their means."""
-    values = returns_of(cell, results.mode)
-    others = None if other is None else returns_of(other, results.mode)
+def side(results: Results, cell: CellResult, other: CellResult | None, early: bool = False) -> _Side | None:
+    """Return whether a cell is ahead of another, by the 95 % interval of the difference of their means.
+
+    Args:
+        results: of the study.
+        cell: one cell.
+        other: the other, if there is one.
+        early: at a fifth of the run instead of its end.
+    """
+    values = at(results, cell, early)
+    others = None if other is None else at(results, other, early)
     if other is None or values is None or others is None or not _finite(values, others):
         return None
     found = difference(values, others, cell.seeds == other.seeds)
@@ -95,9 +102,20 @@ def side(results: Results, cell: CellResult, other: CellResult | None) -> _Side 
     return "ahead" if interval[0] > 0 else "behind" if interval[1] < 0 else "level"
 
 
-def early_of(cell: CellResult) -> Floats | None:
-    """Return the returns at a fifth of the run, by seed."""
+def at(results: Results, cell: CellResult, early: bool) -> Floats | None:
+    """Return the returns by seed, at a fifth of the run or at its end; None where it was not run so far."""
+    if not early:
+        return returns_of(cell, results.mode)
     return None if cell.early is None else floats(cell.early)
+
+
+def leaders(results: Results, cells: Mapping[str, CellResult], early: bool) -> set[str]:
+    """Return the method with the highest mean, and those that are not told apart from it."""
+    known = {method: values for method, cell in cells.items() if (values := at(results, cell, early)) is not None}
+    best = max((method for method in known if _finite(known[method])), key=lambda one: known[one].mean(), default=None)
+    if best is None:
+        return set()
+    return {best} | {one for one in known if side(results, cells[one], cells[best], early) == "level"}
 
 
 def _finite(*values: Floats) -> bool:

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
 from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.reporting.breaking import ESP, PLAIN, early_of, series_of, side, verdicts
+from esp_cli.reporting.breaking import ESP, PLAIN, at, leaders, series_of, side, verdicts
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell
 from esp_cli.studies import paper
 from esp_cli.studies.catalogue import paper_cells
+from esp_cli.studies.kinds import UNBROKEN
 
 NOT_RUN, _STOPPED = "not run", "every seed stopped"
 _AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", None: NOTHING}
@@ -151,15 +152,33 @@ def breaking_table(results: Results) -> Table | None:
     for one in series_of(results):
         for strength, cells in one.cells.items():
             for method, cell in cells.items():
-                early = early_of(cell)
-                short = NOTHING if early is None else _mean_of(summarise(early))
                 beside = [
                     _AHEAD[side(results, cell, cells.get(name))] if method != name else "" for name in (PLAIN, ESP)
                 ]
+                short = _return_at(results, cell, early=True)
                 rows.append((one.name, f"{one.setting} {strength:g}", method, short, _short(results, cell), *beside))
     caption = "Mean ± standard error over seeds at a fifth of the run and at its end; ahead: at the end, by intervals."
     headings = ("run", "breaking", "method", "at 20 %>", "at 100 %>", "ahead of plain", "ahead of ESP")
     return Table("Returns over the strength of breaking", headings, tuple(rows), caption) if rows else None
+
+
+def methods_table(results: Results, early: bool = False) -> Table | None:
+    """Return the returns with one column for each method, or None of a study that breaks nothing."""
+    lines = {
+        f"{one.name}, {f'{one.setting} {strength:g}' if strength else UNBROKEN}": cells
+        for one in series_of(results)
+        for strength, cells in one.cells.items()
+    }
+    methods = tuple(dict.fromkeys(method for cells in lines.values() for method in cells))
+    rows = []
+    for name, cells in lines.items():
+        best = leaders(results, cells, early)
+        texts = {method: _return_at(results, cell, early) for method, cell in cells.items()}
+        rows.append((name, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
+    when = "at a fifth of the run" if early else "at the end of the run"
+    caption = f"Mean ± standard error over seeds {when}; (*): the highest of its row, or not told apart from it."
+    headings = ("run", *(f"{method}>" for method in methods))
+    return Table(f"Returns {when}", headings, tuple(rows), caption) if rows else None
 
 
 def verdicts_table(results: Results) -> Table | None:
@@ -196,16 +215,20 @@ TABLES: dict[str, Callable[[Results], Table | None]] = {
     "statistics": statistics_table,
     "networks": networks_table,
     "breaking": breaking_table,
+    "methods": methods_table,
+    "methods-early": lambda results: methods_table(results, early=True),
     "verdicts": verdicts_table,
     "aggregates": aggregates_table,
     "provenance": times_table,
 }
 """By the name that a page asks for."""
+_AGAIN = {"paper", "methods", "methods-early"}
+"""Those that say what another one says, in the layout of a page."""
 
 
 def all_tables(results: Results) -> list[Table]:
     """Return every table that has something to say, each once."""
-    made = [make(results) for name, make in TABLES.items() if name != "paper"]
+    made = [make(results) for name, make in TABLES.items() if name not in _AGAIN]
     return [table for table in made if table is not None and table.rows]
 
 
@@ -248,6 +271,11 @@ def _caption(results: Results) -> str:
 
 def _mean_of(summary: SeedSummary | None) -> str:
     return NOTHING if summary is None else format_mean(summary.mean, summary.sem)
+
+
+def _return_at(results: Results, cell: CellResult, early: bool) -> str:
+    values = at(results, cell, early)
+    return NOTHING if values is None else _mean_of(summarise(values))
 
 
 def _estimate(found: Estimate | None) -> str:

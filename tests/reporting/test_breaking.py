@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from esp_cli.checking import measured
-from esp_cli.reporting.breaking import Verdict, series_of, side, verdicts
+from esp_cli.reporting.breaking import Verdict, leaders, series_of, side, verdicts
 from esp_cli.reporting.collect import collect
 from esp_cli.reporting.page import write_report
 from esp_cli.reporting.results import read_results
-from esp_cli.reporting.tables import breaking_table, returns_table, verdicts_table
+from esp_cli.reporting.tables import breaking_table, methods_table, returns_table, verdicts_table
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.kinds import BREAKINGS, KINDS
 from esp_cli.studies.study import StudyFolder
@@ -161,6 +161,24 @@ def test_the_table_has_returns_at_a_fifth_and_at_the_end(folder: StudyFolder):
     assert rows["wind 0", "measured weights"][-1] == "not told apart"
 
 
+def test_a_page_has_one_column_for_each_method_and_marks_the_best(folder: StudyFolder):
+    """Seeds of all methods differ by the same noise, so methods are level only where their means are equal."""
+    results = collect(folder).results
+    end, early = methods_table(results), methods_table(results, early=True)
+    assert end is not None
+    assert early is not None
+    assert end.headings == ("run", *(f"{method}>" for method in METHODS))
+    assert [row[0] for row in end.rows] == [
+        f"navigation, MAPPO, 200, {x}" for x in ("unbroken", "wind 0.3", "wind 0.6")
+    ]
+    best = [{method for method, text in zip(METHODS, row[1:], strict=True) if "(*)" in text} for row in end.rows]
+    assert best == [{name for name, mean in BASE.items() if mean == -120.0}, {"compass"}, {"compass"}]
+    assert end.rows[1][1:3] == ("-150.00 ± 0.58", "-180.00 ± 0.58")
+    assert early.rows[1][1].startswith("-170.00")
+    cells = {name: cell.model_copy(update={"early": None}) for name, cell in series_of(results)[0].cells[0.3].items()}
+    assert leaders(results, cells, early=True) == set()
+
+
 def test_the_report_draws_returns_over_the_strength(folder: StudyFolder, tmp_path: Path):
     files = write_report(collect(folder), tmp_path / "report")
     assert "breaking-1.png" in {file.name for file in files}
@@ -190,6 +208,7 @@ def test_without_runs_nothing_is_said_and_other_studies_have_no_such_table(tmp_p
     other = write_study(tmp_path / "other", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
     results = collect(other).results
     assert breaking_table(results) is None
+    assert methods_table(results) is None
     assert verdicts_table(results) is None
     assert returns_table(results).rows
     assert all(cell.early is None for cell in results.cells)
