@@ -16,7 +16,7 @@ class PriorConfig(BaseModel):
 
     `kind` "esp" has both parts, copies and consistency losses; "augment" and "consistency" have one of them; "none" is
     the plain learner. "auto" is short for "esp" with trust "measured" that fades: elements that hold stay, the others
-    count by how nearly they hold, and only for the first half of the run.
+    count by how nearly they hold, and only for the first half of the run. It weighs all of d4, whatever a preset has.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

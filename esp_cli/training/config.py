@@ -135,6 +135,8 @@ def resolve_config(
     for name in set(sections["network"]) - set(network.model_fields):
         if f"network.{name}" not in (overrides or {}):  # of a preset, for a network that the user did not choose
             del sections["network"][name]
+    if sections["prior"].get("kind") == "auto" and "prior.transforms" not in (overrides or {}):
+        sections["prior"].pop("transforms", None)  # of a preset, for a prior that trusts all of them alike
 
     task_settings = resolve_task_settings(task, sections["task"])
     algorithm_settings = validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)

@@ -93,6 +93,16 @@ def test_auto_is_short_for_measured_weights_that_fade_and_what_a_user_chooses_wi
     assert PriorConfig.model_validate(auto.model_dump()) == auto
 
 
+def test_auto_weighs_all_of_d4_where_a_preset_has_less_and_nobody_chose() -> None:
+    def transforms(**overrides: object) -> str:
+        named = {f"prior.{name}": value for name, value in overrides.items()}
+        return resolve_config("formation", overrides=named).prior.transforms
+
+    assert (transforms(), transforms(kind="auto")) == ("c4", "d4")
+    assert transforms(kind="auto", transforms="c2") == "c2"
+    assert transforms(trust="measured", fade=0.5) == "c4", "written out, a preset's choice stays"
+
+
 def test_weights_of_1_are_the_prior_as_it_is_bit_for_bit(tmp_path: Path) -> None:
     measured = ("--set", "prior.trust=measured")
     assert (
