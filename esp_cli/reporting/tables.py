@@ -164,20 +164,23 @@ def breaking_table(results: Results) -> Table | None:
 
 def methods_table(results: Results, early: bool = False) -> Table | None:
     """Return the returns with one column for each method, or None of a study that breaks nothing."""
+    series = series_of(results)
+    shared = series[0].name if len({one.name for one in series}) == 1 else None
     lines = {
-        f"{one.name}, {f'{one.setting} {strength:g}' if strength else UNBROKEN}": cells
-        for one in series_of(results)
+        (one.name, f"{one.setting} {strength:g}" if strength else UNBROKEN): cells
+        for one in series
         for strength, cells in one.cells.items()
     }
     methods = tuple(dict.fromkeys(method for cells in lines.values() for method in cells))
     rows = []
-    for name, cells in lines.items():
+    for (name, breaking), cells in lines.items():
         best = leaders(results, cells, early)
         texts = {method: _return_at(results, cell, early) for method, cell in cells.items()}
-        rows.append((name, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
+        label = breaking if shared else f"{name}, {breaking}"
+        rows.append((label, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
     when = "at a fifth of the run" if early else "at the end of the run"
     caption = f"Mean ± standard error over seeds {when}; (*): the highest of its row, or not told apart from it."
-    headings = ("run", *(f"{method}>" for method in methods))
+    headings = (shared or "run", *(f"{method}>" for method in methods))
     return Table(f"Returns {when}", headings, tuple(rows), caption) if rows else None
 
 
