@@ -21,14 +21,13 @@ from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regu
 Relaxation = Literal["residual", "weights"]
 
 
-def copies_for(width: int, group: FiniteGroup, relaxation: Relaxation | None = None) -> int:
+def copies_for(width: int, group: FiniteGroup, banks: int = 1) -> int:
     """Return how many regular features have about as many weights between two layers as `width` plain numbers.
 
-    Two layers of m features of a group of order G share m m G free numbers, so m is width / sqrt(G). Relaxed weights
-    share twice as many; a plain layer beside them has (m G)^2 more.
+    Two layers of m features of a group of order G share m m G free numbers in each bank of filters, so m is width /
+    sqrt(banks G).
     """
-    free = {None: group.order, "weights": 2 * group.order, "residual": group.order + group.order**2}
-    return max(1, round(width / math.sqrt(free[relaxation])))
+    return max(1, round(width / math.sqrt(banks * group.order)))
 
 
 class ConstrainedLinear(nn.Module):
@@ -173,8 +172,8 @@ class Equivariant(Memoryless):
                 f"the network 'equivariant' reads numbers, but {io.spaces.label} shows pictures; use empn or mlp"
             )
         self.group = io.group(config.group)
-        relaxation = config.relaxation if config.relax else None
-        hidden = [[regular(self.group, copies_for(width, self.group, relaxation))] for width in config.hidden]
+        banks = 2 if config.relax and config.relaxation == "weights" else 1
+        hidden = [[regular(self.group, copies_for(width, self.group, banks))] for width in config.hidden]
         blocks = [io.inputs(self.group), *hidden, io.outputs(self.group)]
         gains = [GAINS[config.activation]] * len(hidden) + [output_gain]
         self.layers = nn.ModuleList(

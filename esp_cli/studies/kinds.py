@@ -188,11 +188,12 @@ KINDS: Mapping[str, StudyKind] = {
             "measured weights": {"prior.kind": "esp", "prior.trust": "measured"},
             "gate": {"prior.kind": "esp", "prior.trust": "gate"},
             "compass": {"prior.kind": "esp", "prior.compass": 1.0},
-            "relaxed network": {
+            "relaxed weights": {
                 "prior.kind": "none",
                 "network.name": "equivariant",
                 "network.group": "d4",
-                "network.relax": 0.1,
+                "network.relax": 1.0,
+                "network.relaxation": "weights",
             },
         },
         tasks=("navigation", "predator-prey", "formation"),

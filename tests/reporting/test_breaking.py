@@ -27,7 +27,7 @@ BASE = {
     "measured weights": -120.0,
     "gate": -120.0,
     "compass": -125.0,
-    "relaxed network": -120.0,
+    "relaxed weights": -120.0,
 }
 """Returns where nothing is broken; the standard error is 1."""
 BROKEN = {
@@ -38,7 +38,7 @@ BROKEN = {
     "measured weights": -140.0,
     "gate": -140.0,
     "compass": -130.0,
-    "relaxed network": -200.0,
+    "relaxed weights": -200.0,
 }
 NOISE = (-1.0, 0.0, 1.0)
 
@@ -65,7 +65,7 @@ def test_every_method_meets_every_strength_of_its_task(monkeypatch: pytest.Monke
     assert [configs[m].prior.kind for m in METHODS] == ["none", *["esp"] * (len(METHODS) - 2), "none"]
     assert configs["ESP that fades"].prior.fade > 0
     assert configs["compass"].prior.compass > 0
-    assert (configs["gate"].prior.trust, configs["relaxed network"].network.relax) == ("gate", 0.1)
+    assert (configs["gate"].prior.trust, configs["relaxed weights"].network.relax) == ("gate", 1.0)
     assert all(cell.reference is None or cell.reference.endswith("-plain") for cell in cells)
 
 
@@ -127,7 +127,7 @@ def test_each_method_gets_its_verdict(folder: StudyFolder):
         Verdict("measured weights", True, True, True),
         Verdict("gate", True, True, True),
         Verdict("compass", False, True, True),
-        Verdict("relaxed network", True, False, False),
+        Verdict("relaxed weights", True, False, False),
     ]
     table = verdicts_table(results)
     assert table is not None
