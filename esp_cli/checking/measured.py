@@ -15,7 +15,7 @@ from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment
-from esp_envs.registry import make
+from esp_envs.registry import make, task_class
 
 _EPISODES = 1024
 _WORLDS = 256
@@ -39,7 +39,8 @@ def prepared(config: RunConfig) -> RunConfig:
         )
         prior = prior.model_copy(update=change)
     if prior.kind != "none" and prior.trust != "full" and not prior.weights:
-        weights = {name: math.exp(-prior.doubt * gap) for name, gap in _breaking(_Maker(config), prior.transforms)}
+        gaps = _breaking(_Maker(config), prior.transforms)
+        weights = {name: math.exp(-prior.doubt * gap) if gap < math.inf else 0.0 for name, gap in gaps}
         prior = prior.model_copy(update={"weights": weights})
     return config if prior is config.prior else config.model_copy(update={"prior": prior})
 
@@ -60,7 +61,7 @@ class _Maker:
         self._task, self._settings = config.task, dict(config.task_settings)
         if isinstance(horizon := self._settings.get("horizon"), int):
             self._settings["horizon"] = min(horizon, _HORIZON)
-        self._key = (config.task, repr(sorted(self._settings.items())))
+        self._key = (task_class(config.task), repr(sorted(self._settings.items())))  # a name can get another class
 
     def __call__(self, num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(self._task, num_envs, seeds, self._settings)
@@ -94,4 +95,7 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
 
 
 def _worst(verdict: ElementVerdict) -> float:
+    """Return how far the worst field is off; without end where nothing could be said, as of a task that raises."""
+    if verdict.outcome == "not covered":
+        return math.inf
     return max((field.gap for field in verdict.fields if field.outcome == "broken"), default=0.0)

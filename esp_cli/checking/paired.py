@@ -112,12 +112,12 @@ def _judge(
 
 def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, plain: Tensor) -> FieldVerdict:
     """Judge one field from its outcomes [M, numbers]; `plain` is x before it was transformed."""
-    spread = torch.cat([x, y]).std(0)
-    scale = max(float(spread.max()), 1e-6)
     known = torch.isfinite(torch.stack([x, x2, y, y2])).all(-1).all(0)
     x, x2, y, y2 = (part[known] for part in (x, x2, y, y2))
     if not bool(known.any()):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    spread = torch.cat([x, y]).std(0)
+    scale = max(float(spread.max()), 1e-6)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
     # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
     bound = _BOUND * scale

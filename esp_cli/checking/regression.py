@@ -54,15 +54,16 @@ def check_by_regression(
 
 
 def _fields(spaces: Spaces, gap: Tensor, outputs: Tensor, tolerated: float) -> tuple[FieldVerdict, ...]:
-    names = spaces.observation.slices() | {"reward": slice(spaces.observation.width, spaces.observation.width + 1)}
-    return tuple(
-        _field(name if name == "reward" else f"obs.{name}", gap[:, where], outputs[..., where], tolerated)
-        for name, where in names.items()
-    )
+    width = spaces.observation.width
+    parts = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
+    parts["reward"] = slice(width, width + 1)
+    if outputs.shape[-1] > width + 1:
+        parts["action mask"] = slice(width + 1, None)
+    return tuple(_field(name, gap[:, where], outputs[..., where], tolerated) for name, where in parts.items())
 
 
 def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
-    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1].
+    """Return inputs [M, T, N, features] and outputs [M, T, N, D + 1], behind them any mask of actions.
 
     The inputs hold what the other agents see and do: else others that prefer a direction would look like a task that
     does.

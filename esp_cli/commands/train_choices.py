@@ -28,6 +28,7 @@ def with_file(
     Raises:
         ValueError: the file cannot be read, or does not go with what was given.
     """
+    from esp_cli.prior.config import SAID_BY_AUTO
     from esp_cli.training.config_file import read_config_file
 
     file = read_config_file(path)
@@ -42,7 +43,10 @@ def with_file(
                     "or name a file with only what differs"
                 )
     filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in said}
-    return given | filled, file.settings | settings
+    kept = file.settings
+    if settings.get("prior.kind") == "auto":  # says these by itself
+        kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
+    return given | filled, kept | settings
 
 
 def _was_given(context: typer.Context, name: str) -> bool:

@@ -83,18 +83,24 @@ class FinalEvaluation(BaseModel):
 
 
 def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
-    """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy."""
+    """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy.
+
+    A seed that stopped in training has an early policy. Its numbers are NaN, as in the metrics of its run.
+    """
     seeds = trained.config.seeds
     greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
     drawn = PolicyController(trained.policy, generators(seeds, _STREAM, "noise"))
     stochastic = play_batches(trained, drawn, "stochastic", episodes)
+    for played in (greedy, stochastic):
+        for numbers in (played.returns, *played.metrics.values()):
+            numbers[list(trained.stopped)] = float("nan")
     names = task_class(trained.config.task).heuristics
     anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
         anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
     spread = dict(anchors)
-    if len(seeds) == 1:
+    if len(seeds) == 1 and not trained.stopped:
         spread |= {"greedy": greedy, "stochastic": stochastic}
     return FinalEvaluation(
         esp_version=__version__,
@@ -111,7 +117,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         anchors={name: float(played.returns.mean()) for name, played in anchors.items()},
         heuristics=names,
         metrics=_means(greedy),
-        metrics_per_seed={name: tuple(value.mean(1).tolist()) for name, value in greedy.metrics.items()},
+        metrics_per_seed={name: summarise_returns(value).per_seed for name, value in greedy.metrics.items()},
         anchor_metrics={name: _means(played) for name, played in anchors.items()},
         over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
     )
@@ -123,7 +129,9 @@ def summarise_returns(returns: Tensor) -> SeedSummary:
 
 
 def _means(episodes: Episodes) -> Metrics:
-    return {name: float(value.mean()) for name, value in episodes.metrics.items()}
+    """Return the mean of each metric over the episodes that count."""
+    known = {name: value[value.isfinite()] for name, value in episodes.metrics.items()}
+    return {name: float(value.mean()) for name, value in known.items() if value.numel()}
 
 
 def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,17 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
     return table
 
 
-def flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and the value of everything in nested tables: {"a": {"b": 1}} -> ("a.b", 1)."""
+def flat(table: Mapping[str, Any], whole: Collection[str] = (), prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of everything in nested tables: {"a": {"b": 1}} -> ("a.b", 1).
+
+    Args:
+        table: the outermost.
+        whole: dotted names whose tables are values themselves.
+        prefix: of all names.
+    """
     for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from flat(value, f"{prefix}{key}.")
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and name not in whole:
+            yield from flat(value, whole, f"{name}.")
         else:
-            yield f"{prefix}{key}", value
+            yield name, value

@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 _AUTO = {"kind": "esp", "trust": "measured", "fade": 0.5}
 """What `kind` "auto" stands for, under what else the user chooses."""
+SAID_BY_AUTO = frozenset({*_AUTO, "transforms", "weights"})
+"""Settings that another prior has no say in where a user asks for "auto"."""
 
 
 class PriorConfig(BaseModel):

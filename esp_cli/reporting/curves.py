@@ -28,6 +28,7 @@ class RunCurve:
         steps: [K] environment steps per seed.
         values: [K, S] returns; NaN where a seed stopped.
         seconds: training time so far.
+        trained: environment steps per seed so far, where they are more than those of the last evaluation.
     """
 
     label: str
@@ -35,6 +36,7 @@ class RunCurve:
     steps: NDArray[np.int64]
     values: NDArray[np.float64]
     seconds: float
+    trained: int = 0
 
     @cached_property
     def spec(self) -> TaskSpec:
@@ -48,7 +50,7 @@ class RunCurve:
 
     def until(self, step: int) -> RunCurve | None:
         """Return the curve up to the evaluation nearest to a step, or None where the run did not get there."""
-        if step - self.last_step > self.config.evaluation.every_steps:
+        if step > max(self.trained, self.last_step):
             return None
         end = int(np.abs(self.steps - step).argmin()) + 1
         return replace(self, steps=self.steps[:end], values=self.values[:end])
@@ -70,4 +72,5 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
         )
     times = (row.get("time/elapsed_s") for row in rows)
     seconds = max((time for time in times if isinstance(time, int | float)), default=0.0)
-    return RunCurve(label or path.name, config, steps, values, seconds)
+    trained = max((row["step"] for row in rows if isinstance(row.get("step"), int)), default=0)
+    return RunCurve(label or path.name, config, steps, values, seconds, trained)

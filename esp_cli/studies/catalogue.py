@@ -137,9 +137,9 @@ def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
         return kind.steps or ((rows or names) if kind.all_rows else (rows or names)[:1])
     own = tuple(steps for name, steps in request.steps if name == task)
     if own:
-        return own
+        return tuple(dict.fromkeys(own))
     row_of = dict(zip(names, rows, strict=True)) if rows else {}
-    return tuple(row_of.get(steps, steps) for name, steps in request.steps if name is None)
+    return tuple(dict.fromkeys(row_of.get(steps, steps) for name, steps in request.steps if name is None))
 
 
 def _config(task: str, algorithm: str, steps: int, request: Request, choice: Settings, common: Settings) -> RunConfig:

@@ -169,9 +169,10 @@ class StudyFolder:
 
     @classmethod
     def _written(cls, path: Path, study: Study) -> StudyFolder:
+        folder = cls(path, study)
         reach("study")
         STUDY_FORMAT.write(path / _STUDY, study.model_dump(mode="json"))
-        return cls(path, study)
+        return folder
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:

@@ -86,6 +86,8 @@ class Tuning(BaseModel):
         if (self.goal == "return") != (self.reach is None):
             what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
             raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
+        if "prior.kind" in self.overrides:
+            raise ValueError("a tuning takes the kinds of prior by --prior, not by --set prior.kind")
         for prior in self.priors:
             for name, dimension in space_of(self.space, prior).items():
                 if name in self.overrides:
@@ -224,7 +226,7 @@ def fresh_study(
     panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
     cells: list[Cell] = []
     for prior, (number, settings) in best.items():
-        variants = {f"{NAMES[prior]}, tuned (trial {number})": settings, f"{NAMES[prior]}, default": {}}
+        variants = {f"{NAMES[prior]}, default": {}, f"{NAMES[prior]}, tuned (trial {number})": settings}
         for variant, own in variants.items():
             config, reference = tuning.config(prior, own, seeds), cells[0].name if cells else None
             if all(cell.config != config for cell in cells):  # unless the default settings were the best

@@ -29,7 +29,7 @@ class TrackedRun:
         folder: of the run; a tracker writes below it and nowhere else.
         seeds: of the run, in the order of the metrics.
         config: the resolved configuration.
-        first_step: rows from this step on are written again by a resumed run.
+        first_step: rows after this step are written again by a resumed run.
     """
 
     folder: Path

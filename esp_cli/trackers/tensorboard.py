@@ -32,5 +32,6 @@ class TensorBoard:
             folder = self._run.folder / "tensorboard"
             place = folder if seed is None else folder / f"seed-{seed}"
             # what a resumed run writes again is hidden
-            self._boards[seed] = SummaryWriter(str(place), purge_step=self._run.first_step or None, flush_secs=10)
+            purge = self._run.first_step + 1 if self._run.first_step else None
+            self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)
         return self._boards[seed]

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
@@ -59,6 +59,13 @@ class RunConfig(BaseModel):
     evaluation: EvaluationConfig = EvaluationConfig()
     device: Literal["cpu", "cuda"] = "cpu"
     init_from: InitialPolicy | None = Field(None, description="the policy that it started from")
+
+    @field_validator("seeds")
+    @classmethod
+    def _once(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if len(set(seeds)) < len(seeds):
+            raise ValueError("a seed stands there twice")
+        return seeds
 
     def own_words(self) -> list[str]:
         """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""

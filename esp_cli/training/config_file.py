@@ -48,7 +48,7 @@ def read_config_file(path: Path) -> ConfigFile:
     if "format" in table:
         return _of_run(path, parse_config(RUN_FORMAT.read(path), path))
     choices, settings = {}, {}
-    for name, value in flat(table):
+    for name, value in flat(table, whole=("prior.weights",)):
         if name in CHOICES:
             choices[name] = value
         elif "." in name:

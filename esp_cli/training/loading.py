@@ -38,6 +38,7 @@ class TrainedPolicy:
         step: environment steps per seed behind it.
         source: the run folder or file.
         notes: sentences for the user (a damaged checkpoint was passed over).
+        stopped: places of the seeds that stopped on a number that is not finite; their policies are early ones.
     """
 
     config: RunConfig
@@ -46,6 +47,7 @@ class TrainedPolicy:
     step: int
     source: Path
     notes: tuple[str, ...] = ()
+    stopped: tuple[int, ...] = ()
 
 
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
@@ -151,7 +153,7 @@ def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
     policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
     index = seeds.index(seed)
     policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in trained.policy.state_dict().items()})
-    return replace(trained, config=config, policy=policy)
+    return replace(trained, config=config, policy=policy, stopped=(0,) if index in trained.stopped else ())
 
 
 def _build(
@@ -180,7 +182,15 @@ def _build(
     build = ALGORITHMS[config.algorithm].build_policy
     policy = build(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
     _fill(policy, tensors, path, misfit)
-    return TrainedPolicy(config, policy, spec, step, path, notes)
+    return TrainedPolicy(config, policy, spec, step, path, notes, _stopped(meta, len(config.seeds)))
+
+
+def _stopped(meta: Mapping[str, Any], seeds: int) -> tuple[int, ...]:
+    """Return the places of stopped seeds: a checkpoint names them, a policy file has no return of theirs."""
+    named, returns = meta.get("stopped_seeds"), meta.get("greedy_returns")
+    if isinstance(named, Mapping):
+        return tuple(k for k in range(seeds) if str(k) in named)
+    return tuple(k for k, value in enumerate(returns[:seeds]) if value is None) if isinstance(returns, list) else ()
 
 
 def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -> None:

@@ -176,7 +176,8 @@ class Trainer:
         row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}
         self._stop_broken_seeds(result.finite)
         seconds = time.monotonic() - begun
-        if self.step // self.config.evaluation.every_steps > before or self.is_complete:
+        all_stopped = len(self.stopped_seeds) == len(self.config.seeds)
+        if self.step // self.config.evaluation.every_steps > before or self.is_complete or all_stopped:
             row |= self._evaluate()
         return row, seconds
 

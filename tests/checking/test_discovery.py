@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.checking import Transitions, collect
+from esp_cli.checking import Transitions, collect, measured
 from esp_cli.checking.discovery import (
     accepted_of,
     discover_in_task,
@@ -20,6 +20,7 @@ from esp_cli.checking.discovery import (
 )
 from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
+from esp_cli.checking.paired import _verdict
 from esp_cli.checking.regression import check_by_regression
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.symmetry import parse_elements
@@ -211,6 +212,36 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
     assert "is for a file of transitions" in refused("discover", tmp_path, "--task", "navigation")
+
+
+def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:
+    env = make("navigation", 64, [0])
+    plain = collect(env, 1024, 2)
+    mask = torch.ones(*plain.action.shape, 5, dtype=torch.bool)
+    mask[..., 2] = plain.obs[..., 0] > 0  # one action, in one half of the plane
+    verdicts = [
+        check_by_regression(env.spec, data, parse_elements("rot90", env.spec))[0]
+        for data in (plain, replace(plain, action_mask=mask))
+    ]
+    assert [verdict.outcome for verdict in verdicts] == ["holds", "broken"]
+    assert {field.field for field in verdicts[1].fields if field.outcome == "broken"} == {"action mask"}
+
+
+def test_one_number_that_is_not_finite_hides_no_gap() -> None:
+    x = torch.randn(500, 1, generator=torch.Generator().manual_seed(0))
+    hole = x.clone()
+    hole[7] = torch.nan
+    found = _verdict("reward", hole, x, x + 3, x + 3, x)
+    assert (found.outcome, found.gap > 1) == ("broken", True)
+
+
+def test_what_could_not_be_looked_at_weighs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown = ElementVerdict("rot90", False, (), "the task raises in the transformed states")
+    monkeypatch.setattr(measured, "check_paired", lambda *_: [unknown])
+    measured._breaking.cache_clear()
+    config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.transforms": "rot90"})
+    assert prepared(config).prior.weights == {"rot90": 0.0}
+    measured._breaking.cache_clear()
 
 
 def test_a_gap_that_is_no_number_is_not_accepted() -> None:

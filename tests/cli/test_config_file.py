@@ -48,6 +48,19 @@ def test_what_is_printed_is_a_file_that_resolves_to_the_same(tmp_path: Path, opt
     assert printed("--config", written(tmp_path / "c.json", whole)) == whole
 
 
+def test_auto_means_the_same_over_a_whole_configuration(tmp_path: Path) -> None:
+    whole = written(tmp_path / "c.json", printed("--task", "formation", "--steps", "20k"))
+    auto = printed("--config", whole, "--prior", "auto")["prior"]
+    assert (auto["trust"], auto["fade"], auto["transforms"]) == ("measured", 0.5, "d4")
+    assert printed("--config", whole, "--prior", "auto", "--set", "prior.fade=0.2")["prior"]["fade"] == 0.2
+
+
+def test_weights_of_elements_are_a_value_in_a_small_file(tmp_path: Path) -> None:
+    prior = {"transforms": "rot90,rot180", "trust": "measured", "weights": {"rot90": 0.5, "rot180": 1.0}}
+    small = written(tmp_path / "c.json", {"task": "navigation", "prior": prior})
+    assert printed("--config", small)["prior"]["weights"] == prior["weights"]
+
+
 def test_printing_makes_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     printed("--out", "here")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from esp_cli.evaluation.final import FinalEvaluation, evaluate, summarise_return
 from esp_cli.evaluation.statistics import SeedSummary
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.build import build_environment
-from esp_cli.training.loading import TrainedPolicy
+from esp_cli.training.loading import TrainedPolicy, _stopped
 from esp_cli.training.play import HeuristicController, play
 from esp_cli.training.streams import generators
 from tests.training.runs import tiny_config
@@ -49,6 +51,32 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     assert result.task_settings["num_agents"] == 3
     assert evaluate(trained, 3) == result, "the same every time"
     assert FinalEvaluation.model_validate_json(result.model_dump_json()) == result
+
+
+def test_a_seed_that_stopped_has_no_numbers(tmp_path):
+    whole = untrained(tmp_path)
+    result = evaluate(replace(whole, stopped=(1,)), 3)
+    alone = evaluate(whole, 3).greedy.per_seed
+    assert result.greedy.per_seed == (alone[0], None)
+    assert (result.greedy.mean, result.stochastic.per_seed[1]) == (alone[0], None)
+    assert {values[1] for values in result.metrics_per_seed.values()} == {None}
+    assert all(math.isfinite(value) for value in result.metrics.values())
+    assert FinalEvaluation.model_validate_json(result.model_dump_json()) == result
+    nobody = evaluate(replace(whole, stopped=(0, 1)), 3)
+    assert (nobody.greedy.mean, nobody.metrics) == (None, {})
+
+
+@pytest.mark.parametrize(
+    ("meta", "stopped"),
+    [
+        ({"stopped_seeds": {"1": 200}}, (1,)),
+        ({"greedy_returns": [None, -3.0]}, (0,)),
+        ({"greedy_returns": [-2.0, -3.0]}, ()),
+        ({}, ()),
+    ],
+)
+def test_a_checkpoint_and_a_policy_file_say_who_stopped(meta, stopped):
+    assert _stopped(meta, 2) == stopped
 
 
 def test_anchors_lie_where_the_card_says(tmp_path):

@@ -79,15 +79,17 @@ def test_a_run_without_an_evaluation_or_with_other_seeds_is_refused(tmp_path):
 def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there():
     one = curve([[-9.0], [-7.0], [-5.0]], steps=(0, 800, 1600), seeds=(0,))
     assert one.config.evaluation.every_steps == 100
-    assert [one.until(step).values[-1].tolist() for step in (0, 399, 401, 1100, 1600, 1700)] == [
+    assert [one.until(step).values[-1].tolist() for step in (0, 399, 401, 1100, 1600)] == [
         [-9.0],
         [-9.0],
         [-7.0],
         [-7.0],
-        [-5.0],
         [-5.0],
     ]
-    assert one.until(1701) is None, "more than an evaluation interval past the end"
+    assert one.until(1601) is None, "it did not get there"
+    further = replace(one, trained=1700).until(1650)
+    assert further is not None
+    assert further.last_step == 1600
 
 
 def test_the_fewest_episodes_of_all_runs_are_stated():

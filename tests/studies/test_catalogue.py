@@ -185,3 +185,15 @@ def test_every_study_has_a_title_and_cells_of_its_own_names(monkeypatch: pytest.
         names = {cell.name for cell in study.cells}
         assert len(names) == len(study.cells)
         assert {cell.reference for cell in study.cells} <= {None, *names}
+
+
+def test_two_numbers_of_steps_that_are_one_row_of_a_task_are_run_once():
+    study = plan("table1", request(tasks=("formation",), steps=((None, 500_000), (None, 200_000)), seeds=(0,)))
+    names = [cell.name for cell in study.cells]
+    assert len(set(names)) == len(names)
+    assert {cell.config.steps for cell in study.cells} == {200_000}
+
+
+def test_a_seed_stands_in_a_run_once():
+    with pytest.raises(ValueError, match="twice"):
+        plan("table1", request(tasks=("navigation",), seeds=(0, 0)))

@@ -141,9 +141,12 @@ def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
 def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
     best = {"esp": (3, {"mappo.learning_rate": 0.002}), "none": (0, {})}
     study = fresh_study(tuning(), best, (0, 1), 4)
-    assert [cell.variant for cell in study.cells] == ["ESP, tuned (trial 3)", "ESP, default", "plain, tuned (trial 0)"]
+    assert [cell.variant for cell in study.cells] == ["ESP, default", "ESP, tuned (trial 3)", "plain, default"]
     assert {cell.config.seeds for cell in study.cells} == {(0, 1)}
-    assert study.cells[0].config.algorithm_settings["learning_rate"] == 0.002
+    assert study.cells[1].config.algorithm_settings["learning_rate"] == 0.002
     assert [cell.reference for cell in study.cells] == [None, study.cells[0].name, study.cells[0].name]
+    later = fresh_study(tuning(), best | {"esp": (5, {"mappo.learning_rate": 0.003})}, (0, 1), 4)
+    assert [cell for cell in later.cells if "tuned" not in cell.variant] == [study.cells[0], study.cells[2]]
+    assert later.cells[1].reference == study.cells[1].reference, "another best adds a cell and changes no other"
     with pytest.raises(ValueError, match="seed 1001 belongs to the trials"):
         fresh_study(tuning(), best, (0, 1001), 4)
