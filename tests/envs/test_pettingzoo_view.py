@@ -139,7 +139,7 @@ def test_unknown_tasks_and_settings_are_refused() -> None:
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "esp_envs.pettingzoo_view")
     monkeypatch.setitem(sys.modules, "pettingzoo", None)
-    with pytest.raises(ImportError, match=r'pip install "esp-marl\[pettingzoo\]"'):
+    with pytest.raises(ImportError, match=r"pip install 'gymnasium>=[\d.]+' 'pettingzoo>=[\d.]+'"):
         importlib.import_module("esp_envs.pettingzoo_view")
 
 
