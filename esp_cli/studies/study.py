@@ -27,6 +27,7 @@ from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
+from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
@@ -216,7 +217,7 @@ class StudyFolder:
     def find_twin(self, cell: Cell, others: Sequence[StudyFolder]) -> Path | None:
         """Return the folder of a finished run of the same configuration and number of episodes in other studies.
 
-        None where there is none, or where the cell's own run has begun.
+        None where there is none for this version of the task, or where the cell's own run has begun.
         """
         if self.run_path(cell).exists():
             return None
@@ -227,7 +228,11 @@ class StudyFolder:
             for theirs in other.study.cells
             if theirs.config == cell.config and other.is_finished(theirs)
         )
-        return next(alike, None)
+        for path in alike:
+            final = read_evaluation(path)
+            if final is not None and final.task_version == spec_of(cell.config).version:
+                return path
+        return None
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run of the same configuration over as this cell's; its log says where it is from."""

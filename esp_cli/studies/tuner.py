@@ -170,16 +170,17 @@ class Tuner(Scheduler):
     def _start(self, run: Run) -> None:
         """Begin the trial of a run, or go on with it; record one that is trained to its end."""
         prior, number = self._keys[run.cell.name]
-        try:
-            if run.cell.name not in self._begun:
-                trial = self.trials.trial(prior, number)
+        if run.cell.name not in self._begun:
+            trial = self._begun[run.cell.name] = self.trials.trial(prior, number)
+            try:
                 run.cell = self.trial_folder.cell(prior, number, self.trials.settings(prior, trial))
-                self._begun[run.cell.name] = trial
-            super()._start(run)
-            if run.status == "finished":
-                self._judge(run)
-        except ValueError as error:  # these settings do not go together
-            run.status, run.message = "failed", str(error)
+            except ValueError as error:  # these settings do not go together
+                self._tell(run, trial, None)
+                run.status, run.message = "finished", str(error)
+                return
+        super()._start(run)
+        if run.status == "finished":
+            self._judge(run)
 
     def _follow(self, run: Run, going: bool) -> None:
         """Look at a trial: end it where it does not keep up."""

@@ -11,6 +11,7 @@ from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.compass import Compass
 from esp_envs.registry import make
+from esp_envs.spec import TaskSpec
 
 _GATE_WORLDS = 256
 """In which the episodes are played that a gate's predictors are fitted to."""
@@ -23,6 +24,11 @@ def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Envi
     return Compass(env, prior.compass, labels="agents" in prior.transforms) if prior.compass else env
 
 
+def spec_of(config: RunConfig) -> TaskSpec:
+    """Return the contract of a run's task as its policy meets it."""
+    return build_environment(config, 1, "shape").spec
+
+
 def build_learner(config: RunConfig) -> Learner:
     """Build the learner of a run, with its worlds, from the configuration alone.
 
@@ -31,7 +37,7 @@ def build_learner(config: RunConfig) -> Learner:
     """
     cls = ALGORITHMS[config.algorithm]
     settings = cls.config_class(**config.algorithm_settings)
-    refuse_what_does_not_fit(config, settings, build_environment(config, 1, "shape").spec)
+    refuse_what_does_not_fit(config, settings, spec_of(config))
     env = build_environment(config, settings.num_envs, "training worlds")
     learner = cls(
         env,

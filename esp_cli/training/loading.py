@@ -18,7 +18,7 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence, validate
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.policy import Policy
-from esp_cli.training.build import build_environment
+from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed, resolve_task_settings
 from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import CheckpointWarning, RunFolder
@@ -124,7 +124,7 @@ def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedP
         return trained
     changed = resolve_task_settings(trained.config.task, {**trained.config.task_settings, **settings})
     config = trained.config.model_copy(update={"task_settings": changed})
-    spec = build_environment(config, 1, "shape").spec
+    spec = spec_of(config)
     for part in ("num_agents", "observation", "action"):
         if getattr(spec, part) != getattr(trained.spec, part):
             names = ", ".join(f"task.{name}" for name in settings)
@@ -168,7 +168,7 @@ def _build(
     # Checked before worlds are made for every seed: a damaged configuration may ask for more than the memory holds.
     if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
         raise ValueError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
-    spec = build_environment(config, 1, "shape").spec
+    spec = spec_of(config)
     version = meta.get("task_version", spec.version)
     if version != spec.version:
         raise ValueError(

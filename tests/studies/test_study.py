@@ -121,6 +121,17 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
     assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
 
 
+def test_a_run_of_another_version_of_the_task_is_no_twin(tmp_path):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    plain = other.study.cells[0]
+    file = other.evaluation_path(plain)
+    found = json.loads(file.read_text())
+    file.write_text(json.dumps(found | {"task_version": found["task_version"] + 1}))
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    assert other.is_finished(plain)
+    assert folder.find_twin(folder.study.cells[0], [other]) is None
+
+
 @pytest.mark.parametrize("choice", [{"seeds": (0, 1)}, {"steps": ((None, 300),)}, {"episodes": 8}])
 def test_a_run_of_other_seeds_or_steps_or_evaluated_otherwise_is_no_twin(tmp_path, choice):
     other = write_study(tmp_path / "other", small_study(), ENDS)

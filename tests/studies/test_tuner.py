@@ -15,6 +15,7 @@ from optuna.trial import TrialState
 from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
 from esp_cli.studies.tuner import Trials, Tuner, write_presets
 from esp_cli.studies.tuning import Tuning, TuningFolder
+from esp_cli.studies.tuning_space import Dimension
 from esp_cli.training.config import resolve_config
 from esp_cli.training.config_file import read_config_file
 from tests.studies.test_tuning import tuning
@@ -182,6 +183,19 @@ def test_a_broken_trial_is_never_the_best_and_a_failed_one_is_tried_again_with_i
     assert engine.started == ["none-001"]
     assert all(state.is_finished() for state in states(again.trials, "none"))
     assert (tmp_path / "t" / "trials" / "none-001" / "config.json").read_text() == config
+
+
+def test_a_trial_whose_settings_do_not_go_together_is_ended(tmp_path):
+    flag = Dimension(choices=(True, False))
+    both = {"network.separate_parts": flag, "network.symmetrise": Dimension(choices=(None, "c4"))}
+    plan, engine = tuning(priors=("none",), budget=16, space=both), CurveEngine()
+    tuner = search(tmp_path / "t", plan, engine)
+    refused = [run for run in tuner.runs if "separate_parts and symmetrise exclude each other" in run.message]
+    assert 0 < len(refused) < 16
+    assert all(run.status == "finished" for run in tuner.runs)
+    assert len(engine.started) == 16 - len(refused)
+    assert all(state.is_finished() for state in states(tuner.trials, "none"))
+    assert search(tmp_path / "t", plan, CurveEngine()).engine.started == []
 
 
 def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budgets(tmp_path):
