@@ -95,10 +95,10 @@ def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, tran
     return _concluded(source, "transitions", spaces, elements, verdicts, 2 * TOLERATED)
 
 
-def accepted_of(p_values: Sequence[float], rate: float = FALSE_DISCOVERIES) -> list[bool]:
-    """Return which hypotheses are rejected at a false discovery rate (Benjamini and Hochberg, 1995)."""
+def accepted_of(p_values: Sequence[float]) -> list[bool]:
+    """Return which hypotheses are rejected at the false discovery rate (Benjamini and Hochberg, 1995)."""
     ordered = sorted(p_values)
-    bounds = [p for k, p in enumerate(ordered, 1) if p <= rate * k / len(ordered)]
+    bounds = [p for k, p in enumerate(ordered, 1) if p <= FALSE_DISCOVERIES * k / len(ordered)]
     return [bool(bounds) and p <= bounds[-1] for p in p_values]
 
 

@@ -23,6 +23,7 @@ from esp_envs.base import Environment, Observation, Step
 from esp_envs.spec import Layout, TaskSpec, joint_layout
 
 MakeWorlds = Callable[[int, Sequence[int]], Environment]
+_MOST_WORLDS = 256
 _NUMBERS = 1 << 18
 """Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
 MOMENTS = 8
@@ -34,17 +35,15 @@ Outcomes = dict[str, Tensor]
 """What a step gives, by field: [M, numbers]."""
 
 
-def check_paired(make: MakeWorlds, elements: Sequence[Element], worlds: int | None = None) -> list[ElementVerdict]:
+def check_paired(make: MakeWorlds, elements: Sequence[Element]) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state.
 
     Args:
         make: makes E worlds for some seeds.
         elements: to try.
-        worlds: E; by default 256, and fewer where agents see pictures.
     """
-    if worlds is None:
-        spec = make(1, [0]).spec
-        worlds = max(64, min(256, _NUMBERS // (spec.num_agents * spec.observation.width)))
+    shown = make(1, [0]).spec
+    worlds = max(64, min(_MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
     twins = [make(worlds, [seed]) for seed in (101, 102)]
     spec = twins[0].spec
     visited = _visit(make(worlds, [0]))

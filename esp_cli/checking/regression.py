@@ -30,16 +30,13 @@ _STILL = 1e-10
 """Variance below which a field does not change, so that it says nothing."""
 
 
-def check_by_regression(
-    spaces: Spaces, data: Transitions, elements: Sequence[Element], tolerated: float = TOLERATED
-) -> list[ElementVerdict]:
+def check_by_regression(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
     """Judge elements from transitions; `gap` is a share of variance here, and `error` its standard error.
 
     Args:
         spaces: what the numbers are.
         data: anybody's transitions; each episode counts once.
         elements: to try.
-        tolerated: gap up to which a field holds.
     """
     half = len(data.obs) // 2
     first = data.episodes(slice(half))
@@ -49,17 +46,17 @@ def check_by_regression(
     for element in elements:
         plain = for_all if element.permutation is None else for_each
         gap = plain.worsening(*_rows(spaces, turned(first, build_transform([element], spaces))))
-        verdicts.append(ElementVerdict(element.name, False, _fields(spaces, gap, rows[1], tolerated)))
+        verdicts.append(ElementVerdict(element.name, False, _fields(spaces, gap, rows[1])))
     return verdicts
 
 
-def _fields(spaces: Spaces, gap: Tensor, outputs: Tensor, tolerated: float) -> tuple[FieldVerdict, ...]:
+def _fields(spaces: Spaces, gap: Tensor, outputs: Tensor) -> tuple[FieldVerdict, ...]:
     width = spaces.observation.width
     parts = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
     parts["reward"] = slice(width, width + 1)
     if outputs.shape[-1] > width + 1:
         parts["action mask"] = slice(width + 1, None)
-    return tuple(_field(name, gap[:, where], outputs[..., where], tolerated) for name, where in parts.items())
+    return tuple(_field(name, gap[:, where], outputs[..., where]) for name, where in parts.items())
 
 
 def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
@@ -71,14 +68,14 @@ def _rows(spaces: Spaces, data: Transitions) -> tuple[Tensor, Tensor]:
     return inputs_of(spaces, data.obs, data.action), outputs_of(data)
 
 
-def _field(name: str, excess: Tensor, outputs: Tensor, tolerated: float) -> FieldVerdict:
+def _field(name: str, excess: Tensor, outputs: Tensor) -> FieldVerdict:
     """Judge one field by the excess of squared error [M, numbers] of each held-out episode."""
     variance = float(outputs.flatten(0, 2).double().var(0).sum())
     if variance < _STILL:
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
     shares = excess.sum(1) / variance
     gap, error = float(shares.mean()), float(shares.std() / len(shares) ** 0.5)
-    return FieldVerdict(name, "broken" if gap > tolerated else "holds", gap, error)
+    return FieldVerdict(name, "broken" if gap > TOLERATED else "holds", gap, error)
 
 
 class _Plain:

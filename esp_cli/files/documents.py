@@ -180,10 +180,10 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
     return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
 
 
-def shortened(text: str, length: int = 80) -> str:
+def shortened(text: str) -> str:
     """Return a text that fits into a sentence, whatever a file or a command line put into it."""
     line = next(iter(text.splitlines()), "")
-    return line if len(line) <= length else f"{line[: length - 3]}..."
+    return line if len(line) <= 80 else f"{line[:77]}..."
 
 
 def _inside(value: object) -> list[Any]:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from esp_cli.evaluation.statistics import Floats, difference, summarise
 from esp_cli.reporting.results import CellResult, Results
-from esp_cli.reporting.summary import floats, returns_of
+from esp_cli.reporting.summary import Side, floats, returns_of, side_of
 from esp_cli.studies.kinds import KINDS, UNBROKEN
 
 PLAIN, ESP = "plain", "ESP"
-_Side = Literal["ahead", "behind", "level"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ def verdicts(results: Results) -> list[Verdict]:
     ]
 
 
-def side(results: Results, cell: CellResult, other: CellResult | None, early: bool = False) -> _Side | None:
+def side(results: Results, cell: CellResult, other: CellResult | None, early: bool = False) -> Side | None:
     """Return whether a cell is ahead of another, by the 95 % interval of the difference of their means.
 
     Args:
@@ -99,7 +97,7 @@ def side(results: Results, cell: CellResult, other: CellResult | None, early: bo
         if values.size < 2:
             return None
         interval = (found.value, found.value)
-    return "ahead" if interval[0] > 0 else "behind" if interval[1] < 0 else "level"
+    return side_of(interval)
 
 
 def at(results: Results, cell: CellResult, early: bool) -> Floats | None:

@@ -155,10 +155,11 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
     if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
         of_all = probability_of_improvement(values, others)
         chance = probability_of_improvement(values, others, paired=True) if paired else of_all
-    return Gap(found, paired, chance, of_all, _side(found.ci95))
+    return Gap(found, paired, chance, of_all, side_of(found.ci95))
 
 
-def _side(interval: tuple[float, float] | None) -> Side | None:
+def side_of(interval: tuple[float, float] | None) -> Side | None:
+    """Return where an interval of a difference lies; None where there is none."""
     if interval is None:
         return None
     low, high = interval

@@ -22,18 +22,17 @@ def versions() -> Mapping[str, str]:
     return found | {name: _version(name) for name in _LIBRARIES}
 
 
-def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, str] | None = None) -> None:
+def refuse_difference(node: str, theirs: Mapping[str, str]) -> None:
     """Refuse a node whose versions are not those of this machine.
 
     Args:
         node: its name.
         theirs: versions of the node.
-        ours: versions of this machine; for tests.
 
     Raises:
         ValueError: they differ; the message names all that do.
     """
-    ours = versions() if ours is None else ours
+    ours = versions()
     unlike = [name for name in ours if theirs.get(name) != ours[name]]
     if unlike:
         there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 
-from esp_cli.checking import check_symmetry, task
-from esp_cli.checking.paired import check_paired
+from esp_cli.checking import check_symmetry, paired
 from esp_envs import make
 from tests.checking import faults
 from tests.checking.faults import Fault, declared, field_of, turned_by_first, wind, with_fault
@@ -16,7 +13,7 @@ from tests.checking.faults import Fault, declared, field_of, turned_by_first, wi
 @pytest.fixture(autouse=True)
 def fewer_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compare in half as many worlds as `esp check` does, which makes faults harder to find."""
-    monkeypatch.setattr(task, "check_paired", partial(check_paired, worlds=128))
+    monkeypatch.setattr(paired, "_MOST_WORLDS", 128)
 
 
 NAVIGATION = ("navigation", {"actions": "continuous"})
