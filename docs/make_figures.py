@@ -11,8 +11,9 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from esp_cli.reporting.page import draw_over_strength
 from esp_cli.reporting.plots import Group, dots
-from esp_cli.reporting.results import read_results
+from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.summary import floats
 
 DOCS = Path(__file__).parent
@@ -24,6 +25,12 @@ RESULTS = {
     "ablate-transforms-mappo": "ablate-transforms",
 }
 """Results in docs/measured -> their figures, of which each learner has one."""
+BREAKING = {
+    "breaking-navigation": ("breaking-navigation", "breaking-navigation-others"),
+    "breaking-predator-prey": ("breaking-predator-prey",),
+    "breaking-formation": ("breaking-formation",),
+}
+"""Figures in docs/measured, one for each setting -> the results that are drawn together."""
 Row = dict[str, str]
 
 
@@ -113,7 +120,7 @@ def draw(ax: Axes, panel: Panel) -> None:
 
 
 def draw_results() -> None:
-    """Draw the returns of the ablations from their results."""
+    """Draw the returns of the ablations, and those over the strength of breaking, from their results."""
     for name, picture in RESULTS.items():
         results = read_results(MEASURED / f"{name}.json")
         for panel in dict.fromkeys(cell.panel for cell in results.cells):
@@ -123,6 +130,10 @@ def draw_results() -> None:
             learner = cells[0].name.split("-")[1]
             _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
             svg.unlink()  # the pages show PNGs
+    for picture, names in BREAKING.items():
+        both = join([read_results(MEASURED / f"{name}.json") for name in names])
+        for _, svg in draw_over_strength(both, MEASURED / picture):
+            svg.unlink()
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli.evaluation.statistics import mean_and_sem
+from esp_cli.reporting.breaking import series_of
 from esp_cli.reporting.pages import files_of, filled
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.tables import TABLES
@@ -136,6 +137,16 @@ def test_every_figure_of_results_can_be_drawn_again_and_is_on_a_page() -> None:
             figure = f"{picture}-{cell.name.split('-')[1]}.png"
             assert f"../measured/{figure}" in pages
             assert (DOCS / "measured" / figure).is_file()
+
+
+def test_every_figure_of_broken_symmetry_can_be_drawn_again_and_is_on_its_page() -> None:
+    drawing = runpy.run_path(str(DOCS / "make_figures.py"))
+    page = (DOCS / "imperfect-symmetry.md").read_text(encoding="utf-8")
+    for picture, names in drawing["BREAKING"].items():
+        both = drawing["join"]([drawing["read_results"](DOCS / "measured" / f"{name}.json") for name in names])
+        for k, _ in enumerate(series_of(both), 1):
+            assert f"(measured/{picture}-{k}.png)" in page
+            assert (DOCS / "measured" / f"{picture}-{k}.png").is_file()
 
 
 def test_a_table_that_is_gone_is_noticed() -> None:

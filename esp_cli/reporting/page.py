@@ -18,7 +18,7 @@ from esp_cli.drawing.draw import draw
 from esp_cli.evaluation.statistics import Floats
 from esp_cli.files.documents import encode
 from esp_cli.files.writing import replace_file
-from esp_cli.reporting.breaking import Series, series_of
+from esp_cli.reporting.breaking import series_of
 from esp_cli.reporting.charts import chart, stroke
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.marl_eval import marl_eval
@@ -150,8 +150,8 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
         panel: {variant: floats(cell.returns[results.mode]) for variant, cell in own.items()}
         for panel, own in finished.items()
     }
-    if series := series_of(results):
-        return [*pictures, *_over_strength(results, series, out, label)]
+    if over_strength := draw_over_strength(results, out / "breaking"):
+        return [*pictures, *over_strength]
     if results.kind == "ablate-coefficient":
         lines = [
             Sensitivity(panel, values[panel], {v: c.paper[0] for v, c in own.items() if c.paper})
@@ -169,10 +169,15 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
     return pictures
 
 
-def _over_strength(results: Results, series: Sequence[Series], out: Path, label: str) -> Pictures:
-    """Draw the return over the strength of breaking, one picture for each task, one line for each method."""
+def draw_over_strength(results: Results, out: Path) -> Pictures:
+    """Draw the return over the strength of breaking, one line for each method.
+
+    Args:
+        results: of any study; one that breaks nothing has no such pictures.
+        out: the pictures are `out`-1, `out`-2 and so on, one for each task and setting.
+    """
     pictures: Pictures = []
-    for k, one in enumerate(series, 1):
+    for k, one in enumerate(series_of(results), 1):
         lines: dict[str, dict[str, Floats]] = {}
         for strength, cells in one.cells.items():
             for method, cell in cells.items():
@@ -182,9 +187,8 @@ def _over_strength(results: Results, series: Sequence[Series], out: Path, label:
         drawn = [Sensitivity(method, values) for method, values in lines.items()]
         if drawn:
             order = [f"{strength:g}" for strength in one.cells]
-            pictures.append(
-                sensitivity(drawn, out / f"breaking-{k}", f"{one.name}, {one.setting}", one.setting, label, order)
-            )
+            path, title = out.with_name(f"{out.name}-{k}"), f"{one.name}, {one.setting}"
+            pictures.append(sensitivity(drawn, path, title, one.setting, f"{results.mode} return", order))
     return pictures
 
 
