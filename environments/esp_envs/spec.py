@@ -59,7 +59,7 @@ Kind.RING, Kind.RECORD = Kind("ring", 1), Kind("record", 0)
 
 
 class Items(Enum):
-    """What the items of a field count over; only agent permutations look at it.
+    """What the items of a field count over, which orders of agents and of items look at.
 
     FIXED   things that no agent permutation moves (landmarks, the own body).
     OTHERS  the other agents in index order, the observer left out.
@@ -231,8 +231,8 @@ class Spaces:
         observation: layout of one agent's row, D numbers.
         state: layout of the global state that a centralised critic or mixer may see.
         action: the action space, the same for every agent.
-        symmetry: under what the *dynamics and reward* are invariant: the largest planar group or one element ("d4",
-            "o2", "flip-y"), with "*agents" where the agents may also be exchanged ("d4*agents").
+        symmetry: what leaves *dynamics and reward* alone: the largest planar group or one element ("d4", "flip-y"),
+            times "agents" and FIELD-COUNT where agents or like items may change places ("d4*agents*landmarks-3").
         nearly: a larger symmetry that holds nearly, which a prior may use all the same; empty where there is none.
         masks: whether each observation says which of the discrete actions each agent may take.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from esp_cli.symmetry import Element, Group, build_transform, parse_elements
+from esp_cli.symmetry.parse import is_planar, name_of_orders, planar_part
 from esp_envs.spec import Spaces
 
 _TRIED = "d8,rot57,flip23"
@@ -15,7 +16,7 @@ _MOST = 64
 
 
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
-    """Return the elements to try: those asked for, else of d8, any angle, and exchanges of agents.
+    """Return the elements to try: those asked for, else of d8, any angle, orders of agents and of declared items.
 
     Elements that the actions or layouts cannot carry are left out.
 
@@ -26,11 +27,13 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     Raises:
         ValueError: the text means nothing, or nothing that is asked for can be carried.
     """
-    texts = [transforms] if transforms is not None else [_TRIED, _plane(spaces)]
-    if transforms is None and spaces.num_agents > 1:
-        order = list(range(spaces.num_agents))
-        swap, cycle = [order[1], order[0], *order[2:]], [*order[1:], order[0]]
-        texts += ["agents-" + "-".join(map(str, new)) for new in (swap, cycle)]
+    texts = [transforms] if transforms is not None else [_TRIED, planar_part(spaces.symmetry)]
+    if transforms is None:
+        if spaces.num_agents > 1:
+            texts += _orders("agents", spaces.num_agents)
+        for factor in _item_factors(spaces):
+            name, _, count = factor.partition("-")
+            texts += _orders(name, int(count))
     asked = dict.fromkeys(element for text in texts for element in _elements(text, spaces.num_agents))
     refusals = {element: _refusal(element, spaces) for element in asked}
     found = [element for element, refusal in refusals.items() if refusal is None]
@@ -38,6 +41,18 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
         said = next(iter(refusals.values()), None)
         raise ValueError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
     return found[:_MOST]
+
+
+def _orders(name: str, count: int) -> list[str]:
+    """Return the exchange of the first two of some things and the round of all, which generate every order of them."""
+    order = list(range(count))
+    swap, cycle = [order[1], order[0], *order[2:]], [*order[1:], order[0]]
+    return ["-".join(map(str, (name, *new))) for new in (swap, cycle)]
+
+
+def _item_factors(spaces: Spaces) -> list[str]:
+    """Return the declared groups of orders of items: ["landmarks-3"]."""
+    return [name for name in spaces.symmetry.split("*") if name != "agents" and not is_planar(name)]
 
 
 def _refusal(element: Element, spaces: Spaces) -> str | None:
@@ -51,8 +66,8 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
-    plane = _plane(spaces)
-    if element.permutation is not None and "agents" not in spaces.symmetry.split("*"):
+    plane, factors = planar_part(spaces.symmetry), spaces.symmetry.split("*")
+    if any(name_of_orders(name, len(places)) not in factors for name, places in element.orders):
         return False
     if element.in_place.is_identity:
         return True
@@ -65,18 +80,17 @@ def is_declared(element: Element, spaces: Spaces) -> bool:
 def found_group(holding: Collection[str], spaces: Spaces) -> str:
     """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
     plane = "c1"
-    for name in sorted((*_NAMED, _plane(spaces)), key=lambda name: len(_elements(name, 1))):
+    for name in sorted((*_NAMED, planar_part(spaces.symmetry)), key=lambda name: len(_elements(name, 1))):
         if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
             plane = name
     if "rot57" in holding:
         plane = "o2" if "flip23" in holding else "so2"
-    agents = any(name.startswith("agents-") for name in holding)
-    return f"{plane}*agents" if agents else plane
-
-
-def _plane(spaces: Spaces) -> str:
-    """Return the planar part of the declared symmetry."""
-    return "*".join(name for name in spaces.symmetry.split("*") if name != "agents")
+    orders = [
+        factor
+        for factor in ("agents", *_item_factors(spaces))
+        if any(name.startswith(f"{factor.partition('-')[0]}-") for name in holding)
+    ]
+    return "*".join((plane, *orders))
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:

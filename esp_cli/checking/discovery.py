@@ -18,7 +18,8 @@ from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup
-from esp_cli.symmetry.parse import parse_elements
+from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.parse import name_of_orders, parse_elements
 from esp_envs.spec import Spaces
 
 FALSE_DISCOVERIES = 0.05
@@ -26,7 +27,7 @@ FALSE_DISCOVERIES = 0.05
 _TOLERATED_SD = 0.15
 """Gap between paired steps, in standard deviations, below which a field that is not found broken counts as equal."""
 _EXCHANGES = 28
-"""Exchanges of two agents that are tried, at most: all of 8 agents."""
+"""Exchanges of two that are tried, at most: all of 8 agents."""
 _WORLDS = 256
 _EPISODES = 4096
 
@@ -76,14 +77,14 @@ def discover_in_task(make: MakeWorlds, transforms: str | None = None, logs_alone
 
     Args:
         make: makes E worlds for some seeds.
-        transforms: elements to try; by default those of a 16-gon, any angle, and exchanges of agents.
+        transforms: elements to try; by default those of `default_candidates`.
         logs_alone: use transitions of the random policy even where the task can be set to states.
     """
     probe = make(1, [0])
     spec, elements = probe.spec, default_candidates(probe.spec, transforms)
     if probe.has("set_state") and not logs_alone:
         verdicts = check_paired(make, elements)
-        return _concluded(spec.name, "paired states", spec, elements, verdicts, _TOLERATED_SD)
+        return _concluded(spec.name, "paired states", elements, verdicts, _TOLERATED_SD)
     data = collect(make(max(16, min(_WORLDS, 8192 // spec.horizon)), [0]), _EPISODES)
     return discover_in_transitions(spec.name, spec, data, transforms)
 
@@ -92,7 +93,7 @@ def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, tran
     """Find the symmetries of transitions of any policy; see `discover_in_task`."""
     elements = default_candidates(spaces, transforms)
     verdicts = check_by_regression(spaces, data, elements)
-    return _concluded(source, "transitions", spaces, elements, verdicts, 2 * TOLERATED)
+    return _concluded(source, "transitions", elements, verdicts, 2 * TOLERATED)
 
 
 def accepted_of(p_values: Sequence[float]) -> list[bool]:
@@ -102,31 +103,58 @@ def accepted_of(p_values: Sequence[float]) -> list[bool]:
     return [bool(bounds) and p <= bounds[-1] for p in p_values]
 
 
-def named(accepted: Sequence[Element], tried: Sequence[Element], num_agents: int) -> tuple[str, str]:
+def named(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, str]:
     """Return the name of the largest group that the accepted elements close to, and its `--transforms`.
 
-    A group counts where all of its elements that were tried are accepted, and at least one was tried.
+    A planar group counts where all of its elements that were tried are accepted, and at least one was tried. All orders
+    of agents, or of a field's items, count where the accepted exchanges of two connect each with each.
 
     Args:
         accepted: elements that hold.
         tried: all elements.
-        num_agents: N.
     """
-    plane, plane_text = _plane([e for e in accepted if e.permutation is None], tried)
-    exchanges = [e for e in accepted if e.permutation is not None and e.in_place.is_identity]
-    agents_text = ""
-    if exchanges:
-        group = FiniteGroup.generated_by("found", exchanges) if num_agents <= 6 else None
-        others = [e for e in tried if e.permutation is not None and e.in_place.is_identity]
-        moved = {agent for e in exchanges for agent, place in enumerate(e.permutation or ()) if agent != place}
-        everyone = len(exchanges) == len(others) and len(moved) == num_agents
-        whole = everyone or (group is not None and group.order == math.factorial(num_agents))
-        agents_text = "agents" if whole else ",".join(e.name for e in exchanges)
-    if not agents_text:
-        return plane, plane_text
-    if agents_text == "agents" and "," not in plane_text:
-        return f"{plane}*agents", f"{plane_text}*agents" if plane_text else "agents"
-    return f"{plane} and {agents_text}", ",".join(text for text in (plane_text, agents_text) if text)
+    plane, text = _plane([e for e in accepted if e == e.in_place], tried)
+    whole, single = _orders_of(accepted)
+    glue = " and " if "," in plane else "*"
+    name = " and ".join([glue.join((plane, *whole)), *([",".join(single)] if single else [])])
+    glue = "," if "," in plane else "*"
+    product = glue.join(part for part in (text, *whole) if part)
+    texts = (",".join(part for part in (product, *single) if part), product, text)
+    return name, next((part for part in texts if _is_readable(part, accepted)), "")
+
+
+def _orders_of(accepted: Sequence[Element]) -> tuple[list[str], list[str]]:
+    """Return the groups of all orders of agents or items, and the accepted elements that make up none."""
+    found: dict[tuple[str, int], list[Element]] = {}
+    for element in accepted:
+        if len(element.orders) == 1 and element.in_place.is_identity:
+            name, places = element.orders[0]
+            found.setdefault((name, len(places)), []).append(element)
+    whole, single = list[str](), list[str]()
+    for (name, count), elements in found.items():
+        if _connect([element.orders[0][1] for element in elements], count):
+            whole.append(name_of_orders(name, count))
+        else:
+            single += [element.name for element in elements]
+    return whole, single
+
+
+def _connect(orders: Sequence[tuple[int, ...]], count: int) -> bool:
+    """Return whether the exchanges of two among some orders connect all things; then they generate every order."""
+    moved = [{i for i, place in enumerate(order) if i != place} for order in orders]
+    reached = {0}
+    for _ in range(count):
+        reached = reached.union(*(pair for pair in moved if len(pair) == 2 and pair & reached))
+    return len(reached) == count
+
+
+def _is_readable(text: str, accepted: Sequence[Element]) -> bool:
+    """Return whether `--transforms` takes a text; it takes no list that holds a sampled group."""
+    try:
+        parse_elements(text, max((len(e.permutation or ()) for e in accepted), default=1))
+    except ValueError:
+        return False
+    return True
 
 
 def _plane(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, str]:
@@ -174,16 +202,25 @@ def _listed(text: str) -> tuple[Element, ...]:
 def default_candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try that actions and layouts can carry, whatever the task declares.
 
-    By default turns and mirrors of a 16-gon, two that stand for all angles, and exchanges of two agents.
+    By default turns and mirrors of a 16-gon, two that stand for all angles, and exchanges of two agents or of two like
+    items of a field.
     """
     if transforms is not None:
         return candidates(spaces, transforms)
-    texts, count = ["d16", "rot57", "flip23"], spaces.num_agents
+    texts = ["d16", "rot57", "flip23", *_exchanges("agents", spaces.num_agents)]
+    for name, _, count in (group.partition("-") for group in exchangeable(spaces)):
+        texts += _exchanges(name, int(count))
+    return [element for text in texts for element in _carried(spaces, text)]
+
+
+def _exchanges(name: str, count: int) -> list[str]:
+    """Return the exchanges of two of some things that are tried."""
+    texts = []
     for a, b in itertools.islice(itertools.combinations(range(count), 2), _EXCHANGES):
         order = list(range(count))
         order[a], order[b] = b, a
-        texts.append("agents-" + "-".join(map(str, order)))
-    return [element for text in texts for element in _carried(spaces, text)]
+        texts.append("-".join(map(str, (name, *order))))
+    return texts
 
 
 def _carried(spaces: Spaces, text: str) -> list[Element]:
@@ -197,14 +234,13 @@ def _carried(spaces: Spaces, text: str) -> list[Element]:
 def _concluded(
     source: str,
     method: str,
-    spaces: Spaces,
     elements: Sequence[Element],
     verdicts: Sequence[ElementVerdict],
     tolerance: float,
 ) -> Discovery:
     tried = judged_elements(verdicts, tolerance)
     kept = [element for element, one in zip(elements, tried, strict=True) if one.accepted]
-    group, transforms = named(kept, elements, spaces.num_agents)
+    group, transforms = named(kept, elements)
     return Discovery(source, method, group, transforms, tried)
 
 

@@ -39,10 +39,10 @@ class IoSpec:
         """Return a group of turns and mirrors by its name.
 
         Raises:
-            ValueError: there is no such group, it is infinite or moves agents, or the task cannot carry it.
+            ValueError: there is no such group, it is infinite or moves agents or items, or the task cannot carry it.
         """
         group = parse_group(name, self.spaces.num_agents)
-        if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
+        if not isinstance(group, FiniteGroup) or any(element.orders for element in group.elements):
             raise ValueError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
         admit(name, group, self.spaces)
         return group

@@ -10,6 +10,7 @@ from esp_cli.symmetry.groups import (
     cyclic,
     dihedral,
     direct_product,
+    item_orders,
     orthogonal,
     special_orthogonal,
 )
@@ -33,6 +34,7 @@ __all__ = [
     "dihedral",
     "direct_product",
     "environment_errors",
+    "item_orders",
     "mirror",
     "network_equivariance_error",
     "orthogonal",

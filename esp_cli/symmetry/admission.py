@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from esp_cli.symmetry.elements import Element
-from esp_cli.symmetry.groups import Group
-from esp_cli.symmetry.parse import parse_elements
+from esp_cli.symmetry.groups import MOST_ITEMS, Group
+from esp_cli.symmetry.parse import is_planar, name_of_orders, parse_elements, planar_part
 from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
 from esp_envs.spec import Discrete, Items, Spaces, joint_layout
 
@@ -29,7 +29,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
 
     Raises:
         ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
-            are to change places and a layout does not say which numbers follow them.
+            or items are to change places and a layout does not say which numbers follow them.
     """
     moved = elements.generators() if isinstance(elements, Group) else tuple(elements)
     reason = _reason(moved, spaces)
@@ -37,7 +37,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
         return
     advice = "use --prior none"
     if carried := carried_groups(spaces):
-        plane = [name for name in carried if name != "agents"]
+        plane = [name for name in carried if is_planar(name)]
         advice = f"use a group within {plane[-1]}" if plane else "use agents"
         if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
@@ -47,14 +47,28 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
 def carried_groups(spaces: Spaces) -> tuple[str, ...]:
     """Return the named groups that a task's actions and declared symmetry both carry, the largest planar one last.
 
-    `agents` stands at the end if the agents of the task may change places.
+    `agents` follows if the agents of the task may change places, then orders of items that it declares.
     """
-    own = _declared_plane(spaces)
+    own = planar_part(_usable(spaces))
     names = PLANE_GROUPS if own in ("", "c1", *PLANE_GROUPS) else (*PLANE_GROUPS, own)
     carried = [name for name in names if _carries(name, spaces)]
     if spaces.num_agents > 1 and _carries("agents", spaces):
         carried.append("agents")
-    return tuple(carried)
+    orders = [name for name in _usable(spaces).split("*") if name not in ("agents", own) and not is_planar(name)]
+    return (*carried, *(name for name in orders if _carries(name, spaces)))
+
+
+def exchangeable(spaces: Spaces) -> tuple[str, ...]:
+    """Return the groups of all orders of each field's items that an agent sees: ("landmarks-3",).
+
+    These are fields of two to `MOST_ITEMS` items that are no pictures, and that follow no agents.
+    """
+    names = [
+        name_of_orders(field.name, field.count)
+        for field in spaces.observation.fields
+        if field.items is Items.FIXED and field.pixels is None and 2 <= field.count <= MOST_ITEMS
+    ]
+    return tuple(name for name in names if not is_planar(name))
 
 
 def _carries(name: str, spaces: Spaces) -> bool:
@@ -67,11 +81,6 @@ def _usable(spaces: Spaces) -> str:
     return spaces.nearly or spaces.symmetry
 
 
-def _declared_plane(spaces: Spaces) -> str:
-    """Return the planar part of the symmetry that a prior may use; empty where there is none."""
-    return "*".join(name for name in _usable(spaces).split("*") if name != "agents")
-
-
 def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why a task cannot carry elements, if it cannot."""
     return (
@@ -79,6 +88,7 @@ def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         or _task_reason(elements, spaces)
         or _layout_reason(elements, spaces)
         or _agents_reason(elements, spaces)
+        or _items_reason(elements, spaces)
     )
 
 
@@ -94,7 +104,7 @@ def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which element is no symmetry of the dynamics and reward, if one is none."""
-    name = _declared_plane(spaces) or "c1"
+    name = planar_part(_usable(spaces)) or "c1"
     declared = () if name == "c1" else parse_elements(name, spaces.num_agents)
     for element in elements:
         if not element.in_place.is_identity and element.in_place not in declared:
@@ -134,12 +144,25 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     return None
 
 
+def _items_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
+    """Say why items cannot change places, if some are asked to and cannot."""
+    usable = _usable(spaces)
+    for name, places in dict.fromkeys(order for element in elements for order in element.items):
+        if all(field.name != name for field in spaces.observation.fields):
+            return f"its observation has no field '{name}'"
+        if name_of_orders(name, len(places)) not in usable.split("*"):
+            return f"its declared symmetry, {usable}, does not say that its {name} may be exchanged"
+    return None
+
+
 def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
     """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`).
 
     What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
     """
-    found = text.removeprefix(DISCOVERED)
+    found, declared = text.removeprefix(DISCOVERED), spaces
+    if found != text:
+        declared = replace(spaces, nearly="*".join(("o2*agents", *exchangeable(spaces))))
     elements = parse_elements(found, spaces.num_agents)
-    admit(found, elements, spaces if found == text else replace(spaces, nearly="o2*agents"))
+    admit(found, elements, declared)
     return elements

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_envs.spec import Field
+from esp_envs.spec import Field, Items
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Orders = tuple[tuple[str, tuple[int, ...]], ...]
+"""Fields by name, each with the place that each of its items moves to."""
 
 
 class Element(ABC):
@@ -23,9 +25,11 @@ class Element(ABC):
 
     Attributes:
         permutation: sigma, with sigma[i] the place that agent i moves to; None where agents stay.
+        items: fields whose like items change places, each with the place that item k moves to; sorted by name.
     """
 
     permutation: tuple[int, ...] | None
+    items: Orders = ()
 
     @property
     @abstractmethod
@@ -40,7 +44,12 @@ class Element(ABC):
     @property
     @abstractmethod
     def in_place(self) -> Element:
-        """The same element with all agents in their places."""
+        """The same element with all agents and items in their places."""
+
+    @property
+    def orders(self) -> Orders:
+        """All that changes places, agents first: (("agents", (1, 0, 2)), ("landmarks", (2, 0, 1)))."""
+        return self.items if self.permutation is None else (("agents", self.permutation), *self.items)
 
     @property
     def participle(self) -> str:
@@ -88,6 +97,25 @@ def places_of(elements: Sequence[Element], num_agents: int) -> Indices | None:
     return np.array([element.permutation or stay for element in elements], dtype=np.int64)
 
 
+def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
+    """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
+
+    Raises:
+        ValueError: the field has another number of items, is a picture, or its items follow the agents.
+    """
+    name = field.name.rpartition(".")[2]  # a joint layout has one field for each agent: "agent0.landmarks"
+    orders = [dict(element.items).get(name) for element in elements]
+    moved = [order for order in orders if order is not None]
+    if not moved:
+        return None
+    if field.items is not Items.FIXED or field.pixels is not None:
+        raise ValueError(f"the items of field '{name}' cannot be exchanged: they are the agents', or pictures")
+    if any(len(order) != field.count for order in moved):
+        raise ValueError(f"field '{name}' has {field.count} items, not {len(moved[0])}")
+    stay = tuple(range(field.count))
+    return np.array([order or stay for order in orders], dtype=np.int64)
+
+
 def compose_permutations(g: tuple[int, ...] | None, h: tuple[int, ...] | None) -> tuple[int, ...] | None:
     """Return the permutation that applies h first, then g; None moves nothing.
 
@@ -97,5 +125,5 @@ def compose_permutations(g: tuple[int, ...] | None, h: tuple[int, ...] | None) -
     if g is None or h is None:
         return g or h
     if len(g) != len(h):
-        raise ValueError(f"permutations of {len(g)} and of {len(h)} agents cannot be composed; give both one length")
+        raise ValueError(f"orders of {len(g)} and of {len(h)} things cannot be composed; give both one length")
     return tuple(g[i] for i in h)

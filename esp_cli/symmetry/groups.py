@@ -1,13 +1,14 @@
-"""Groups built from generators: C_n, D_n, SO(2), O(2), agent permutations and their direct products."""
+"""Groups built from generators: C_n, D_n, SO(2), O(2), orders of agents or items, and their direct products."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
-from functools import cached_property
-from itertools import permutations
+from functools import cached_property, reduce
+from itertools import permutations, product
+from operator import matmul
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ from esp_cli.symmetry.plane import PlaneElement, mirror
 
 LISTED_LIMIT = 1024
 """Largest number of elements that is listed; larger groups (all orders of 7 agents: 5040) are sampled instead."""
+MOST_ITEMS = 6
+"""Items of a field all of whose orders make a group; of more, they are too many to list."""
 
 
 class Group(ABC):
@@ -110,7 +113,7 @@ class PlaneGroup(Group):
         return PlaneElement(turn, mirrored)
 
     def __contains__(self, element: object) -> bool:
-        if not isinstance(element, PlaneElement) or element.permutation is not None:
+        if not isinstance(element, PlaneElement) or element != element.in_place:
             return False
         return self.mirrors or not element.mirrored
 
@@ -132,7 +135,7 @@ class AgentPermutations(Group):
         return PlaneElement(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
 
     def __contains__(self, element: object) -> bool:
-        if not isinstance(element, Element) or not element.in_place.is_identity:
+        if not isinstance(element, Element) or not element.in_place.is_identity or element.items:
             return False
         return element.permutation is None or len(element.permutation) == self.num_agents
 
@@ -143,24 +146,32 @@ class AgentPermutations(Group):
 
 
 class ProductGroup(Group):
-    """The direct product of a planar group and a group of agent permutations, sampled factor by factor."""
+    """The direct product of a planar group, orders of agents and orders of items, sampled factor by factor."""
 
-    def __init__(self, plane: Group, agents: Group) -> None:
-        self.name = f"{plane.name}*{agents.name}"
-        self.plane, self.agents = plane, agents
+    def __init__(self, *factors: Group) -> None:
+        self.name = "*".join(factor.name for factor in factors)
+        self.factors = factors
 
     def draw(self, generator: torch.Generator) -> Element:
         """Draw each factor."""
-        return self.plane.draw(generator) @ self.agents.draw(generator)
+        return reduce(matmul, [factor.draw(generator) for factor in self.factors])
 
     def __contains__(self, element: object) -> bool:
         if not isinstance(element, Element):
             return False
-        return element.in_place in self.plane and PlaneElement(permutation=element.permutation) in self.agents
+        return all(part.is_identity or any(part in factor for factor in self.factors) for part in _parts(element))
 
     def generators(self) -> tuple[Element, ...]:
-        """Return those of both factors."""
-        return self.plane.generators() + self.agents.generators()
+        """Return those of all factors."""
+        return tuple(element for factor in self.factors for element in factor.generators())
+
+
+def _parts(element: Element) -> Iterator[Element]:
+    """Yield what an element does in the plane, to agents, and to the items of each field."""
+    yield element.in_place
+    yield PlaneElement(permutation=element.permutation)
+    for order in element.items:
+        yield PlaneElement(items=(order,))
 
 
 def cyclic(n: int) -> FiniteGroup:
@@ -196,11 +207,21 @@ def agent_permutations(num_agents: int) -> Group:
     return FiniteGroup("agents", (PlaneElement(permutation=p) for p in permutations(range(num_agents))))
 
 
-def direct_product(plane: Group, agents: Group) -> Group:
-    """Return the direct product of a planar group and agent permutations, listed where small enough."""
-    product = ProductGroup(plane, agents)
-    if not (isinstance(plane, FiniteGroup) and isinstance(agents, FiniteGroup)):
-        return product
-    if plane.order * agents.order > LISTED_LIMIT:
-        return product
-    return FiniteGroup(product.name, (g @ h for g in plane.elements for h in agents.elements))
+def item_orders(field: str, count: int) -> FiniteGroup:
+    """Return all orders of a field's items.
+
+    Raises:
+        ValueError: fewer than 2 items, or more than `MOST_ITEMS`.
+    """
+    if not 2 <= count <= MOST_ITEMS:
+        raise ValueError(f"{count} {field} have no group of orders; 2 to {MOST_ITEMS} like items of a field have one")
+    return FiniteGroup(f"{field}-{count}", (PlaneElement(items=((field, p),)) for p in permutations(range(count))))
+
+
+def direct_product(*factors: Group) -> Group:
+    """Return the direct product of a planar group, orders of agents and orders of items, listed where small enough."""
+    sampled = ProductGroup(*factors)
+    listed = [factor.elements for factor in factors if isinstance(factor, FiniteGroup)]
+    if len(listed) < len(factors) or math.prod(map(len, listed)) > LISTED_LIMIT:
+        return sampled
+    return FiniteGroup(sampled.name, (reduce(matmul, each) for each in product(*listed)))

@@ -1,4 +1,4 @@
-"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`."""
+"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`, `d4*landmarks-3`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from esp_cli.symmetry.groups import (
     cyclic,
     dihedral,
     direct_product,
+    item_orders,
     orthogonal,
     special_orthogonal,
 )
@@ -30,6 +31,8 @@ _NAMED = {
 }
 _KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, flip-antidiagonal, c4, d4, c8, so2, o2, agents, d4*agents"
 _DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
+_ORDER = r"(?!(?:rot|flip)-)([a-z]\w*)((?:-\d{1,4})+)"
+"""A field and numbers: how many items it has, or the place that each of them moves to."""
 _MAX_FOLD = 360
 
 
@@ -37,8 +40,8 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
     """Read a comma-separated list of elements and groups.
 
     Args:
-        text: elements (`rot90`, `flip-x`, `flip22.5`, `agents-1-0-2`) and groups (`c4`, `d4`, `so2`, `o2`, `agents`),
-            each possibly a product with `*`, whose right factor acts first.
+        text: elements (`rot90`, `flip-x`, `flip22.5`, `agents-1-0-2`, `landmarks-1-0-2`) and groups (`c4`, `d4`,
+            `so2`, `o2`, `agents`, `landmarks-3`), each possibly a product with `*`, whose right factor acts first.
         num_agents: N, which gives `agents` its meaning.
 
     Returns:
@@ -61,28 +64,48 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
 
 
 def parse_group(text: str, num_agents: int) -> Group:
-    """Read one group name or a product of a planar group and `agents`, such as a task's declared symmetry.
+    """Read one group name or a product of a planar group, `agents` and orders of items: a task's declared symmetry.
 
     Raises:
         ValueError: unknown, or no group.
     """
     factors = [_factor(part.strip(), text, num_agents) for part in text.lower().split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
-    if len(groups) != len(factors) or len(groups) > 2:
+    if len(groups) != len(factors):
         raise ValueError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
-    if len(groups) == 1:
-        return groups[0]
-    plane, agents = groups
-    if plane.name == "agents" or agents.name != "agents":
+    ranks = [_rank(group) for group in groups]
+    if ranks != sorted(set(ranks)):
         raise ValueError(f"'{text}' is not a direct product; write a planar group, then agents, as in d4*agents")
-    return direct_product(plane, agents)
+    return groups[0] if len(groups) == 1 else direct_product(*groups)
+
+
+def is_planar(name: str) -> bool:
+    """Return whether a factor of a group's name is its planar part: neither agents nor items change places."""
+    return name != "agents" and not re.fullmatch(_ORDER, name)
+
+
+def planar_part(symmetry: str) -> str:
+    """Return the planar part of a task's symmetry; empty where there is none."""
+    return "*".join(name for name in symmetry.split("*") if is_planar(name))
+
+
+def name_of_orders(name: str, count: int) -> str:
+    """Return the name of the group of all orders of agents, or of a field's items: "agents", "landmarks-3"."""
+    return name if name == "agents" else f"{name}-{count}"
+
+
+def _rank(group: Group) -> tuple[int, str]:
+    """Return where a group stands in a direct product: plane, agents, items of each field by name."""
+    if is_planar(group.name):
+        return 0, ""
+    return (1, "") if group.name == "agents" else (2, group.name.partition("-")[0])
 
 
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     """Read one item of the list: a tuple of elements, or a group that has to be sampled."""
     factors = [_factor(p.strip(), text, num_agents) for p in part.split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
-    if len(groups) == len(factors) and (len(groups) == 1 or groups[-1].name == "agents"):
+    if len(groups) == len(factors) and (len(groups) == 1 or not is_planar(groups[-1].name)):
         group = parse_group(part, num_agents)
         return group.elements if isinstance(group, FiniteGroup) else group
     lists = []
@@ -135,7 +158,14 @@ def _read_agents(word: str, num_agents: int) -> Element | Group | None:
     return PlaneElement(permutation=sigma)
 
 
-READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents]
+def _read_items(word: str, _: int) -> Element | Group | None:
+    if not (match := re.fullmatch(_ORDER, word)):
+        return None
+    name, numbers = match[1], tuple(int(x) for x in match[2].split("-")[1:])
+    return item_orders(name, *numbers) if len(numbers) == 1 else PlaneElement(items=((name, numbers),))
+
+
+READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents, _read_items]
 """What reads a word for N agents, or returns None; each kind of transform has its own."""
 
 

@@ -1,10 +1,10 @@
-"""Turns and mirrors of the plane, with or without a permutation of the agents, and how they act on each field kind.
+"""Turns and mirrors of the plane, with or without orders of agents and items, and how they act on each field kind.
 
 Convention, pinned by `tests/symmetry/test_elements.py`: angles are counter-clockwise, `rot90` sends (1, 0) to (0, 1),
 so *right* becomes *up*; a product `g @ h` applies h first, hence L_g L_h = L_{gh}. `flip-x` is the mirror in the
 x-axis, (x, y) -> (x, -y); `flip-y` the one in the y-axis, (x, y) -> (-x, y).
 
-An element is stored as an exact fraction of a turn, a mirror flag and a permutation, so that closure, products and
+An element is stored as an exact fraction of a turn, a mirror flag and permutations, so that closure, products and
 inverses are decided without rounding; matrices are derived.
 """
 
@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Floats, Indices, compose_permutations
+from esp_cli.symmetry.elements import Element, Floats, Indices, Orders, compose_permutations
 from esp_envs.spec import Field, Kind
 
 _PIXEL_TOLERANCE = 1e-6
@@ -121,27 +121,26 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
 
 @dataclass(frozen=True)
 class PlaneElement(Element):
-    """One transform: mirror in the x-axis if `mirrored`, then turn, and let agent i take the place of agent sigma(i).
+    """One transform: mirror in the x-axis if `mirrored`, then turn, and let agents and items change places.
 
     Attributes:
         turn: counter-clockwise fraction of a full turn in [0, 1).
         mirrored: whether y changes sign before the turn.
         permutation: sigma, with sigma[i] the place that agent i moves to; None where agents stay.
+        items: fields whose like items change places, each with the place that item k moves to.
     """
 
     turn: Fraction = Fraction(0)
     mirrored: bool = False
     permutation: tuple[int, ...] | None = None
+    items: Orders = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "turn", Fraction(self.turn) % 1)
-        sigma = self.permutation
-        if sigma is None:
-            return
-        if sorted(sigma) != list(range(len(sigma))):
-            raise ValueError(f"{sigma} is not a permutation; write each agent number from 0 to {len(sigma) - 1} once")
-        if sigma == tuple(range(len(sigma))):
+        if self.permutation is not None and not _moves(self.permutation):
             object.__setattr__(self, "permutation", None)
+        moving = ((name, places) for name, places in self.items if _moves(places))
+        object.__setattr__(self, "items", tuple(sorted(moving)))
 
     @cached_property
     def matrix(self) -> Floats:
@@ -162,13 +161,13 @@ class PlaneElement(Element):
 
     @property
     def in_place(self) -> PlaneElement:
-        """The same element with all agents in their places."""
+        """The same element with all agents and items in their places."""
         return PlaneElement(self.turn, self.mirrored)
 
     @property
-    def order(self) -> tuple[tuple[int, ...], bool, Fraction]:
-        """What the elements of a group are sorted by: permutation, mirror, turn."""
-        return self.permutation or (), self.mirrored, self.turn
+    def order(self) -> tuple[Orders, tuple[int, ...], bool, Fraction]:
+        """What the elements of a group are sorted by: items, permutation, mirror, turn."""
+        return self.items, self.permutation or (), self.mirrored, self.turn
 
     @property
     def participle(self) -> str:
@@ -177,34 +176,35 @@ class PlaneElement(Element):
 
     @property
     def name(self) -> str:
-        """The name that `parse_elements` reads: rot90, flip-x, flip22.5, agents-1-0-2, rot90*agents-1-0-2."""
+        """The name that `parse_elements` reads: rot90, flip-x, flip22.5, rot90*agents-1-0-2*landmarks-1-0."""
         parts = []
         if self.mirrored:
             axis = self.degrees / 2
             parts.append(_MIRROR_NAMES.get(axis, f"flip{_number(axis)}"))
         elif self.turn:
             parts.append(f"rot{_number(self.degrees)}")
-        if self.permutation is not None:
-            parts.append("agents-" + "-".join(map(str, self.permutation)))
+        parts += ["-".join(map(str, (name, *places))) for name, places in self.orders]
         return "*".join(parts) or "identity"
 
     def __matmul__(self, other: PlaneElement) -> PlaneElement:
         """Compose: `g @ h` applies h first, then g.
 
         Raises:
-            ValueError: the two permute different numbers of agents.
+            ValueError: the two permute different numbers of agents or items.
         """
         # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
         turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
         permutation = compose_permutations(self.permutation, other.permutation)
-        return PlaneElement(turn, self.mirrored != other.mirrored, permutation)
+        mine, others = dict(self.items), dict(other.items)
+        items = {name: compose_permutations(mine.get(name), others.get(name)) or () for name in mine | others}
+        return PlaneElement(turn, self.mirrored != other.mirrored, permutation, tuple(items.items()))
 
     def inverse(self) -> PlaneElement:
         """Return the element that undoes this one."""
         turn = self.turn if self.mirrored else -self.turn
-        sigma = self.permutation
-        back = None if sigma is None else tuple(sigma.index(i) for i in range(len(sigma)))
-        return PlaneElement(turn, self.mirrored, back)
+        permutation = None if self.permutation is None else _undone(self.permutation)
+        items = tuple((name, _undone(places)) for name, places in self.items)
+        return PlaneElement(turn, self.mirrored, permutation, items)
 
     def block(self, field: Field) -> Floats:
         """Return how one item of a field transforms: [item width, item width].
@@ -227,6 +227,22 @@ class PlaneElement(Element):
         if field.pixels is None:
             return super().gather(field)
         return picture_sources(field.pixels, self.matrix), np.ones(field.item_width)
+
+
+def _moves(places: tuple[int, ...]) -> bool:
+    """Return whether a permutation moves something.
+
+    Raises:
+        ValueError: it is none.
+    """
+    stay = tuple(range(len(places)))
+    if tuple(sorted(places)) != stay:
+        raise ValueError(f"{places} is not a permutation; write each number from 0 to {len(places) - 1} once")
+    return places != stay
+
+
+def _undone(places: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(places.index(i) for i in range(len(places)))
 
 
 def rotation(degrees: Fraction | int | str) -> PlaneElement:

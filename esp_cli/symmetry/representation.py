@@ -9,17 +9,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Floats, Indices, places_of
+from esp_cli.symmetry.elements import Element, Floats, Indices, item_places, places_of
 from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, joint_layout
 
 _MATCH_TOLERANCE = 1e-6
 
 
 def block_matrix(field: Field, elements: Sequence[Element]) -> Floats:
-    """Return how each run of d numbers of a field transforms, d dividing its width: [G, d, d]."""
+    """Return how each run of d numbers of a field transforms, d dividing its width: [G, d, d].
+
+    Where items change places, the run is the whole field.
+    """
     if field.parts:
-        return layout_matrix(Layout(field.parts), elements)
-    return np.stack([element.block(field) for element in elements])
+        item = layout_matrix(Layout(field.parts), [element.in_place for element in elements])
+    else:
+        item = np.stack([element.block(field) for element in elements])
+    places = item_places(elements, field)
+    if places is None:
+        return item
+    came_from = np.eye(field.count)[np.argsort(places, axis=1)]
+    each = np.kron(np.eye(field.item_width // item.shape[-1]), item)  # one item may be several runs
+    return np.einsum("gkm,gde->gkdme", came_from, each).reshape(len(elements), field.width, field.width)
 
 
 def layout_matrix(layout: Layout, elements: Sequence[Element]) -> Floats:
@@ -93,11 +103,20 @@ def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: in
 
 
 def _signed_permutations(field: Field, elements: Sequence[Element]) -> tuple[Indices, Floats]:
-    """Return source and sign of each run of d numbers of a field, [G, d] each."""
+    """Return source and sign of each run of d numbers of a field, [G, d] each; see `block_matrix`."""
     if field.parts:
-        return rows_permutation(Layout(field.parts), [element.in_place for element in elements], 1)
-    sources, signs = zip(*(element.gather(field) for element in elements), strict=True)
-    return np.stack(sources), np.stack(signs)
+        source, sign = rows_permutation(Layout(field.parts), [element.in_place for element in elements], 1)
+    else:
+        gathered = zip(*(element.gather(field) for element in elements), strict=True)
+        source, sign = (np.stack(part) for part in gathered)
+    places = item_places(elements, field)
+    if places is None:
+        return source, sign
+    first = field.item_width * np.argsort(places, axis=1)
+    runs = np.arange(0, field.item_width, source.shape[1])
+    item = (source[:, None, :] + runs[:, None]).reshape(len(elements), -1)
+    whole = (first[:, :, None] + item[:, None, :]).reshape(len(elements), -1)
+    return whole, np.tile(sign, (1, field.width // sign.shape[1]))
 
 
 def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:

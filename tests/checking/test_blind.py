@@ -138,8 +138,8 @@ def test_navigation_is_found_with_its_exchanges_of_landmarks(monkeypatch: pytest
     torch.manual_seed(0)
     env = make("navigation", 512, [0])
     found = discover_blindly("navigation", env.spec, collect(env, 32_768, 2))
-    assert found.group == "d4 among 96 maps of numbers"
-    assert found.transforms == "d4"
+    assert found.group == "d4*landmarks-3 among 96 maps of numbers"
+    assert found.transforms == "d4*landmarks-3"
 
 
 def test_what_it_cannot_look_at_is_refused() -> None:

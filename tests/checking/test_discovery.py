@@ -31,16 +31,17 @@ from tests.cli.running import esp, refused
 
 FORCES = {"actions": "continuous"}
 ROBOTS = {"horizon": 40, "num_agents": 4, "num_obstacles": 2}
+NOTHING = {"wind": 0.3, "gust_mean": 1.0, "weak_agent": 0.5, "num_agents": 2, "num_landmarks": 1}
 DRONES = {"width": 5, "height": 5, "horizon": 30}
 FOUND = [
-    ("navigation", {}, "d4*agents"),
-    ("navigation", FORCES, "o2*agents"),
-    ("navigation", {"wind": 0.3, **FORCES}, "flip-x*agents"),
-    ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal*agents"),
-    ("navigation", {"weak_agent": 0.5}, "d4 and agents-0-2-1"),
-    ("navigation", {"wind": 0.3, "gust_mean": 1.0, "weak_agent": 0.5, "num_agents": 2}, "c1"),
-    ("predator-prey", {}, "d4*agents"),
-    ("predator-prey", {"control": "prey", **FORCES}, "d4"),
+    ("navigation", {}, "d4*agents*landmarks-3"),
+    ("navigation", FORCES, "o2*agents*landmarks-3"),
+    ("navigation", {"wind": 0.3, **FORCES}, "flip-x*agents*landmarks-3"),
+    ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal*agents*landmarks-3"),
+    ("navigation", {"weak_agent": 0.5}, "d4*landmarks-3 and agents-0-2-1"),
+    ("navigation", NOTHING, "c1"),
+    ("predator-prey", {}, "d4*agents*obstacles-2"),
+    ("predator-prey", {"control": "prey", **FORCES}, "d4*obstacles-2"),
     ("wildlife", DRONES, "d4*agents"),
     ("formation", ROBOTS, "d4*agents"),
 ]
@@ -147,6 +148,10 @@ def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
         ("c16,rot57", "so2", "so2"),
         ("d4,agents-1-0-2,agents-0-2-1,agents-2-1-0", "d4*agents", "d4*agents"),
         ("flip-x,agents-1-0-2", "flip-x and agents-1-0-2", "flip-x,agents-1-0-2"),
+        ("d4,marks-1-0-2,marks-0-2-1", "d4*marks-3", "d4*marks-3"),
+        ("d4,marks-1-0-2,agents-0-2-1", "d4 and marks-1-0-2,agents-0-2-1", "d4,marks-1-0-2,agents-0-2-1"),
+        ("d16,rot57,flip23,marks-1-0-2", "o2 and marks-1-0-2", "o2"),
+        ("marks-1-0-2,marks-0-2-1", "c1*marks-3", "marks-3"),
         ("agents-1-0-2,agents-2-1-0", "c1*agents", "agents"),
         (
             "rot180,flip45,flip135,agents-1-0-2,agents-0-2-1,agents-2-1-0",
@@ -156,8 +161,8 @@ def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
     ],
 )
 def test_accepted_elements_close_to_the_largest_group(accepted: str, group: str, transforms: str | None) -> None:
-    tried = parse_elements("d16,rot57,flip23,agents-1-0-2,agents-0-2-1,agents-2-1-0", 3)
-    name, text = named(parse_elements(accepted, 3), tried, 3)
+    tried = parse_elements("d16,rot57,flip23,agents-1-0-2,agents-0-2-1,agents-2-1-0,marks-1-0-2,marks-0-2-1", 3)
+    name, text = named(parse_elements(accepted, 3), tried)
     assert name == group
     assert text == (group if transforms is None else transforms)
     if text:
@@ -179,7 +184,7 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
     shown = esp("discover", path, "--task", "navigation", "--set", "task.actions=continuous", "--json", out)
     assert "found flip-x*agents" in shown.stdout
     assert "--transforms flip-x*agents" in shown.stderr
-    assert json.loads(out.read_text())["group"] == "flip-x*agents"
+    assert json.loads(out.read_text())["group"] == "flip-x*agents", "so few episodes do not show the landmarks' orders"
     spec = make("navigation", 1, [0], FORCES).spec
     data = read_transitions(path, spec)
     flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
@@ -252,15 +257,18 @@ def test_a_gap_that_is_no_number_is_not_accepted() -> None:
 def test_agents_that_were_never_exchanged_are_not_claimed() -> None:
     """Agent 3 of four is in no exchange that was tried."""
     tried = parse_elements("agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3", 4)
-    assert named(tried, tried, 4)[1] == "agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3"
+    assert named(tried, tried)[1] == "agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3"
 
 
 def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settings(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     esp("train", "--task", "navigation", "--set", "task.wind=0.3", "--transforms", "discovered", "--steps", "50",
         "--set", "mappo.num_envs=2", "--out", folder)  # fmt: skip
-    assert json.loads((folder / "config.json").read_text())["prior"]["transforms"] == "discovered:flip-x*agents"
-    assert "found flip-x*agents" in esp("discover", folder).stdout
+    assert (
+        json.loads((folder / "config.json").read_text())["prior"]["transforms"]
+        == "discovered:flip-x*agents*landmarks-3"
+    )
+    assert "found flip-x*agents*landmarks-3" in esp("discover", folder).stdout
     esp("train", "--resume", folder)
 
 
@@ -273,7 +281,7 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
 
 
 def test_where_nothing_is_found_there_is_no_prior() -> None:
-    broken = {"task.wind": 0.3, "task.gust_mean": 1.0, "task.weak_agent": 0.5, "task.num_agents": 2}
+    broken = {f"task.{name}": value for name, value in NOTHING.items()}
     config = resolve_config("navigation", overrides={**broken, "prior.transforms": "discovered"})
     assert prepared(config).prior.kind == "none"
     plain = resolve_config("navigation")

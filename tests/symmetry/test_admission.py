@@ -56,6 +56,14 @@ def test_actions_that_cannot_follow_are_refused_in_one_sentence(make_spec) -> No
         ("agents", {"symmetry": "d4"}, "declared symmetry, d4, does not say that agents may be exchanged; use a group"),
         ("d4*agents", {"symmetry": "d4"}, "does not say that agents may be exchanged; use a group within d4"),
         ("rot90,agents-1-0-2", {"symmetry": "o2"}, "does not say that agents may be exchanged"),
+        (
+            "landmarks-2",
+            {},
+            "symmetry, o2.agents, does not say that its landmarks may be exchanged; use a group within",
+        ),
+        ("landmarks-3", {"symmetry": "d4*landmarks-3"}, "field 'landmarks' has 2 items, not 3"),
+        ("others-1-0", {}, "items of field 'others' cannot be exchanged: they are the agents'"),
+        ("islands-1-0", {}, "its observation has no field 'islands'"),
     ],
 )
 def test_refusals(make_spec, text, changes, message) -> None:
@@ -83,6 +91,19 @@ def test_a_single_element_can_be_declared(make_spec) -> None:
 def test_agents_that_may_not_be_exchanged_are_not_among_the_carried(make_spec) -> None:
     assert carried_groups(make_spec(symmetry="d4")) == UP_TO_D4
     assert carried_groups(make_spec(symmetry="d4*agents")) == (*UP_TO_D4, "agents")
+
+
+def test_declared_orders_of_items_are_carried(make_spec) -> None:
+    spec = make_spec(symmetry="d4*agents*landmarks-2")
+    assert carried_groups(spec) == (*UP_TO_D4, "agents", "landmarks-2")
+    assert transform_set("d4*agents*landmarks-2", spec).size == 8 * 6 * 2 - 1
+    assert transform_set("rot90*landmarks-1-0", spec).names == ("rot90*landmarks-1-0",)
+
+
+def test_what_is_discovered_may_order_items_that_are_not_declared(make_spec) -> None:
+    assert transform_set("discovered:d4*landmarks-2", make_spec(symmetry="c1")).size == 15
+    with pytest.raises(ValueError, match="its observation has no field 'islands'"):
+        transform_set("discovered:islands-1-0", make_spec(symmetry="c1"))
 
 
 def test_a_ring_carries_the_turns_between_its_rays(make_spec) -> None:

@@ -66,7 +66,18 @@ def test_permutations_send_agent_i_to_sigma_of_i() -> None:
     assert (round_ @ swap).permutation == (2, 1, 0)
 
 
+def test_orders_of_items_compose_and_are_undone_field_by_field() -> None:
+    swap = PlaneElement(items=(("marks", (1, 0, 2)), ("cars", (1, 0))))
+    round_ = PlaneElement(items=(("marks", (1, 2, 0)),))
+    assert (swap @ round_).items == (("cars", (1, 0)), ("marks", (0, 2, 1)))
+    assert (round_ @ swap).items == (("cars", (1, 0)), ("marks", (2, 1, 0)))
+    assert round_.inverse().items == (("marks", (2, 0, 1)),)
+    assert (swap @ swap).is_identity
+    assert swap.in_place.is_identity
+
+
 def test_an_order_that_moves_nobody_is_the_identity() -> None:
+    assert PlaneElement(items=(("marks", (0, 1, 2)),)) == PlaneElement()
     assert PlaneElement(permutation=(0, 1, 2)) == PlaneElement()
     assert PlaneElement(permutation=(0, 1)).is_identity
 
@@ -80,6 +91,10 @@ def test_an_order_that_moves_nobody_is_the_identity() -> None:
         (PlaneElement(permutation=(1, 0, 2)), "agents-1-0-2"),
         (rotation(90) @ PlaneElement(permutation=(1, 0)), "rot90*agents-1-0"),
         (PlaneElement(Fraction(0.123456789)), "rot44.444"),
+        (
+            PlaneElement(permutation=(1, 0), items=(("marks", (1, 0, 2)), ("cars", (1, 0)))),
+            "agents-1-0*cars-1-0*marks-1-0-2",
+        ),
     ],
 )
 def test_names_of_other_elements(element: PlaneElement, name: str) -> None:
@@ -89,5 +104,5 @@ def test_names_of_other_elements(element: PlaneElement, name: str) -> None:
 def test_refusals() -> None:
     with pytest.raises(ValueError, match="is not a permutation"):
         PlaneElement(permutation=(0, 0, 1))
-    with pytest.raises(ValueError, match="of 2 and of 3 agents cannot be composed"):
+    with pytest.raises(ValueError, match="orders of 2 and of 3 things cannot be composed"):
         PlaneElement(permutation=(1, 0)) @ PlaneElement(permutation=(1, 0, 2))

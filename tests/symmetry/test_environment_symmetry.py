@@ -124,6 +124,20 @@ def test_continuous_turns_by_any_angle(task, settings) -> None:
     assert max(errors.values()) < BOUND, errors
 
 
+@pytest.mark.parametrize(("task", "orders"), [("navigation", "landmarks-3"), ("predator-prey", "obstacles-2")])
+def test_landmarks_and_obstacles_may_change_places_and_bodies_may_not_alone(task, orders) -> None:
+    elements = parse_elements(f"{orders},rot90*{orders}", 3)
+    env = worlds(task, {}, len(elements))
+    errors = measure(env, build_transform(elements, env.spec))
+    assert max(errors.values()) < LAST_BITS, errors
+    name, _, count = orders.partition("-")
+    env = worlds(task, {}, 1)
+    (swap,) = parse_elements("-".join([name, "1", "0", *map(str, range(2, int(count)))]), 3)
+    half = build_transform([swap], env.spec)
+    half = replace(half, state_map=build_transform([swap.in_place], env.spec).state_map)
+    assert measure(env, half)["observation"] > 0.1, "what agents see moves, and the world does not"
+
+
 def test_the_check_sees_bodies_touch() -> None:
     # Without contacts and rewards the checks above would say little.
     env = worlds("predator-prey", {}, 4)

@@ -15,6 +15,7 @@ from esp_cli.symmetry import (
     cyclic,
     dihedral,
     direct_product,
+    item_orders,
     mirror,
     orthogonal,
     rotation,
@@ -33,6 +34,8 @@ ORDERS = {
     "d8": (dihedral(8), 16),
     "agents": (agent_permutations(3), 6),
     "d4*agents": (direct_product(dihedral(4), agent_permutations(3)), 48),
+    "marks-3": (item_orders("marks", 3), 6),
+    "c2*agents*marks-3": (direct_product(cyclic(2), agent_permutations(2), item_orders("marks", 3)), 24),
 }
 
 
@@ -129,3 +132,15 @@ def test_membership_of_continuous_groups() -> None:
     assert mirror(10) @ PlaneElement(permutation=(1, 0)) in both
     assert all(w in both for w in both.generators())
     assert "rot90" not in both
+    with_items = direct_product(orthogonal(), agent_permutations(2), item_orders("marks", 3))
+    swap = PlaneElement(items=(("marks", (1, 0, 2)),))
+    assert mirror(10) @ PlaneElement(permutation=(1, 0)) @ swap in with_items
+    assert swap not in both
+    assert PlaneElement(items=(("marks", (1, 0)),)) not in with_items
+    assert PlaneElement(items=(("cars", (1, 0, 2)),)) not in with_items
+    assert with_items.draw(torch.Generator().manual_seed(0)) in with_items
+
+
+def test_many_items_have_no_group_of_orders() -> None:
+    with pytest.raises(ValueError, match="7 marks have no group of orders; 2 to 6 like items"):
+        item_orders("marks", 7)

@@ -13,9 +13,11 @@ from esp_cli.symmetry.representation import (
     block_matrix,
     joint_matrix,
     layout_matrix,
+    rows_matrix,
+    rows_permutation,
     state_matrix,
 )
-from esp_envs.spec import Discrete, Field, Items, Kind, Layout, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
 KINDS = [Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.VECTOR, Kind.WHEELS, Kind.PICTURE]
@@ -57,6 +59,54 @@ def test_a_row_by_hand() -> None:
     turned, mirrored = layout_matrix(row_layout, [rotation(90), mirror(0)]) @ row
     np.testing.assert_array_equal(turned, [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0])
     np.testing.assert_array_equal(mirrored, [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1])
+
+
+MARKED = layout(
+    Field("velocity", Kind.VECTOR),
+    Field("marks", Kind.VECTOR, 3),
+    Field("cars", Kind.RECORD, 2, parts=(Field("place", Kind.VECTOR), Field("rate", Kind.PSEUDOSCALAR))),
+)
+ROUND = PlaneElement(items=(("marks", (1, 2, 0)), ("cars", (1, 0))))
+
+
+def test_items_change_places_by_hand() -> None:
+    # Mark 0 goes to place 1, 1 to 2, 2 to 0; the two cars change places, each with its rate.
+    row = np.array([1, 2, 10, 11, 20, 21, 30, 31, 5, 6, 7, -5, -6, -7], dtype=float)
+    moved, both = layout_matrix(MARKED, [ROUND, mirror(0) @ ROUND]) @ row
+    np.testing.assert_array_equal(moved, [1, 2, 30, 31, 10, 11, 20, 21, -5, -6, -7, 5, 6, 7])
+    np.testing.assert_array_equal(both, [1, -2, 30, -31, 10, -11, 20, -21, -5, 6, 7, 5, -6, -7])
+
+
+@pytest.mark.parametrize("num_agents", [1, 2])
+def test_orders_of_items_are_homomorphisms_and_signed_permutations(num_agents: int) -> None:
+    swap = PlaneElement(items=(("marks", (1, 0, 2)),), permutation=(1, 0) if num_agents == 2 else None)
+    elements = [swap, rotation(90) @ ROUND, swap @ rotation(90) @ ROUND]
+    first, second, product = rows_matrix(MARKED, elements, num_agents)
+    np.testing.assert_array_equal(first @ second, product)
+    source, sign = rows_permutation(MARKED, elements, num_agents)
+    row = np.arange(1.0, source.shape[1] + 1)
+    whole = rows_matrix(MARKED, elements, num_agents)
+    np.testing.assert_array_equal(row[source] * sign, whole @ np.resize(row, whole.shape[2]))
+
+
+def test_a_state_of_all_rows_moves_the_items_of_each() -> None:
+    observation = layout(Field("marks", Kind.SCALAR, 2))
+    spaces = Spaces(
+        num_agents=2,
+        observation=observation,
+        state=joint_layout(observation, 2),
+        action=FOUR_DIRECTIONS,
+        symmetry="c1*marks-2",
+    )
+    swap = PlaneElement(items=(("marks", (1, 0)),))
+    np.testing.assert_array_equal(state_matrix(spaces, [swap])[0] @ [1, 2, 3, 4], [2, 1, 4, 3])
+
+
+def test_items_that_cannot_change_places_are_refused() -> None:
+    with pytest.raises(ValueError, match="field 'marks' has 3 items, not 2"):
+        layout_matrix(MARKED, [PlaneElement(items=(("marks", (1, 0)),))])
+    with pytest.raises(ValueError, match="items of field 'others' cannot be exchanged"):
+        block_matrix(field_of("others", Kind.SCALAR, 2, Items.OTHERS), [PlaneElement(items=(("others", (1, 0)),))])
 
 
 def test_others_are_reordered_by_hand() -> None:
