@@ -34,11 +34,11 @@ def remaining(whole: str, breakings: Iterable[Breaking]) -> str:
     """
     real = [one for one in breakings if one.size]
     planes = {one.plane for one in real if one.plane is not None}
-    plane = whole.removesuffix("*agents")
+    plane, *rest = whole.split("*")
     if planes:
         plane = planes.pop() if len(planes) == 1 else "c1"
-    agents = whole.endswith("*agents") and all(one.agents for one in real)
-    return f"{plane}*agents" if agents else plane
+    exchanged = all(one.agents for one in real)
+    return "*".join((plane, *(factor for factor in rest if factor != "agents" or exchanged)))
 
 
 def described(breakings: Iterable[Breaking]) -> str:

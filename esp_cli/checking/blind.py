@@ -69,8 +69,8 @@ def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discover
     generators = [Permutation(points) for one in maps if (points := _points(one.matrix))]
     group = PermutationGroup(generators or [Permutation(1)])
     known = [element for element in default_candidates(spaces) if element.permutation is None]
-    plane, transforms = named(_held(known, spaces, data, maps, group), known)
-    found = f"{plane} among {'' if is_complete else 'at least '}{group.order()} maps of numbers"
+    name, transforms = named(_held(known, spaces, data, maps, group), known)
+    found = f"{name} among {'' if is_complete else 'at least '}{group.order()} maps of numbers"
     return Discovery(source, BLIND, found, transforms, results)
 
 

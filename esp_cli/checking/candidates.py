@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from esp_cli.symmetry import Element, Group, build_transform, parse_elements
-from esp_cli.symmetry.parse import is_planar, name_of_orders, planar_part
+from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.groups import swap_and_round
+from esp_cli.symmetry.parse import Factors
 from esp_envs.spec import Spaces
 
 _TRIED = "d8,rot57,flip23"
@@ -27,13 +29,11 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     Raises:
         ValueError: the text means nothing, or nothing that is asked for can be carried.
     """
-    texts = [transforms] if transforms is not None else [_TRIED, planar_part(spaces.symmetry)]
+    texts = [transforms] if transforms is not None else [_TRIED, Factors.of(spaces.symmetry).plane]
     if transforms is None:
-        if spaces.num_agents > 1:
-            texts += _orders("agents", spaces.num_agents)
-        for factor in _item_factors(spaces):
-            name, _, count = factor.partition("-")
-            texts += _orders(name, int(count))
+        agents = {"agents": spaces.num_agents} if spaces.num_agents > 1 else {}
+        for name, count in (agents | Factors.of(spaces.symmetry).items).items():
+            texts += _orders(name, count)
     asked = dict.fromkeys(element for text in texts for element in _elements(text, spaces.num_agents))
     refusals = {element: _refusal(element, spaces) for element in asked}
     found = [element for element, refusal in refusals.items() if refusal is None]
@@ -44,15 +44,8 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
 
 
 def _orders(name: str, count: int) -> list[str]:
-    """Return the exchange of the first two of some things and the round of all, which generate every order of them."""
-    order = list(range(count))
-    swap, cycle = [order[1], order[0], *order[2:]], [*order[1:], order[0]]
-    return ["-".join(map(str, (name, *new))) for new in (swap, cycle)]
-
-
-def _item_factors(spaces: Spaces) -> list[str]:
-    """Return the declared groups of orders of items: ["landmarks-3"]."""
-    return [name for name in spaces.symmetry.split("*") if name != "agents" and not is_planar(name)]
+    """Return the names of elements that generate all orders of some things."""
+    return ["-".join(map(str, (name, *order))) for order in swap_and_round(count)]
 
 
 def _refusal(element: Element, spaces: Spaces) -> str | None:
@@ -66,31 +59,30 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
-    plane, factors = planar_part(spaces.symmetry), spaces.symmetry.split("*")
-    if any(name_of_orders(name, len(places)) not in factors for name, places in element.orders):
+    factors = Factors.of(spaces.symmetry)
+    if not all(factors.order(name, len(places)) for name, places in element.orders):
         return False
     if element.in_place.is_identity:
         return True
-    if plane in ("", "c1"):
+    if factors.plane in ("", "c1"):
         return False
-    group = parse_elements(plane, spaces.num_agents)
+    group = parse_elements(factors.plane, spaces.num_agents)
     return element.in_place in group
 
 
 def found_group(holding: Collection[str], spaces: Spaces) -> str:
     """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
     plane = "c1"
-    for name in sorted((*_NAMED, planar_part(spaces.symmetry)), key=lambda name: len(_elements(name, 1))):
+    for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_elements(name, 1))):
         if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
             plane = name
     if "rot57" in holding:
         plane = "o2" if "flip23" in holding else "so2"
-    orders = [
-        factor
-        for factor in ("agents", *_item_factors(spaces))
-        if any(name.startswith(f"{factor.partition('-')[0]}-") for name in holding)
+    agents = ["agents"] if any(name.startswith("agents-") for name in holding) else []
+    items = [
+        f"{name}-{count}" for name, count in exchangeable(spaces).items() if set(_orders(name, count)) <= set(holding)
     ]
-    return "*".join((plane, *orders))
+    return "*".join((plane, *agents, *items))
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:

@@ -19,7 +19,7 @@ from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup
 from esp_cli.symmetry.admission import exchangeable
-from esp_cli.symmetry.parse import name_of_orders, parse_elements
+from esp_cli.symmetry.parse import parse_elements
 from esp_envs.spec import Spaces
 
 FALSE_DISCOVERIES = 0.05
@@ -131,9 +131,9 @@ def _orders_of(accepted: Sequence[Element]) -> tuple[list[str], list[str]]:
             name, places = element.orders[0]
             found.setdefault((name, len(places)), []).append(element)
     whole, single = list[str](), list[str]()
-    for (name, count), elements in found.items():
+    for (name, count), elements in sorted(found.items(), key=lambda one: (one[0][0] != "agents", one[0])):
         if _connect([element.orders[0][1] for element in elements], count):
-            whole.append(name_of_orders(name, count))
+            whole.append(name if name == "agents" else f"{name}-{count}")
         else:
             single += [element.name for element in elements]
     return whole, single
@@ -208,8 +208,8 @@ def default_candidates(spaces: Spaces, transforms: str | None = None) -> list[El
     if transforms is not None:
         return candidates(spaces, transforms)
     texts = ["d16", "rot57", "flip23", *_exchanges("agents", spaces.num_agents)]
-    for name, _, count in (group.partition("-") for group in exchangeable(spaces)):
-        texts += _exchanges(name, int(count))
+    for name, count in exchangeable(spaces).items():
+        texts += _exchanges(name, count)
     return [element for text in texts for element in _carried(spaces, text)]
 
 

@@ -11,7 +11,7 @@ from esp_cli.checking.paired import check_paired
 from esp_cli.checking.regression import check_by_regression
 from esp_cli.checking.transitions import collect
 from esp_cli.checking.verdicts import ElementVerdict
-from esp_cli.symmetry import Group
+from esp_cli.symmetry import Group, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment
@@ -34,6 +34,8 @@ def prepared(config: RunConfig) -> RunConfig:
         return config
     if prior.transforms == DISCOVERED.rstrip(":"):
         found = discover_in_task(_Maker(config)).transforms
+        if prior.copies == "all" or prior.trust != "full":
+            found = _listed(found, config)
         change: dict[str, object] = (
             {"transforms": DISCOVERED + found} if found else {"kind": "none", "transforms": "d4"}
         )
@@ -52,6 +54,14 @@ def planned(config: RunConfig) -> RunConfig:
 
 def _effective(config: RunConfig) -> RunConfig:
     return config.model_copy(update={"prior": config.prior.effective()})
+
+
+def _listed(transforms: str, config: RunConfig) -> str:
+    """Leave factors out from the right, orders of items first, until all elements can be listed."""
+    num_agents = _Maker(config)(1, [0]).spec.num_agents
+    while "*" in transforms and isinstance(parse_elements(transforms, num_agents), Group):
+        transforms = transforms.rpartition("*")[0]
+    return transforms
 
 
 class _Maker:

@@ -42,7 +42,7 @@ def check_symmetry(make: MakeWorlds, transforms: str | None = None) -> SymmetryR
 
     Args:
         make: makes E worlds for some seeds.
-        transforms: which elements, as `--transforms` takes them; by default d8, any angle and exchanges of agents.
+        transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
 
     Raises:
         ValueError: the transforms mean nothing, or the task can carry none of them.

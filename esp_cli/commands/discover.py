@@ -97,6 +97,8 @@ def _discovery(
 
 
 def _print(found: Discovery) -> None:
+    from esp_cli.symmetry.admission import DISCOVERED
+
     rows = [
         (
             one.element,
@@ -111,6 +113,6 @@ def _print(found: Discovery) -> None:
     caption = f"worst field: gap ± standard error in {unit}; p: that a field is off by the tolerance or more"
     console.table(("element", "result", "p>", "worst field"), rows, title=title, caption=caption)
     if found.transforms:
-        console.note(f"use it with: --transforms {found.transforms}")
+        console.note(f"use it with: --transforms {DISCOVERED}{found.transforms}")
     else:
         console.note("nothing that --transforms can name was found: train with --prior none, or with prior.compass")

@@ -14,6 +14,7 @@ from esp_cli.loop.shapes import act, carry, check_state, lead_of
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
+from esp_cli.symmetry.admission import unrestricted
 from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
 
 if TYPE_CHECKING:
@@ -66,8 +67,8 @@ class Symmetry:
         seed: int = 0,
     ) -> None:
         joint = joint_layout(observation, num_agents)
-        self.spaces = Spaces(
-            num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="o2*agents"
+        self.spaces = unrestricted(
+            Spaces(num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="c1")
         )
         self.group, self.copies = group, copies
         self.generator = torch.Generator().manual_seed(seed)

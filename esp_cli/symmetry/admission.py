@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element
+from esp_cli.symmetry.elements import Element, item_places
 from esp_cli.symmetry.groups import MOST_ITEMS, Group
-from esp_cli.symmetry.parse import is_planar, name_of_orders, parse_elements, planar_part
+from esp_cli.symmetry.parse import Factors, is_item_name, parse_elements
 from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
-from esp_envs.spec import Discrete, Items, Spaces, joint_layout
+from esp_envs.spec import Continuous, Discrete, Items, Spaces, joint_layout
 
 DISCOVERED = "discovered:"
 """Begins transforms that were found in data, and that the task need not declare."""
@@ -37,8 +37,8 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
         return
     advice = "use --prior none"
     if carried := carried_groups(spaces):
-        plane = [name for name in carried if is_planar(name)]
-        advice = f"use a group within {plane[-1]}" if plane else "use agents"
+        plane = [name for name in carried if name in (*PLANE_GROUPS, Factors.of(_usable(spaces)).plane)]
+        advice = f"use a group within {plane[-1]}" if plane else f"use {carried[0]}"
         if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
     raise ValueError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
@@ -49,26 +49,37 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
 
     `agents` follows if the agents of the task may change places, then orders of items that it declares.
     """
-    own = planar_part(_usable(spaces))
+    factors = Factors.of(_usable(spaces))
+    own = factors.plane
     names = PLANE_GROUPS if own in ("", "c1", *PLANE_GROUPS) else (*PLANE_GROUPS, own)
-    carried = [name for name in names if _carries(name, spaces)]
-    if spaces.num_agents > 1 and _carries("agents", spaces):
-        carried.append("agents")
-    orders = [name for name in _usable(spaces).split("*") if name not in ("agents", own) and not is_planar(name)]
-    return (*carried, *(name for name in orders if _carries(name, spaces)))
+    agents = ["agents"] if spaces.num_agents > 1 else []
+    return tuple(name for name in (*names, *agents, *factors.orders) if _carries(name, spaces))
 
 
-def exchangeable(spaces: Spaces) -> tuple[str, ...]:
-    """Return the groups of all orders of each field's items that an agent sees: ("landmarks-3",).
+def exchangeable(spaces: Spaces) -> dict[str, int]:
+    """Return the fields whose items may change places as far as layouts tell, each with how many it has.
 
-    These are fields of two to `MOST_ITEMS` items that are no pictures, and that follow no agents.
+    An agent sees two to `MOST_ITEMS` of them, they are no pictures and follow no agents, the state has them too, and
+    the name is one word of letters, digits and underscores.
     """
-    names = [
-        name_of_orders(field.name, field.count)
+    own = {field.name for field in spaces.state.fields}
+    return {
+        field.name: field.count
         for field in spaces.observation.fields
         if field.items is Items.FIXED and field.pixels is None and 2 <= field.count <= MOST_ITEMS
-    ]
-    return tuple(name for name in names if not is_planar(name))
+        if field.name in own or _is_joint(spaces)
+        if is_item_name(field.name)
+    }
+
+
+def unrestricted(spaces: Spaces) -> Spaces:
+    """Return spaces whose task may have any symmetry: actions and layouts alone say what is carried."""
+    orders = (f"{name}-{count}" for name, count in exchangeable(spaces).items())
+    return replace(spaces, nearly="*".join(("o2*agents", *orders)))
+
+
+def _is_joint(spaces: Spaces) -> bool:
+    return spaces.state == joint_layout(spaces.observation, spaces.num_agents)
 
 
 def _carries(name: str, spaces: Spaces) -> bool:
@@ -104,7 +115,7 @@ def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which element is no symmetry of the dynamics and reward, if one is none."""
-    name = planar_part(_usable(spaces)) or "c1"
+    name = Factors.of(_usable(spaces)).plane or "c1"
     declared = () if name == "c1" else parse_elements(name, spaces.num_agents)
     for element in elements:
         if not element.in_place.is_identity and element.in_place not in declared:
@@ -115,10 +126,14 @@ def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 def _layout_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which field cannot be transformed, if one cannot."""
     # A picture says so when its map is built, without a matrix of its pixels' square.
-    fields = [field for field in (*spaces.observation.fields, *spaces.state.fields) if not field.pixels]
+    layouts = [spaces.observation, spaces.state]
+    if isinstance(spaces.action, Continuous):
+        layouts.append(spaces.action.layout)
     try:
-        for field in fields:
-            block_matrix(field, elements)
+        for field in (field for layout in layouts for field in layout.fields):
+            item_places(elements, field)
+            if field.pixels is None:
+                block_matrix(field, elements)
     except ValueError as error:
         return str(error)
     return None
@@ -131,10 +146,9 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         return None
     if any(len(element.permutation or ()) != spaces.num_agents for element in moving):
         return f"the permutation is not one of its {spaces.num_agents} agents"
-    if "agents" not in _usable(spaces).split("*"):
+    if not Factors.of(_usable(spaces)).agents:
         return f"its declared symmetry, {_usable(spaces)}, does not say that agents may be exchanged"
-    joint = spaces.state == joint_layout(spaces.observation, spaces.num_agents)
-    if not joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
+    if not _is_joint(spaces) and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
         joint_sources(spaces.observation, np.array([moving[0].permutation]))
@@ -146,12 +160,14 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 def _items_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why items cannot change places, if some are asked to and cannot."""
-    usable = _usable(spaces)
+    usable, seen = _usable(spaces), [field.name for field in spaces.observation.fields]
     for name, places in dict.fromkeys(order for element in elements for order in element.items):
-        if all(field.name != name for field in spaces.observation.fields):
-            return f"its observation has no field '{name}'"
-        if name_of_orders(name, len(places)) not in usable.split("*"):
+        if name not in seen:
+            return f"it has no field '{name}', but {', '.join(seen)}"
+        if not Factors.of(usable).order(name, len(places)):
             return f"its declared symmetry, {usable}, does not say that its {name} may be exchanged"
+        if not _is_joint(spaces) and all(field.name != name for field in spaces.state.fields):
+            return f"its state does not hold its {name}"
     return None
 
 
@@ -160,9 +176,7 @@ def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
 
     What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
     """
-    found, declared = text.removeprefix(DISCOVERED), spaces
-    if found != text:
-        declared = replace(spaces, nearly="*".join(("o2*agents", *exchangeable(spaces))))
+    found = text.removeprefix(DISCOVERED)
     elements = parse_elements(found, spaces.num_agents)
-    admit(found, elements, declared)
+    admit(found, elements, spaces if found == text else unrestricted(spaces))
     return elements

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any
@@ -103,7 +104,7 @@ def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
     Raises:
         ValueError: the field has another number of items, is a picture, or its items follow the agents.
     """
-    name = field.name.rpartition(".")[2]  # a joint layout has one field for each agent: "agent0.landmarks"
+    name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
     orders = [dict(element.items).get(name) for element in elements]
     moved = [order for order in orders if order is not None]
     if not moved:

@@ -141,8 +141,7 @@ class AgentPermutations(Group):
 
     def generators(self) -> tuple[Element, ...]:
         """Return the swap of the first two agents and the round of all of them, which generate every order."""
-        swap, cycle = (1, 0, *range(2, self.num_agents)), (*range(1, self.num_agents), 0)
-        return PlaneElement(permutation=swap), PlaneElement(permutation=cycle)
+        return tuple(PlaneElement(permutation=order) for order in swap_and_round(self.num_agents))
 
 
 class ProductGroup(Group):
@@ -172,6 +171,11 @@ def _parts(element: Element) -> Iterator[Element]:
     yield PlaneElement(permutation=element.permutation)
     for order in element.items:
         yield PlaneElement(items=(order,))
+
+
+def swap_and_round(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the exchange of the first two of some things and the round of all, which generate every order of them."""
+    return (1, 0, *range(2, count)), (*range(1, count), 0)
 
 
 def cyclic(n: int) -> FiniteGroup:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
 
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,
+    MOST_ITEMS,
     FiniteGroup,
     Group,
     agent_permutations,
@@ -29,9 +31,9 @@ _NAMED = {
     "flip-y": mirror(90),
     "flip-antidiagonal": mirror(135),
 }
-_KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, flip-antidiagonal, c4, d4, c8, so2, o2, agents, d4*agents"
+_KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, c4, d4, c8, so2, o2, agents, landmarks-3, d4*agents"
 _DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
-_ORDER = r"(?!(?:rot|flip)-)([a-z]\w*)((?:-\d{1,4})+)"
+_ORDER = r"(?!(?i:rot|flip|agents)-)([A-Za-z]\w*)((?:-\d{1,4})+)"
 """A field and numbers: how many items it has, or the place that each of them moves to."""
 _MAX_FOLD = 360
 
@@ -51,7 +53,7 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
     Raises:
         ValueError: an unknown name, nothing besides the identity, or a sampled group that does not stand alone.
     """
-    items = [_item(part.strip(), text, num_agents) for part in text.lower().split(",")]
+    items = [_item(part.strip(), text, num_agents) for part in text.split(",")]
     listed = [item for item in items if isinstance(item, tuple)]
     if len(listed) < len(items):
         if len(items) == 1 and isinstance(items[0], Group):
@@ -69,43 +71,84 @@ def parse_group(text: str, num_agents: int) -> Group:
     Raises:
         ValueError: unknown, or no group.
     """
-    factors = [_factor(part.strip(), text, num_agents) for part in text.lower().split("*")]
+    factors = [_factor(part.strip(), text, num_agents) for part in text.split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
     if len(groups) != len(factors):
         raise ValueError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
-    ranks = [_rank(group) for group in groups]
-    if ranks != sorted(set(ranks)):
-        raise ValueError(f"'{text}' is not a direct product; write a planar group, then agents, as in d4*agents")
-    return groups[0] if len(groups) == 1 else direct_product(*groups)
+    ranked = sorted(groups, key=_rank)
+    ranks = [_rank(group) for group in ranked]
+    if len(set(ranks)) < len(ranks) or (len(groups) > 1 and _rank(groups[-1]) == _PLANE):
+        raise ValueError(
+            f"'{text}' is not a direct product; write a planar group, agents and fields, each once, as d4*agents"
+        )
+    return ranked[0] if len(ranked) == 1 else direct_product(*ranked)
 
 
-def is_planar(name: str) -> bool:
-    """Return whether a factor of a group's name is its planar part: neither agents nor items change places."""
-    return name != "agents" and not re.fullmatch(_ORDER, name)
+@dataclass(frozen=True)
+class Factors:
+    """What a task's symmetry moves: "d4*agents*landmarks-3".
+
+    Attributes:
+        plane: name of the planar part, empty where there is none.
+        agents: whether agents change places.
+        items: fields whose items change places, each with how many it has.
+    """
+
+    plane: str
+    agents: bool
+    items: dict[str, int]
+
+    @classmethod
+    def of(cls, symmetry: str) -> Factors:
+        """Read a task's symmetry.
+
+        Raises:
+            ValueError: it has one order of items, and not all.
+        """
+        plane, items = [], dict[str, int]()
+        words = [part.strip() for part in symmetry.split("*")]
+        for word in words:
+            match = re.fullmatch(_ORDER, word)
+            if match is None:
+                plane += [word] if word != "agents" else []
+            elif match[2].count("-") == 1:
+                items[match[1]] = int(match[2][1:])
+            else:
+                count = match[2].count("-")
+                raise ValueError(f"'{word}' is one order of items; declare all of them, as in {match[1]}-{count}")
+        return cls("*".join(plane), "agents" in words, items)
+
+    @property
+    def orders(self) -> list[str]:
+        """The groups of all orders of items: ["landmarks-3"]."""
+        return [f"{name}-{count}" for name, count in self.items.items()]
+
+    def order(self, name: str, count: int) -> bool:
+        """Return whether agents (so named), or the items of a field, may take any order."""
+        return self.agents if name == "agents" else self.items.get(name) == count
 
 
-def planar_part(symmetry: str) -> str:
-    """Return the planar part of a task's symmetry; empty where there is none."""
-    return "*".join(name for name in symmetry.split("*") if is_planar(name))
+def is_item_name(name: str) -> bool:
+    """Return whether orders of the items of a field with this name can be written: "landmarks-1-0-2"."""
+    return "-" not in name and re.fullmatch(_ORDER, f"{name}-2") is not None
 
 
-def name_of_orders(name: str, count: int) -> str:
-    """Return the name of the group of all orders of agents, or of a field's items: "agents", "landmarks-3"."""
-    return name if name == "agents" else f"{name}-{count}"
+_PLANE = (0, "")
 
 
 def _rank(group: Group) -> tuple[int, str]:
     """Return where a group stands in a direct product: plane, agents, items of each field by name."""
-    if is_planar(group.name):
-        return 0, ""
-    return (1, "") if group.name == "agents" else (2, group.name.partition("-")[0])
+    moved = {name for element in group.generators() for name, _ in element.orders}
+    if not moved:
+        return _PLANE
+    return (1, "") if moved == {"agents"} else (2, min(moved))
 
 
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     """Read one item of the list: a tuple of elements, or a group that has to be sampled."""
     factors = [_factor(p.strip(), text, num_agents) for p in part.split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
-    if len(groups) == len(factors) and (len(groups) == 1 or not is_planar(groups[-1].name)):
+    if len(groups) == len(factors) and (len(groups) == 1 or _rank(groups[-1]) != _PLANE):
         group = parse_group(part, num_agents)
         return group.elements if isinstance(group, FiniteGroup) else group
     lists = []
@@ -124,8 +167,10 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
 def _factor(word: str, text: str, num_agents: int) -> Element | Group:
     """Read one word: an element or a group."""
     for read in READERS:
-        if (found := read(word, num_agents)) is not None:
+        if (found := read(word.lower(), num_agents)) is not None:
             return found
+    if (orders := _read_items(word)) is not None:
+        return orders
     where = f" in '{text}'" if word != text else ""
     raise ValueError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
 
@@ -149,24 +194,36 @@ def _read_agents(word: str, num_agents: int) -> Element | Group | None:
         return agent_permutations(num_agents)
     if not re.fullmatch(r"agents(-\d{1,4})+", word):
         return None
-    sigma = tuple(int(x) for x in word.split("-")[1:])
-    if sorted(sigma) != list(range(num_agents)):
-        order = "-".join(map(str, (*range(1, num_agents), 0)))
-        raise ValueError(
-            f"'{word}' is not an order of {num_agents} agents; write each place once, as in agents-{order}"
-        )
-    return PlaneElement(permutation=sigma)
+    return PlaneElement(permutation=_order(word, num_agents))
 
 
-def _read_items(word: str, _: int) -> Element | Group | None:
+READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents]
+"""What reads a word for N agents, or returns None; each kind of transform has its own."""
+
+
+def _read_items(word: str) -> Element | Group | None:
+    """Read an order of a field's items, or all orders; fields keep their capitals, and come after all other words."""
     if not (match := re.fullmatch(_ORDER, word)):
         return None
-    name, numbers = match[1], tuple(int(x) for x in match[2].split("-")[1:])
-    return item_orders(name, *numbers) if len(numbers) == 1 else PlaneElement(items=((name, numbers),))
+    count = match[2].count("-")
+    if count > 1:
+        return PlaneElement(items=((match[1], _order(word, count)),))
+    items = int(match[2][1:])
+    return item_orders(match[1], items) if 2 <= items <= MOST_ITEMS else None
 
 
-READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents, _read_items]
-"""What reads a word for N agents, or returns None; each kind of transform has its own."""
+def _order(word: str, count: int) -> tuple[int, ...]:
+    """Read the place that each of some things moves to: "agents-1-0-2".
+
+    Raises:
+        ValueError: it is no order of so many.
+    """
+    name, *numbers = word.split("-")
+    places = tuple(map(int, numbers))
+    if sorted(places) != list(range(count)):
+        example = "-".join(map(str, (name, *range(1, count), 0)))
+        raise ValueError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
+    return places
 
 
 def _polygon(letter: str, n: int) -> FiniteGroup:

@@ -162,7 +162,9 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
         ValueError: some action's image is no action.
     """
     points = np.array(action.points, dtype=np.float64)
-    images = np.einsum("gvw,jw->gjv", block_matrix(Field("action", action.kind), elements), points)
+    images = np.einsum(
+        "gvw,jw->gjv", block_matrix(Field("action", action.kind), [e.in_place for e in elements]), points
+    )
     same = np.abs(points[:, None, :] - points).max(axis=-1) <= _MATCH_TOLERANCE
     place = np.tril(same, -1).sum(axis=1)  # among the actions of its meaning
     distance = np.abs(images[:, :, None, :] - points).max(axis=-1)

@@ -168,6 +168,9 @@ def build_transform(
     if not elements:
         raise ValueError("a transform needs one element per seed, got none")
     chosen, num_agents = tuple(elements), spaces.num_agents
+    seen = spaces.observation.slices()
+    if missing := [name for element in chosen for name, _ in element.items if name not in seen]:
+        raise ValueError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {', '.join(seen)}")
     places = places_of(chosen, num_agents)
     index: Tensor | None = None
     if isinstance(spaces.action, Discrete):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.checking import Transitions, collect, measured
+from esp_cli.checking import Transitions, check_symmetry, collect, measured
 from esp_cli.checking.discovery import (
     accepted_of,
     discover_in_task,
@@ -23,7 +23,7 @@ from esp_cli.checking.measured import prepared
 from esp_cli.checking.paired import _verdict
 from esp_cli.checking.regression import check_by_regression
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
-from esp_cli.symmetry import parse_elements
+from esp_cli.symmetry import parse_elements, transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
@@ -65,6 +65,8 @@ def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> 
     found = discovered(task, settings, robots)
     assert (found.method, found.group) == ("paired states", group)
     assert bool(found.transforms) == (group != "c1")
+    if found.transforms:
+        assert transform_set(f"discovered:{found.transforms}", make(task, 1, [0], settings).spec).names
 
 
 @pytest.mark.slow
@@ -149,7 +151,7 @@ def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
         ("d4,agents-1-0-2,agents-0-2-1,agents-2-1-0", "d4*agents", "d4*agents"),
         ("flip-x,agents-1-0-2", "flip-x and agents-1-0-2", "flip-x,agents-1-0-2"),
         ("d4,marks-1-0-2,marks-0-2-1", "d4*marks-3", "d4*marks-3"),
-        ("d4,marks-1-0-2,agents-0-2-1", "d4 and marks-1-0-2,agents-0-2-1", "d4,marks-1-0-2,agents-0-2-1"),
+        ("d4,marks-1-0-2,agents-0-2-1", "d4 and agents-0-2-1,marks-1-0-2", "d4,agents-0-2-1,marks-1-0-2"),
         ("d16,rot57,flip23,marks-1-0-2", "o2 and marks-1-0-2", "o2"),
         ("marks-1-0-2,marks-0-2-1", "c1*marks-3", "marks-3"),
         ("agents-1-0-2,agents-2-1-0", "c1*agents", "agents"),
@@ -169,6 +171,11 @@ def test_accepted_elements_close_to_the_largest_group(accepted: str, group: str,
         parse_elements(text, 3)
 
 
+def test_what_is_found_is_complete_in_whatever_order_fields_stand() -> None:
+    found = parse_elements("d4,obstacles-1-0,marks-1-0,agents-1-0", 2)
+    assert named(found, found) == ("d4*agents*marks-2*obstacles-2",) * 2
+
+
 def recorded(folder: Path, **changes: object) -> Path:
     """Write transitions of navigation with forces, some of them changed."""
     env = make("navigation", 128, [0], {"actions": "continuous", "wind": 0.3})
@@ -183,7 +190,7 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
     path, out = recorded(tmp_path), tmp_path / "found.json"
     shown = esp("discover", path, "--task", "navigation", "--set", "task.actions=continuous", "--json", out)
     assert "found flip-x*agents" in shown.stdout
-    assert "--transforms flip-x*agents" in shown.stderr
+    assert "--transforms discovered:flip-x*agents" in shown.stderr
     assert json.loads(out.read_text())["group"] == "flip-x*agents", "so few episodes do not show the landmarks' orders"
     spec = make("navigation", 1, [0], FORCES).spec
     data = read_transitions(path, spec)
@@ -278,6 +285,43 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
     assert learner.prior.transforms.names == ("flip-x",)
     with pytest.raises(ValueError, match="45 degrees"):
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:rot45"}))
+
+
+@pytest.mark.slow
+def test_what_is_weighed_is_listed() -> None:
+    """Four agents and four landmarks under d4 are 4608 elements, too many to weigh: landmarks stay then."""
+    settings = {"task.num_agents": 4, "prior.transforms": "discovered", "prior.trust": "measured"}
+    prior = prepared(resolve_config("navigation", overrides=settings)).prior
+    assert prior.transforms == "discovered:d4*agents"
+    assert len(prior.weights) == 8 * 24 - 1
+
+
+@pytest.mark.parametrize(("settings", "outcome"), [({}, "holds"), ({"num_landmarks": 2}, "broken")])
+def test_declared_orders_of_landmarks_are_checked(settings, outcome, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a false declaration: two landmarks of which the first counts twice."""
+
+    def worlds(num_envs, seeds):
+        env = make("navigation", num_envs, seeds, settings)
+        env.spec = replace(env.spec, symmetry=f"d4*agents*landmarks-{settings.get('num_landmarks', 3)}")
+        if outcome == "broken":
+            step = env.step
+            monkeypatch.setattr(env, "step", lambda action: weighted(step(action), env.spec))
+        return env
+
+    def weighted(step, spec):
+        return replace(step, reward=step.reward + step.next.obs[..., spec.observation.slices()["landmarks"].start])
+
+    report = check_symmetry(worlds)
+    found = [one for one in report.elements if one.element.startswith("landmarks-")]
+    assert len(found) == 2 if outcome == "holds" else found
+    assert {(one.declared, one.outcome) for one in found} == {(True, outcome)}
+    assert ("landmarks-" in report.found) == (outcome == "holds")
+
+
+def test_an_unknown_field_is_refused() -> None:
+    sentence = "navigation has no field 'islands' whose items change places, but velocity, position, landmarks, others"
+    assert sentence in refused("discover", "navigation", "--transforms", "islands-1-0")
+    assert sentence in refused("check", "symmetry", "navigation", "--transforms", "islands-1-0")
 
 
 def test_where_nothing_is_found_there_is_no_prior() -> None:

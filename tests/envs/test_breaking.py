@@ -80,6 +80,7 @@ def test_what_several_breakings_leave() -> None:
     assert remaining("d4*agents", [Breaking("wind", 0, "flip-x")]) == "d4*agents"
     assert remaining("o2*agents", [wind, mud]) == "flip-x*agents"
     assert remaining("d4*agents", [wind, gust, weak]) == "c1"
+    assert remaining("d4*agents*landmarks-3", [wind, weak]) == "flip-x*landmarks-3"
     assert remaining("d4", [weak]) == "d4"
     assert described([wind, Breaking("mud", 0.0, "flip-x")]) == ", wind 1"
 

@@ -52,6 +52,19 @@ def test_a_state_is_all_observations_end_to_end_unless_it_says_otherwise() -> No
     assert other.augment(obs, action, state=torch.tensor([[1.0, 0.0]] * 4))[2][4:].tolist() == [[0, 1]] * 4
 
 
+def test_like_items_change_places_in_observation_and_state() -> None:
+    marks = layout(Field("marks", Kind.SCALAR, 2))
+    row, action = torch.tensor([[3.0, 4.0]]), torch.tensor([0])
+    for state in (None, layout(Field("goal", Kind.SCALAR), *marks.fields)):
+        symmetry = Symmetry(observation=marks, action=MOVES, group="marks-2", state=state)
+        seen = row if state is None else torch.tensor([[9.0, 3.0, 4.0]])
+        obs, _, moved, () = symmetry.augment(row, action, state=seen)
+        assert obs.tolist() == [[3.0, 4.0], [4.0, 3.0]]
+        assert moved[1].tolist() == ([4.0, 3.0] if state is None else [9.0, 4.0, 3.0])
+    with pytest.raises(ValueError, match="it has no field 'islands', but marks"):
+        Symmetry(observation=marks, action=MOVES, group="islands-2")
+
+
 @pytest.mark.parametrize("lead", [(5,), (2, 5), (0,), (3, 2, 1)])
 @pytest.mark.parametrize("agents", [1, 3])
 def test_any_leading_axes_give_what_rows_give(lead: tuple[int, ...], agents: int) -> None:

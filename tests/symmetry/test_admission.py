@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 
 from esp_cli.symmetry import carried_groups, transform_set
-from esp_envs.spec import Field, Kind, layout
+from esp_cli.symmetry.admission import exchangeable
+from esp_envs.spec import Field, Items, Kind, Spaces, layout
 from tests.symmetry.toy_actions import FORCE, WHEEL_PAIRS
 
 UP_TO_D4 = ("c2", "d2", "c4", "d4")
@@ -63,7 +64,7 @@ def test_actions_that_cannot_follow_are_refused_in_one_sentence(make_spec) -> No
         ),
         ("landmarks-3", {"symmetry": "d4*landmarks-3"}, "field 'landmarks' has 2 items, not 3"),
         ("others-1-0", {}, "items of field 'others' cannot be exchanged: they are the agents'"),
-        ("islands-1-0", {}, "its observation has no field 'islands'"),
+        ("islands-1-0", {}, "it has no field 'islands', but velocity"),
     ],
 )
 def test_refusals(make_spec, text, changes, message) -> None:
@@ -102,8 +103,32 @@ def test_declared_orders_of_items_are_carried(make_spec) -> None:
 
 def test_what_is_discovered_may_order_items_that_are_not_declared(make_spec) -> None:
     assert transform_set("discovered:d4*landmarks-2", make_spec(symmetry="c1")).size == 15
-    with pytest.raises(ValueError, match="its observation has no field 'islands'"):
+    with pytest.raises(ValueError, match="it has no field 'islands', but velocity, battery, "):
         transform_set("discovered:islands-1-0", make_spec(symmetry="c1"))
+
+
+def test_a_state_without_the_items_is_refused(make_spec) -> None:
+    spec = replace(make_spec(symmetry="d4*landmarks-2"), state=layout(Field("goals", Kind.VECTOR, 2)))
+    with pytest.raises(ValueError, match="its state does not hold its landmarks"):
+        transform_set("landmarks-1-0", spec)
+    with pytest.raises(ValueError, match="does not say that its landmarks may"):
+        transform_set("discovered:landmarks-1-0", spec)
+
+
+def test_fields_whose_items_may_change_places() -> None:
+    """Two fields of all: the others are one item, too many, the agents', pictures, or have a name that is no word."""
+    observation = layout(
+        Field("Marks", Kind.VECTOR, 3),
+        Field("cars_2", Kind.SCALAR, 2),
+        Field("own", Kind.VECTOR),
+        Field("crowd", Kind.SCALAR, 7),
+        Field("others", Kind.SCALAR, 2, items=Items.OTHERS),
+        Field("shades", Kind.PICTURE, 2, pixels=(3, 3)),
+        *(Field(name, Kind.SCALAR, 2) for name in ("agents", "rot", "my marks", "cube.place", "marks-2")),
+    )
+    spaces = Spaces(num_agents=3, observation=observation, state=observation, action=FORCE, symmetry="c1")
+    assert exchangeable(spaces) == {"Marks": 3, "cars_2": 2}
+    assert transform_set("discovered:Marks-1-0-2", spaces).names == ("Marks-1-0-2",)
 
 
 def test_a_ring_carries_the_turns_between_its_rays(make_spec) -> None:

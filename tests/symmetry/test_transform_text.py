@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from esp_cli.symmetry import FiniteGroup, Group, dihedral, parse_elements, parse_group
+from esp_cli.symmetry import FiniteGroup, Group, dihedral, mirror, parse, parse_elements, parse_group
+from esp_cli.symmetry.parse import Factors
 
 
 def names(text: str, num_agents: int = 3) -> list[str]:
@@ -73,6 +74,10 @@ def test_parse_group() -> None:
         ("agents-0-1", "not an order of 3 agents"),
         ("agents-0-0-1", "not an order of 3 agents"),
         ("agents*agents", "not a direct product"),
+        ("marks-3*marks-3", "not a direct product"),
+        ("marks-1-2-3", "'marks-1-2-3' is not an order of 3 marks; write each place once, as in marks-1-2-0"),
+        ("marks-7", "unknown transform 'marks-7'"),
+        ("rto-90", "unknown transform 'rto-90'"),
         ("d100*d100", "40000 products"),
     ],
 )
@@ -86,3 +91,23 @@ def test_refusals(text: str, message: str) -> None:
 def test_what_is_no_group(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a group|not a direct product"):
         parse_group(text, 3)
+
+
+def test_factors_of_a_product_may_stand_in_any_order_behind_the_plane() -> None:
+    names = {group: {e.name for e in parse_elements(group, 2)} for group in ("d4*cars-2*agents", "d4*agents*cars-2")}
+    assert len(set(map(frozenset, names.values()))) == 1
+    assert parse_group("d4*marks-3*agents*Cars-2", 2).name == "d4*agents*Cars-2*marks-3"
+
+
+def test_what_a_symmetry_moves() -> None:
+    factors = Factors.of("d4 * agents*Marks-3*cars-2")
+    assert (factors.plane, factors.agents, factors.items) == ("d4", True, {"Marks": 3, "cars": 2})
+    assert (factors.order("agents", 5), factors.order("Marks", 3), factors.order("cars", 3)) == (True, True, False)
+    assert Factors.of("flip-y") == Factors("flip-y", False, {})
+    with pytest.raises(ValueError, match="'marks-1-0' is one order of items; declare all of them, as in marks-2"):
+        Factors.of("d4*marks-1-0")
+
+
+def test_a_reader_of_ones_own_comes_before_fields(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parse, "READERS", [*parse.READERS, lambda word, _: mirror() if word == "hex-6" else None])
+    assert parse_elements("hex-6", 1) == (mirror(),)
