@@ -138,6 +138,13 @@ OwnNetworkOption = Annotated[
     list[str] | None,
     typer.Option("--network", help="Import this network of yours, which the run has.", metavar="MODULE:CLASS"),
 ]
+PresetOption = Annotated[
+    str,
+    typer.Option(
+        "--preset",
+        help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
+    ),
+]
 StepsOption = Annotated[
     int,
     typer.Option(

@@ -17,6 +17,7 @@ from esp_cli.commands.options import (
     DeviceOption,
     EpisodesOption,
     JsonOption,
+    PresetOption,
     SeedListOption,
     SeedsOption,
     SetOption,
@@ -54,13 +55,6 @@ StudyStepsOption = Annotated[
 ]
 StudyOutOption = Annotated[
     Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.", metavar="DIR")
-]
-PresetOption = Annotated[
-    str,
-    typer.Option(
-        "--preset",
-        help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
-    ),
 ]
 JobsOption = Annotated[
     int | None,

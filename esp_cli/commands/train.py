@@ -16,6 +16,7 @@ from esp_cli.commands.options import (
     AlgoOption,
     DeviceOption,
     PhysicsOption,
+    PresetOption,
     SeedListOption,
     SeedsOption,
     SetOption,
@@ -48,13 +49,7 @@ def train(
     context: typer.Context,
     task: TaskOption = "navigation",
     algo: AlgoOption = "mappo",
-    preset: Annotated[
-        str,
-        typer.Option(
-            "--preset",
-            help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
-        ),
-    ] = "default",
+    preset: PresetOption = "default",
     prior: Annotated[
         Literal["esp", "auto", "augment", "consistency", "none"] | None,
         typer.Option(
