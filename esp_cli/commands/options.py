@@ -74,6 +74,11 @@ def check_finite(option: str, *values: float) -> None:
             raise ValueError(f"{option} {value} is not a finite number; write for example {option} -125")
 
 
+def was_given(context: typer.Context, name: str | None) -> bool:
+    """Return whether the command line names the option of a parameter."""
+    return getattr(context.get_parameter_source(str(name)), "name", "") == "COMMANDLINE"
+
+
 def register_tasks(names: Iterable[str] | None) -> None:
     """Admit the tasks that this command line names as module:Class; a name of any other form needs nothing.
 

@@ -26,6 +26,7 @@ from esp_cli.commands.options import (
     parse_assignments,
     register_learners,
     register_tasks,
+    was_given,
 )
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.train_choices import with_file
@@ -161,7 +162,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
         parameter.opts[0]
         for parameter in context.command.params
         if parameter.name not in ("resume", "track", "tensorboard", *allowed)
-        and getattr(context.get_parameter_source(str(parameter.name)), "name", "") == "COMMANDLINE"
+        and was_given(context, parameter.name)
     ]
     if given:
         raise ValueError(

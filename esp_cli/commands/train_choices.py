@@ -8,7 +8,7 @@ from typing import Any, get_args
 import typer
 
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
-from esp_cli.commands.options import Device
+from esp_cli.commands.options import Device, was_given
 
 _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""
@@ -32,8 +32,8 @@ def with_file(
     from esp_cli.training.config_file import read_config_file
 
     file = read_config_file(path)
-    said = {name for name in given if _was_given(context, _PARAMETERS.get(name, name))}
-    said |= {"seeds"} if _was_given(context, "seed_list") else set()
+    said = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
+    said |= {"seeds"} if was_given(context, "seed_list") else set()
     if file.is_complete:
         for name in ("task", "algorithm", "preset"):
             if name in said and given[name] != file.choices[name]:
@@ -47,10 +47,6 @@ def with_file(
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
     return given | filled, kept | settings
-
-
-def _was_given(context: typer.Context, name: str) -> bool:
-    return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
 
 
 def _read(path: Path, name: str, value: Any) -> Any:
