@@ -6,11 +6,11 @@ All of it comes from files, so that an answer needs neither torch nor a task.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import typer
 
+from esp_cli.commands.options import installed_tasks
 from esp_cli.settings_index import read_index
 
 _SHARED = ("prior", "evaluation")
@@ -18,8 +18,7 @@ _SHARED = ("prior", "evaluation")
 
 def tasks(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the tasks, those of other packages included."""
-    installed = [entry.name for entry in entry_points(group="esp.tasks")]
-    return _starting(incomplete, [*_names("task"), *installed])
+    return _starting(incomplete, [*_names("task"), *installed_tasks()])
 
 
 def algorithms(_: typer.Context, incomplete: str) -> list[str]:

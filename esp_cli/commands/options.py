@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
@@ -77,6 +78,11 @@ def check_finite(option: str, *values: float) -> None:
 def was_given(context: typer.Context, name: str | None) -> bool:
     """Return whether the command line names the option of a parameter."""
     return getattr(context.get_parameter_source(str(name)), "name", "") == "COMMANDLINE"
+
+
+def installed_tasks() -> list[str]:
+    """Return the names of the tasks that other packages install; none is imported."""
+    return [entry.name for entry in entry_points(group="esp.tasks")]
 
 
 def register_tasks(names: Iterable[str] | None) -> None:

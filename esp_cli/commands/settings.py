@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption
+from esp_cli.commands.options import JsonOption, installed_tasks, register_tasks
 from esp_cli.settings_index import Section, Setting, read_index
 
 if TYPE_CHECKING:
@@ -51,8 +51,7 @@ def _sections(of: str | None) -> Sequence[Section]:
     found = [section for section in built_in if of in (None, section.name)]
     if of is None or found:
         return found
-    if ":" in of or of in _installed():
-        from esp_cli.commands.options import register_tasks
+    if ":" in of or of in installed_tasks():
         from esp_cli.training.settings import task_section
 
         register_tasks([of])
@@ -62,12 +61,6 @@ def _sections(of: str | None) -> Sequence[Section]:
     names = [section.name for section in built_in]
     hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
     raise ValueError(f"nothing with settings is called '{of}'{hint}")
-
-
-def _installed() -> set[str]:
-    from importlib.metadata import entry_points
-
-    return {entry.name for entry in entry_points(group="esp.tasks")}
 
 
 def _print(section: Section) -> None:

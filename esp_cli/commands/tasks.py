@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import json as json_text
-from importlib.metadata import entry_points
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, register_tasks
+from esp_cli.commands.options import JsonOption, installed_tasks, register_tasks
 
 CARDS = Path(__file__).with_name("task_cards.json")
 """What `describe` returns for the built-in tasks: the command imports no torch. docs/make_task_cards.py writes it."""
@@ -27,7 +26,7 @@ def tasks(
 ) -> None:
     """List the tasks with their symmetries, or print the card of one task."""
     built_in = json_text.loads(CARDS.read_text(encoding="utf-8"))
-    names = [task] if task else list(dict.fromkeys((*built_in, *(e.name for e in entry_points(group="esp.tasks")))))
+    names = [task] if task else list(dict.fromkeys((*built_in, *installed_tasks())))
     found = [built_in[name] if name in built_in else describe(name) for name in names]
     shown = [{key: value for key, value in card.items() if key != "card"} for card in found]
     if json != "-":

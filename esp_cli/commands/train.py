@@ -161,8 +161,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", "tensorboard", *allowed)
-        and was_given(context, parameter.name)
+        if parameter.name not in ("resume", "track", "tensorboard", *allowed) and was_given(context, parameter.name)
     ]
     if given:
         raise ValueError(
