@@ -202,18 +202,27 @@ def compiler() -> str | None:
     return shutil.which("cc")
 
 
+def compiled(*files: Path) -> ctypes.CDLL:
+    """Compile written C sources into a library beside the first, with every warning an error.
+
+    Raises:
+        RuntimeError: they do not compile, which is a bug.
+    """
+    shared = files[0].with_suffix(".so")
+    command = [compiler() or "cc", *FLAGS, "-shared", "-fPIC", *map(str, files), "-o", str(shared), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"the exported C does not compile; this is a bug\n{done.stderr}")
+    return ctypes.CDLL(str(shared))
+
+
 def c_runner(file: Path, program: Program) -> Runner:
-    """Compile a written C source with every warning an error, and call it row by row.
+    """Compile a written C source and call it row by row.
 
     Raises:
         RuntimeError: it does not compile, which is a bug.
     """
-    shared = file.with_suffix(".so")
-    command = [compiler() or "cc", *FLAGS, "-shared", "-fPIC", str(file), "-o", str(shared), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"the exported C does not compile; this is a bug\n{done.stderr}")
-    code = ctypes.CDLL(str(shared))
+    code = compiled(file)
     pointer = ctypes.POINTER(ctypes.c_float)
     code.esp_policy_outputs.restype = pointer
     choose, team = program.head == "choose", program.team

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import subprocess
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from esp_cli.deploy import check
-from esp_cli.deploy.c_source import FLAGS
+from esp_cli.deploy.check import compiled
 from esp_cli.deploy.layers import Floats
 from esp_cli.deploy.ros2_package import ROS2_PACKAGE, package_files
 from esp_cli.deploy.runtime.esp_epuck import Pilot
@@ -114,12 +112,12 @@ def python_observer(description: Mapping[str, Any]) -> Callable[[Floats, Floats,
 
 
 def c_observer(folder: Path, width: int) -> Callable[[Floats, Floats, Floats], Floats]:
-    """Compile esp_epuck.c and policy.c with every warning an error, and return what they do, robot by robot.
+    """Compile esp_epuck.c and policy.c, and return what they do, robot by robot.
 
     Raises:
         RuntimeError: it does not compile, or refuses a state; either is a bug.
     """
-    code = compiled(folder)
+    code = compiled(folder / "esp_epuck.c", folder / "policy.c")
 
     def observe(poses: Floats, goals: Floats, pillars: Floats) -> Floats:
         seen = np.empty((len(poses), width), np.float32)
@@ -131,21 +129,6 @@ def c_observer(folder: Path, width: int) -> Callable[[Floats, Floats, Floats], F
         return seen
 
     return observe
-
-
-def compiled(folder: Path) -> ctypes.CDLL:
-    """Compile esp_epuck.c and policy.c into a library.
-
-    Raises:
-        RuntimeError: they do not compile, which is a bug.
-    """
-    shared = folder / "esp_epuck.so"
-    files = [str(folder / name) for name in ("esp_epuck.c", "policy.c")]
-    command = [check.compiler() or "cc", *FLAGS, "-shared", "-fPIC", *files, "-o", str(shared), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise RuntimeError(f"the exported C does not compile; this is a bug\n{done.stderr}")
-    return ctypes.CDLL(str(shared))
 
 
 def _pointer(array: Floats) -> Any:

@@ -144,7 +144,7 @@ def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     spec = importlib.util.spec_from_file_location("exported_for_c", folder / "policy.py")
     policy = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(policy)
-    return epuck.compiled(folder), Pilot(policy.DESCRIPTION, policy.act)
+    return check.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
 
 
 def driven(code: ctypes.CDLL, own: int, poses=TEAM, goals=GOALS, pillars=PILLARS, age_s=0.1, robots=3):
