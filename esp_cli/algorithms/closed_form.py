@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
 
 if TYPE_CHECKING:
+    from esp_cli.algorithms.mappo_config import MappoConfig
     from esp_cli.prior import PriorConfig
 
 
@@ -48,23 +49,7 @@ class Weights:
     stop_gradient: str
 
 
-class Settings(Protocol):
-    """What a learner's hyperparameters say of its losses."""
-
-    @property
-    def clip_epsilon(self) -> float:
-        """See `Weights`."""
-
-    @property
-    def huber_delta(self) -> float:
-        """See `Weights`."""
-
-    @property
-    def value_coef(self) -> float:
-        """See `Weights`."""
-
-
-def weights_of(config: Settings, entropy_coef: float, prior: PriorConfig, augments: bool) -> Weights:
+def weights_of(config: MappoConfig, entropy_coef: float, prior: PriorConfig, augments: bool) -> Weights:
     """Return the weights of a learner with a prior, whose copies may enter the learner's own loss."""
     return Weights(
         clip_epsilon=config.clip_epsilon,
