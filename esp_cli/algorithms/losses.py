@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from esp_cli.prior import mean_per_seed
+
 
 def gae(
     reward: Tensor,
@@ -75,10 +77,9 @@ def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = 
         valid: which numbers count, of the shape of x; all where it is None. The others become 0.
     """
     if valid is not None:
-        count = valid.flatten(1).sum(1).clamp_min(1).view(-1, *[1] * (x.dim() - 1))
-        total = torch.where(valid, x, 0.0).flatten(1).sum(1).view_as(count)
-        centred = torch.where(valid, x - total / count, 0.0)
-        variance = centred.square().flatten(1).sum(1).view_as(count) / count
+        per_seed = (-1, *[1] * (x.dim() - 1))
+        centred = torch.where(valid, x - mean_per_seed(x, valid).view(per_seed), 0.0)
+        variance = mean_per_seed(centred.square(), valid).view(per_seed)
         return centred / (variance.sqrt() + epsilon)
     axes = tuple(range(1, x.dim()))
     deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)

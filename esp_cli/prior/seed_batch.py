@@ -98,8 +98,8 @@ def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
     """
     if mask is None:
         return x.flatten(1).mean(1)
-    if mask.dim() > 3:
-        mask = mask if x.shape[-1] == mask.shape[-1] else mask.any(-1, keepdim=True)
-        return torch.where(mask, x, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
-    rows = x.flatten(3).mean(3) if x.dim() > 3 else x
-    return torch.where(mask, rows, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+    if mask.dim() > 3 and x.shape[-1] != mask.shape[-1]:
+        mask = mask.any(-1, keepdim=True)
+    elif x.dim() > mask.dim():
+        x = x.flatten(mask.dim()).mean(-1)
+    return torch.where(mask, x, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
