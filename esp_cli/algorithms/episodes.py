@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from esp_cli.algorithms.learner import below
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.algorithms.rollout import stacked
 from esp_cli.networks.policy import HistoryPolicy
@@ -76,4 +77,4 @@ class EpisodeCollector:
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
-        self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
+        self.env.load_state_dict(below(tensors, "env"))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from esp_cli.algorithms.learner import below
 from esp_cli.networks.critic import Critic
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import SeedBatch
@@ -160,7 +161,7 @@ class Collector:
         alive = tensors["alive"].to(self.env.device) if self.env.spec.agents_end else None
         self.observation = Observation(own["obs"], own["state"], mask, alive)
         self.memory, self.episode_return = own["memory"], own["episode_return"]
-        self.env.load_state_dict({k.removeprefix("env."): v for k, v in tensors.items() if k.startswith("env.")})
+        self.env.load_state_dict(below(tensors, "env"))
 
 
 def stacked(flags: Sequence[Tensor | None]) -> Tensor | None:

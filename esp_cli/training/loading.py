@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from torch import Tensor
 
 from esp_cli import __version__
+from esp_cli.algorithms.learner import below
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence, validate
 from esp_cli.networks.plain import PlainConfig
@@ -105,9 +106,8 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
     if found is None:
         raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
     tensors, meta = found
-    own = {name.removeprefix("policy."): t for name, t in tensors.items() if name.startswith("policy.")}
     notes = tuple(str(warning.message) for warning in caught)
-    return _build(path, parse_config(folder.config, path), own, meta, notes)
+    return _build(path, parse_config(folder.config, path), below(tensors, "policy"), meta, notes)
 
 
 def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:
