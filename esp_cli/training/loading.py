@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from esp_cli.networks.policy import Policy
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed, resolve_task_settings
 from esp_cli.training.policy_file import read_policy
-from esp_cli.training.run_folder import CheckpointWarning, RunFolder
+from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators
 from esp_envs.registry import task_class
 from esp_envs.spec import TaskSpec
@@ -100,14 +99,12 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
         writer = meta.get("esp_version", __version__)
         return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
     folder = RunFolder.open(path)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CheckpointWarning)
-        found = folder.latest_checkpoint()
+    notes: list[str] = []
+    found = folder.latest_checkpoint(notes.append)
     if found is None:
         raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
     tensors, meta = found
-    notes = tuple(str(warning.message) for warning in caught)
-    return _build(path, parse_config(folder.config, path), below(tensors, "policy"), meta, notes)
+    return _build(path, parse_config(folder.config, path), below(tensors, "policy"), meta, tuple(notes))
 
 
 def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:

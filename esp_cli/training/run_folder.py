@@ -18,8 +18,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -41,10 +40,6 @@ from esp_cli.training.policy_file import write_policy
 
 class RunFolderError(ValueError):
     """A run folder cannot be made, opened or locked; the text is one sentence for the user."""
-
-
-class CheckpointWarning(UserWarning):
-    """A damaged checkpoint was passed over for an older one; the text is one sentence for the user."""
 
 
 RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolderError)
@@ -228,10 +223,11 @@ class RunFolder:
         self._remove_superseded()
         return self.policy_path
 
-    def latest_checkpoint(self) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         """Load the newest good checkpoint.
 
-        Passing over a damaged one gives a CheckpointWarning.
+        Args:
+            note: told, in a sentence for the user, of a damaged one that is passed over.
 
         Returns:
             Its tensors, on the CPU, and its description, with ``step``; None where the run has written none yet.
@@ -249,7 +245,7 @@ class RunFolder:
                 problem = problem or str(error)
                 continue
             if problem:
-                warnings.warn(f"{problem}; going back to step {step_of(file)}", CheckpointWarning, stacklevel=2)
+                note(f"{problem}; going back to step {step_of(file)}")
             return tensors, meta
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +23,7 @@ from esp_cli.training.initial import read_initial
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.play import PolicyController, play
 from esp_cli.training.policy_file import describe_policy
-from esp_cli.training.run_folder import CheckpointWarning, RunFolder
+from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 
 
@@ -244,10 +243,7 @@ class Trainer:
 
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start from the beginning."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CheckpointWarning)
-            found = self.folder.latest_checkpoint()
-        self.notes += [str(warning.message) for warning in caught]
+        found = self.folder.latest_checkpoint(self.notes.append)
         if found is not None:
             tensors, meta = found
             self._load(tensors)

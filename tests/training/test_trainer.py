@@ -41,7 +41,7 @@ def stop_after(iterations):
 
 
 def final_state(folder):
-    tensors, meta = folder.latest_checkpoint()
+    tensors, meta = folder.latest_checkpoint(pytest.fail)
     return tensors, meta["iteration"]
 
 
@@ -156,7 +156,7 @@ def test_a_forged_checkpoint_with_a_valid_checksum_is_one_sentence(tmp_path, alg
     config = small_config(algorithm)
     folder = RunFolder.create(tmp_path / "run", config.model_dump(mode="json"))
     trainer(folder).run(stop_after(2))
-    tensors, meta = folder.latest_checkpoint()
+    tensors, meta = folder.latest_checkpoint(pytest.fail)
     kinds = {name.rsplit(".", 1)[0]: name for name in tensors if tensors[name].dim()}
     for name in kinds.values():  # one of every module, optimiser, generator and world
         changed = dict(tensors)
@@ -186,7 +186,7 @@ def test_a_forged_checkpoint_with_a_valid_checksum_is_one_sentence(tmp_path, alg
 def test_a_checkpoint_that_says_something_else_of_its_run_is_one_sentence(tmp_path, change, sentence):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(stop_after(2))
-    tensors, meta = folder.latest_checkpoint()
+    tensors, meta = folder.latest_checkpoint(pytest.fail)
     folder.write_checkpoint(meta.pop("step"), tensors, meta | change)
     with pytest.raises(ValueError, match=sentence):
         trainer(folder)
@@ -288,7 +288,7 @@ def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
 def test_a_checkpoint_that_does_not_say_where_its_run_stands_is_refused_in_one_sentence(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(stop_after(2))
-    tensors, meta = folder.latest_checkpoint()
+    tensors, meta = folder.latest_checkpoint(pytest.fail)
     folder.write_checkpoint(meta["step"] + 50, tensors, {"iteration": "many"})
     with pytest.raises(ValueError, match="does not say where its run stands"):
         trainer(folder)
