@@ -60,6 +60,16 @@ class Step:
     final: Observation | None
     metrics: dict[str, Tensor]
 
+    @property
+    def ended(self) -> Tensor:
+        """Which episodes ended in this step, [S, E] bool."""
+        return self.terminated | self.truncated
+
+    @property
+    def reached(self) -> Observation:
+        """What the step led to, before any reset."""
+        return self.next if self.final is None else self.final
+
 
 def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
     """Return an allowed action, each with the same probability.

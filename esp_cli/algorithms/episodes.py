@@ -49,13 +49,12 @@ class EpisodeCollector:
             memory = policy.remember(memory, action)
             step = env.step(head.to_environment(action))
             observation = step.next
-            after = step.next if step.final is None else step.final
-            seen.append(after)
+            seen.append(step.reached)
             actions.append(action)
             rewards.append(step.reward)
             terminated.append(step.terminated)
             valid.append(running)
-            running = running & ~(step.terminated | step.truncated)
+            running = running & ~step.ended
         reward, mask = torch.stack(rewards, 2), torch.stack(valid, 2)
         returns = torch.where(mask, reward.mean(-1), 0.0).sum(2).mean(1)
         shared = reward[..., :1] if env.spec.shared_reward else reward

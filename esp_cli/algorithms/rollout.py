@@ -98,11 +98,10 @@ class Collector:
             step = self.env.step(self.policy.head.to_environment(action))
             outputs.append(output)
             actions.append(action)
-            reward[:, :, t], terminated[:, :, t] = step.reward, step.terminated
-            ended[:, :, t] = step.terminated | step.truncated
+            reward[:, :, t], terminated[:, :, t], ended[:, :, t] = step.reward, step.terminated, step.ended
             if step.final is not None:
                 finals[t] = step.final
-            after = (step.final or step.next).alive
+            after = step.reached.alive
             gone.append(None if after is None else ~after)
             self._finish(step.reward, ended[:, :, t], step.final is not None)
             self.observation = step.next

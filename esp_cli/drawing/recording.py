@@ -82,7 +82,7 @@ def _play(controller: PolicyController, env: Environment, world: tuple[int, int]
     for _ in range(env.spec.horizon):
         step = env.step(controller.act(env, observation))
         observation = step.next
-        ended = bool((step.terminated | step.truncated)[world])
+        ended = bool(step.ended[world])
         if ended and step.final is not None:
             env.set_state(step.final.state)  # the world has reset itself; show how the episode ended
         scenes.append(env.scene(world))

@@ -197,7 +197,7 @@ def _played(env: Environment) -> tuple[Tensor, Tensor, Tensor]:
                 half = env.num_envs // 2
                 action[:, :half] = env.heuristic()[:, :half]
             step = env.step(action)
-            change = (step.final or step.next).obs - seen.obs
+            change = step.reached.obs - seen.obs
             rows.append((seen.obs, action, torch.cat([change, step.reward.unsqueeze(-1)], -1)))
             seen = step.next
         found.append(tuple(torch.stack(part, 2).flatten(0, 1) for part in zip(*rows, strict=True)))

@@ -103,7 +103,7 @@ def play(env: Environment, controller: Controller) -> Episodes:
         lengths += running
         for name, value in step.metrics.items():
             sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
-        running &= ~(step.terminated | step.truncated)
+        running &= ~step.ended
         observation = step.next
         if env.spec.terminates and not running.any():
             break

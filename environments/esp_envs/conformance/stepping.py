@@ -60,7 +60,7 @@ def _require_mask(env: Environment, mask: Tensor | None) -> None:
 
 
 def _require_ends(env: Environment, alive: Tensor | None, step: Step) -> None:
-    after = (step.final or step.next).alive
+    after = step.reached.alive
     if alive is None or after is None:
         require(alive is None and after is None, "'alive' is given in some observations only")
         require(not env.spec.agents_end, "the spec says 'agents_end', but observations have no 'alive'")
@@ -134,7 +134,7 @@ def episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest(subject: S
         require(not bool((step.terminated & step.truncated).any()), "a world is terminated and truncated at once")
         at_horizon = torch.equal(step.truncated, (age == env.spec.horizon) & ~step.terminated)
         require(at_horizon, "a world is truncated at another step than the horizon")
-        goes_on = ~(step.terminated | step.truncated)
+        goes_on = ~step.ended
         same = same_observation(step.final, step.next, (goes_on,))
         require(same, "'final' differs from 'next' in a world that goes on")
         age[~goes_on] = 0
