@@ -19,6 +19,7 @@ from esp_cli.reporting.summary import returns_of
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
+from esp_cli.training.folder_names import CONFIG, METRICS
 from esp_cli.training.metrics import MetricsError, read_last_row
 
 _DIGITS = 4
@@ -74,7 +75,7 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
     states = {}
     for cell in study.cells:
         run = folder.run_path(cell)
-        step = int(read_last_row(run / "metrics.jsonl").get("step", 0))
+        step = int(read_last_row(run / METRICS).get("step", 0))
         final = read_evaluation(run) if folder.is_trained(cell) else None
         states[cell.name] = RunState(step, _read_curve(run, cell, mode), final)
     results = results_of(study, states, mode, thresholds)
@@ -114,7 +115,7 @@ def results_of(study: Study, states: Mapping[str, RunState], mode: Mode, thresho
 
 def _read_curve(run: Path, cell: Cell, mode: Mode) -> RunCurve | None:
     """Read the evaluations of a cell's run; None where there are none yet."""
-    if not (run / "config.json").is_file():
+    if not (run / CONFIG).is_file():
         return None
     try:
         return read_curve(run, cell.variant, mode)

@@ -28,6 +28,7 @@ from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results
 from esp_cli.reporting.summary import floats, returns_of
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import KINDS
+from esp_cli.training.folder_names import POLICY
 from esp_cli.training.loading import load_policy
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
@@ -102,8 +103,8 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
         watch: told how many are done.
     """
     for count, run in enumerate(runs.values(), start=1):
-        if (run / "policy.safetensors").is_file() and not (run / FILM).is_file():
-            trained = load_policy(run / "policy.safetensors")
+        if (run / POLICY).is_file() and not (run / FILM).is_file():
+            trained = load_policy(run / POLICY)
             speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
             with TemporaryDirectory() as scratch:
                 film = Path(scratch) / FILM

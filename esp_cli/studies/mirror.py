@@ -13,8 +13,9 @@ from pathlib import Path
 
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import remove_file, replace_file, replacing
-from esp_cli.studies.worker import CHECKPOINTS, CHUNK_BYTES, LOG, METRICS, WHOLE_FILES, News
+from esp_cli.studies.worker import CHUNK_BYTES, WHOLE_FILES, News
 from esp_cli.training.checkpoint_names import FILE_NAME, step_of, superseded
+from esp_cli.training.folder_names import CHECKPOINTS, FINAL, LOG, METRICS
 
 Stamp = tuple[int, int]
 
@@ -91,7 +92,7 @@ class Mirror:
         Raises:
             OSError: the disk here is full, or the like.
         """
-        if name == WHOLE_FILES[-1]:
+        if name == FINAL:
             replace_file(self.path / name, _renamed(b"".join(_parts(stamp[0], read)), remote, str(self.path)))
         else:
             self._path(name).parent.mkdir(exist_ok=True)

@@ -15,6 +15,7 @@ from esp_cli.files.failures import sentence
 from esp_cli.files.writing import remove_file
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.study import Cell, StudyFolder
+from esp_cli.training.folder_names import METRICS
 from esp_cli.training.locking import is_held
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
@@ -56,7 +57,7 @@ class Run:
 
     def look(self, folder: StudyFolder) -> None:
         """Read from its folder how far the run is; rows past its last checkpoint may go when it is resumed."""
-        row = read_last_row(folder.run_path(self.cell) / "metrics.jsonl")
+        row = read_last_row(folder.run_path(self.cell) / METRICS)
         self.step = min(int(row.get("step", 0)), self.cell.config.steps)
         elapsed = row.get("time/elapsed_s")
         if isinstance(elapsed, int | float):

@@ -29,13 +29,14 @@ from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
+from esp_cli.training.folder_names import CONFIG, FINAL, LOG, POLICY
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
-_STUDY, _RUNS, _LOCK, _LOG = "study.json", "runs", "study.lock", "log.txt"
+_STUDY, _RUNS, _LOCK = "study.json", "runs", "study.lock"
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-_FINAL, _OLD_FINAL = "final-evaluation.json", "judgement.json"
+_OLD_FINAL = "judgement.json"
 
 
 class StudyError(ValueError):
@@ -194,11 +195,11 @@ class StudyFolder:
 
     def log_path(self, cell: Cell) -> Path:
         """Return the file that the processes of a cell write to."""
-        return self.run_path(cell) / _LOG
+        return self.run_path(cell) / LOG
 
     def evaluation_path(self, cell: Cell) -> Path:
         """Return the file that the final evaluation of a cell's trained policy is written to."""
-        return self.run_path(cell) / _FINAL
+        return self.run_path(cell) / FINAL
 
     def prepare(self, cell: Cell) -> RunFolder:
         """Make the run folder of a cell, or open the one that is there.
@@ -207,7 +208,7 @@ class StudyFolder:
             ValueError: what is there is damaged or another run.
         """
         path, wanted = self.run_path(cell), cell.config.model_dump(mode="json")
-        if not (path / "config.json").exists():
+        if not (path / CONFIG).exists():
             return RunFolder.create(path, wanted)
         folder = RunFolder.open(path)
         if parse_config(folder.config, path) != cell.config:
@@ -239,13 +240,13 @@ class StudyFolder:
         part = self.path / _RUNS / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part)
-        with os.fdopen(open_own(part / _LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:
+        with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:
             log.write(f"taken over from {twin}\n")
         part.rename(self.run_path(cell))
 
     def is_trained(self, cell: Cell) -> bool:
         """Return whether a cell's training is done; the policy file is the last that a run writes."""
-        return (self.run_path(cell) / "policy.safetensors").is_file()
+        return (self.run_path(cell) / POLICY).is_file()
 
     def is_finished(self, cell: Cell) -> bool:
         """Return whether nothing is left to do for a cell."""
@@ -254,7 +255,7 @@ class StudyFolder:
 
 def read_evaluation(run: Path) -> FinalEvaluation | None:
     """Read the final evaluation of the trained policy in a run folder; None where there is none, or half of one."""
-    for name in (_FINAL, _OLD_FINAL):
+    for name in (FINAL, _OLD_FINAL):
         with contextlib.suppress(OSError, ValueError):
             text = read_regular(run / name, MAX_DOCUMENT_BYTES) or b""
             return validate(FinalEvaluation, parse_object(text, "text"))

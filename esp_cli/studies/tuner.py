@@ -19,6 +19,7 @@ from esp_cli.studies.engine import Engine
 from esp_cli.studies.scheduler import Run, Scheduler
 from esp_cli.studies.tuning import REDUCTION, RUNGS, Point, TuningFolder, score
 from esp_cli.studies.tuning_space import space_of
+from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
@@ -129,7 +130,7 @@ class Trials:
         trials = self.studies[prior].get_trials(deepcopy=False)
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         best = max(done, key=lambda t: (t.value, -t.number), default=None)
-        runs = [self.folder.path / "trials" / f"{prior}-{t.number:03d}" / "metrics.jsonl" for t in trials]
+        runs = [self.folder.path / "trials" / f"{prior}-{t.number:03d}" / METRICS for t in trials]
         rows = [read_last_row(run) for run in runs]
         seeds = len(self.tuning.trial_seeds)
         return Outcome(

@@ -16,6 +16,7 @@ from esp_cli.formatting import file_name, format_count
 from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import MetricsError, column, read_metrics
 
 Goal = Literal["return", "steps", "seconds"]
@@ -162,7 +163,7 @@ class TuningFolder(StudyFolder):
     def curve(self, cell: Cell) -> list[Point]:
         """Return the evaluations of a trial; none before it has begun."""
         try:
-            rows = [row for row in read_metrics(self.run_path(cell) / "metrics.jsonl") if "eval/return_greedy" in row]
+            rows = [row for row in read_metrics(self.run_path(cell) / METRICS) if "eval/return_greedy" in row]
             steps, returns = column(rows, "eval/return_greedy")
         except MetricsError:
             return []

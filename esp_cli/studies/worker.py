@@ -20,6 +20,7 @@ from typing import TypedDict
 from esp_cli.studies.engine_local import APPLICATION, LocalEngine, LocalJob
 from esp_cli.studies.versions import versions
 from esp_cli.training.checkpoint_names import FILE_NAME
+from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, FINAL, LOCK, LOG, METRICS, POLICY
 from esp_cli.training.locking import acquire, is_held
 
 CHUNK_BYTES = 8 * 2**20
@@ -28,8 +29,7 @@ LEASE_S = 60.0
 """Seconds without a call after which a worker ends itself."""
 SILENCE_S = 10.0
 """Seconds without a call after which another driver may take the lease over."""
-LOG, METRICS, CHECKPOINTS = "log.txt", "metrics.jsonl", "checkpoints"
-WHOLE_FILES = ("config.json", "policy.safetensors", "final-evaluation.json")
+WHOLE_FILES = (CONFIG, POLICY, FINAL)
 """Files of a run folder that are written once, beside its checkpoints."""
 _PREFIX, _LOCK = "esp-cell-", "worker.lock"
 
@@ -236,10 +236,5 @@ def _remove_abandoned(root: Path) -> None:
         except OSError:
             continue
         old = time.time() - status.st_mtime > LEASE_S  # a newer one may be about to be locked
-        if (
-            old
-            and status.st_uid == os.getuid()
-            and not is_held(folder / _LOCK)
-            and not is_held(folder / "run" / "run.lock")
-        ):
+        if old and status.st_uid == os.getuid() and not is_held(folder / _LOCK) and not is_held(folder / "run" / LOCK):
             shutil.rmtree(folder, ignore_errors=True)

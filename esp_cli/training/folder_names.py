@@ -8,6 +8,8 @@ from esp_cli.files.writing import TEMPORARY_PREFIX
 
 CONFIG, METRICS, CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
 POLICY, INITIAL, LOCK = "policy.safetensors", "initial-policy.safetensors", "run.lock"
+LOG, FINAL = "log.txt", "final-evaluation.json"
+"""Of the run of a study."""
 
 
 def is_leftover(entry: Path) -> bool:
