@@ -52,7 +52,7 @@ class StudyProgress:
         elif (now := self._clock()) - self._last_line_s >= LINE_INTERVAL_S:
             self._last_line_s = now
             for run in snapshot.runs:
-                if run.status in ("training", "evaluating", "elsewhere"):
+                if run.is_active:
                     console.note(f"  {run.cell.name}  {run_status(run)}")
             console.note(whole_status(snapshot))
 
@@ -73,11 +73,11 @@ class StudyProgress:
 
     def _draw(self, live: Progress, snapshot: Snapshot) -> None:
         for run in snapshot.runs:
-            name, active = run.cell.name, run.status in ("training", "evaluating", "elsewhere")
-            if active and name not in self._bars:
+            name = run.cell.name
+            if run.is_active and name not in self._bars:
                 self._bars[name] = live.add_task(name, total=run.cell.config.steps, status=[])
             if name in self._bars:
-                if active:
+                if run.is_active:
                     live.update(self._bars[name], completed=run.step, status=[run_status(run)])
                 else:
                     live.remove_task(self._bars.pop(name))

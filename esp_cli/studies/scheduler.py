@@ -21,7 +21,6 @@ from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
 Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
-ACTIVE: tuple[Status, ...] = ("training", "evaluating", "elsewhere")
 POLL_S = 0.5
 """Seconds between two looks at the running processes."""
 
@@ -62,6 +61,11 @@ class Run:
         elapsed = row.get("time/elapsed_s")
         if isinstance(elapsed, int | float):
             self.trained_s = float(elapsed)
+
+    @property
+    def is_active(self) -> bool:
+        """Whether a process works on it, of this scheduler or of another."""
+        return self.status in ("training", "evaluating", "elsewhere")
 
     @property
     def rate(self) -> float | None:
@@ -121,11 +125,11 @@ class Scheduler:
             while True:
                 if going:
                     self._fill()
-                active = [run for run in self.runs if run.status in ACTIVE]
+                active = [run for run in self.runs if run.is_active]
                 if not listener(Snapshot(self.runs, self.left_s())) and going:
                     going = False
                     self._stop()
-                if not any(run.status in ACTIVE for run in self.runs):
+                if not any(run.is_active for run in self.runs):
                     return going
                 time.sleep(poll_s)
                 for run in active:
@@ -137,11 +141,11 @@ class Scheduler:
 
     def left_s(self) -> float | None:
         """Return the seconds until the last run is trained, from what the runs so far took; None where none tells."""
-        costs = [(run, self._seconds_left(run)) for run in self.runs if run.status in (*ACTIVE, "waiting")]
+        costs = [(run, self._seconds_left(run)) for run in self.runs if run.is_active or run.status == "waiting"]
         if any(seconds is None for _, seconds in costs):
             return None
-        running = [seconds or 0.0 for run, seconds in costs if run.status in ACTIVE]
-        waiting = [seconds or 0.0 for run, seconds in costs if run.status == "waiting"]
+        running = [seconds or 0.0 for run, seconds in costs if run.is_active]
+        waiting = [seconds or 0.0 for run, seconds in costs if not run.is_active]
         return makespan(running, waiting, self.jobs)
 
     def _seconds_left(self, run: Run) -> float | None:
@@ -160,7 +164,7 @@ class Scheduler:
     def _fill(self) -> None:
         """Start waiting runs while there is room."""
         for run in self.runs:
-            if sum(r.status in ACTIVE for r in self.runs) >= self.jobs:
+            if sum(r.is_active for r in self.runs) >= self.jobs:
                 return
             if run.status == "waiting":
                 self._start(run)
@@ -214,7 +218,7 @@ class Scheduler:
                 run.status, run.message = "failed", run.job.last_words()
             else:
                 run.status = "stopped"
-            if run.status not in ACTIVE:
+            if not run.is_active:
                 run.job = None
         if not going and run.job is None and run.status in ("elsewhere", "waiting"):
             run.status = "stopped"
