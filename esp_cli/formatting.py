@@ -8,21 +8,21 @@ from collections.abc import Collection, Sequence
 NOTHING = "-"
 
 
-def format_mean(mean: float | None, sem: float | None = None, digits: int = 2) -> str:
+def format_mean(mean: float | None, sem: float | None = None) -> str:
     """Return "mean ± standard error", the mean alone where one sample leaves no error to state, a dash for no mean."""
     if mean is None:
         return NOTHING
     if sem is None or not math.isfinite(sem):
-        return f"{mean:.{digits}f}"
-    return f"{mean:.{digits}f} ± {sem:.{digits}f}"
+        return f"{mean:.2f}"
+    return f"{mean:.2f} ± {sem:.2f}"
 
 
-def format_interval(interval: Sequence[float] | None, digits: int = 2) -> str:
+def format_interval(interval: Sequence[float] | None) -> str:
     """Return an interval (low, high) as "[low, high]", and a dash for none."""
     if interval is None:
         return NOTHING
     low, high = interval
-    return f"[{low:.{digits}f}, {high:.{digits}f}]"
+    return f"[{low:.2f}, {high:.2f}]"
 
 
 def file_name(text: str) -> str:

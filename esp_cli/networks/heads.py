@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
+_INITIAL_STD = 0.6
 MASKED = -1e9
 """Output of an action that is not allowed: its probability is exactly 0, and it is never the best."""
 
@@ -121,11 +122,11 @@ class BoundedGaussian(Head):
     A planar vector u is squashed radially, u tanh|u| / |u|, which commutes with every rotation; other numbers by tanh.
     """
 
-    def __init__(self, space: Continuous, num_seeds: int, initial_std: float = 0.6) -> None:
+    def __init__(self, space: Continuous, num_seeds: int) -> None:
         super().__init__()
         self.num_outputs = space.width
         items = [f.kind for f in space.layout.fields for _ in range(f.count)]
-        self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(initial_std)))
+        self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(_INITIAL_STD)))
         self.item: Tensor
         self.register_buffer(
             "item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False

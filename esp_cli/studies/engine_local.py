@@ -29,11 +29,10 @@ class LocalEngine:
 
     Args:
         program: the application as a command line; it has to call `follow_parent` first.
-        threads: of each job's matrix products.
     """
 
-    def __init__(self, program: Sequence[str] = APPLICATION, threads: int = 1) -> None:
-        self.program, self.threads = tuple(program), threads
+    def __init__(self, program: Sequence[str] = APPLICATION) -> None:
+        self.program = tuple(program)
 
     def places(self, device: str) -> int:
         """Return how many jobs this machine runs side by side by default: one a core, or one on its GPU."""
@@ -44,7 +43,7 @@ class LocalEngine:
         roots = [str(Path(__file__).parents[2]), str(Path(esp_envs.__path__[0]).parent)]
         path = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = os.environ | {
-            "OMP_NUM_THREADS": str(self.threads),
+            "OMP_NUM_THREADS": "1",
             "PYTHONPATH": path,
             "PYTHONSAFEPATH": "1",  # a file called random.py in the user's folder is not imported
             "PYTHONUNBUFFERED": "1",

@@ -26,7 +26,7 @@ from esp_cli.files.failures import sentence
 from esp_cli.studies.mirror import FileGoneError, Mirror
 from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect, offers, refuse_what_no_node_has
 from esp_cli.studies.versions import refuse_difference
-from esp_cli.studies.worker import LEASE_S, SILENCE_S, CellWorker, Lease, LeaseLostError, News
+from esp_cli.studies.worker import SILENCE_S, CellWorker, Lease, LeaseLostError, News
 from esp_cli.training.loading import parse_config
 from esp_cli.training.memory import process_bytes
 from esp_cli.training.run_folder import RunFolder
@@ -55,7 +55,6 @@ class RayEngine:
         folder: of the study; workers are named after an identity that is kept there.
         address: of the cluster; by default that of RAY_ADDRESS, or a cluster of this machine alone.
         gpus: share of a GPU that a run on "cuda" takes.
-        lease_s: see `CellWorker`.
         silence_s: see `CellWorker`.
 
     Raises:
@@ -68,10 +67,9 @@ class RayEngine:
         folder: Path,
         address: str | None = None,
         gpus: float = 1.0,
-        lease_s: float = LEASE_S,
         silence_s: float = SILENCE_S,
     ) -> None:
-        self.folder, self.gpus, self.lease_s, self.silence_s = folder, gpus, lease_s, silence_s
+        self.folder, self.gpus, self.silence_s = folder, gpus, silence_s
         self.owner = f"process {os.getpid()} on {platform.node()} ({secrets.token_hex(4)})"
         connect(address)
         self._offers = offers()  # of nodes that were ever there: a lost one may come back
@@ -105,7 +103,7 @@ class RayEngine:
             num_gpus=gpus,
             memory=memory,
         )
-        return RayJob(self.owner, lambda: actor.remote(self.lease_s, self.silence_s), arguments, run)
+        return RayJob(self.owner, lambda: actor.remote(silence_s=self.silence_s), arguments, run)
 
     def _identity(self) -> str:
         """Return the identity of the study, which a driver that is started again finds in its folder."""

@@ -101,7 +101,7 @@ def test_means_and_intervals() -> None:
     assert format_mean(-122.251, 1.618) == "-122.25 ± 1.62"
     assert format_mean(-122.251, math.nan) == "-122.25"
     assert format_mean(3.0) == "3.00"
-    assert format_interval((-125.04, -119.96), digits=1) == "[-125.0, -120.0]"
+    assert format_interval((-125.041, -119.958)) == "[-125.04, -119.96]"
     assert [format_span(counts) for counts in ([160, 32, 64], {10})] == ["32 to 160", "10"]
 
 
