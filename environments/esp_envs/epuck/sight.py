@@ -7,11 +7,10 @@ from torch import Tensor
 
 from esp_envs.epuck.formation_spec import FormationSettings
 from esp_envs.epuck.robot import BODY_RADIUS_M
-from esp_envs.scene import Body, Scene
+from esp_envs.scene import COLORS, Body, Scene
 
 FADING_M = 0.2
 """Gap over which the sight `nearness` of a body fades to 1/e."""
-_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _PILLAR_COLOR = "#707070"
 
 
@@ -55,11 +54,11 @@ def formation_scene(
     """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
     bodies = []
     for i, goal in enumerate(goals.tolist()):
-        bodies.append(Body(tuple(goal), BODY_RADIUS_M, _COLORS[i % len(_COLORS)], "ring", model="goal", label="goal"))
+        bodies.append(Body(tuple(goal), BODY_RADIUS_M, COLORS[i % len(COLORS)], "ring", model="goal", label="goal"))
     radius = settings.obstacle_radius_m
     bodies += [Body(tuple(place), radius, _PILLAR_COLOR, model="pillar", label="pillar") for place in pillars.tolist()]
     for i, (place, turn) in enumerate(zip(position.tolist(), heading.tolist(), strict=True)):
-        color = _COLORS[i % len(_COLORS)]
+        color = COLORS[i % len(COLORS)]
         bodies.append(Body(tuple(place), BODY_RADIUS_M, color, "disc", turn, trail=True, model="robot", label="robot"))
     half = settings.arena.side_m / 2
     return Scene(tuple(bodies), (-half, half, -half, half), unit="m")

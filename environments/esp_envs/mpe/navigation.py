@@ -13,7 +13,7 @@ from esp_envs.breaking import described, remaining
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
-from esp_envs.scene import Body, Scene
+from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
 AGENT_RADIUS = 0.15
@@ -24,7 +24,6 @@ SENSITIVITY = 5.0
 OCCUPIED_WITHIN = 0.1
 """A landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)."""
 LANDMARK_EXTENT = {"esp": 0.8, "pettingzoo": 1.0}
-_AGENT_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _LANDMARK_COLOR = "#404040"
 
 
@@ -159,7 +158,7 @@ class Navigation(ParticleTask):
         agents = self.settings.num_agents
         bodies = [
             Body((x, y), AGENT_RADIUS, color, trail=True, label="agent")
-            for (x, y), color in zip(places[:agents], _AGENT_COLORS, strict=False)
+            for (x, y), color in zip(places[:agents], COLORS, strict=False)
         ]
         bodies += [
             Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, "cross", label="landmark", reach=OCCUPIED_WITHIN)

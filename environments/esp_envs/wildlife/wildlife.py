@@ -17,12 +17,11 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
-from esp_envs.scene import Body, Scene
+from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP
 from esp_envs.wildlife.pictures import all_pictures, cell_index
 from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec
 
-_COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
 _POACHER_COLOR = "#202020"
 
 
@@ -197,7 +196,7 @@ class Wildlife(Environment):
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return the drones of one world and the poacher on top of them, on the lines between the cells."""
         *drones, poacher = [(float(x), float(y)) for x, y in self._cells[world].tolist()]
-        bodies = [Body(place, 0.4, _COLORS[i % len(_COLORS)], label="drone") for i, place in enumerate(drones)]
+        bodies = [Body(place, 0.4, COLORS[i % len(COLORS)], label="drone") for i, place in enumerate(drones)]
         bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross", label="poacher"))
         right, top = self.settings.width / 2, self.settings.height / 2
         return Scene(tuple(bodies), (-right, right, -top, top), grid=(1.0, 0.5), unit="cells")
