@@ -1,6 +1,6 @@
 """The gradient of MADDPG's actor by the logits, for discrete actions: a third of autograd's operations.
 
-`Maddpg.actor_loss` says in the terms of the paper what this is the gradient of; tests hold both together.
+`Maddpg.reference_gradient` says in the terms of the paper what this is the gradient of; tests hold both together.
 
 Shape letters: S seeds, A actions, N agents, P parts (the originals and K copies of them), R rows of a part.
 """
