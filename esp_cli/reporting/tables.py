@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
@@ -29,6 +29,13 @@ def markdown_text(text: str) -> str:
     return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))
 
 
+def markdown_rows(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table in Markdown; a heading that ends in ">" is aligned to the right."""
+    names = [heading.removesuffix(">") for heading in headings]
+    rule = ["---:" if heading.endswith(">") else "---" for heading in headings]
+    return [f"| {' | '.join(cells)} |" for cells in (names, rule, *rows)]
+
+
 @dataclass(frozen=True)
 class Table:
     """A table before it is drawn.
@@ -47,10 +54,8 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table as Markdown, without its title."""
-        names = [heading.removesuffix(">") for heading in self.headings]
-        rule = ["---:" if heading.endswith(">") else "---" for heading in self.headings]
-        rows = [[markdown_text(cell) for cell in row] for row in (names, *self.rows)]
-        lines = [f"| {' | '.join(cells)} |" for cells in (rows[0], rule, *rows[1:])]
+        headings, *rows = ([markdown_text(cell) for cell in row] for row in (self.headings, *self.rows))
+        lines = markdown_rows(headings, rows)
         return "\n".join([*lines, *(["", markdown_text(self.caption)] if self.caption else [])])
 
 

@@ -15,6 +15,7 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
 from esp_cli.files.writing import replace_file
 from esp_cli.formatting import format_count, format_duration
+from esp_cli.reporting.tables import markdown_rows
 from esp_cli.studies.tuner import Outcome, Trials
 from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
 
@@ -83,8 +84,8 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(found) for found in outcomes]}
     replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
     lines = [f"# {trials.folder.study.title}", "", budget_sentence(tuning), "", f"`{tuning.command}`", ""]
-    lines += ["## Budgets and scores", "", *_markdown(*budget_table(outcomes))]
-    lines += ["", "## Best settings", "", *_markdown(*settings_table(outcomes))]
+    lines += ["## Budgets and scores", "", *markdown_rows(*budget_table(outcomes))]
+    lines += ["", "## Best settings", "", *markdown_rows(*settings_table(outcomes))]
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` judges them on others."]
     for prior, study in trials.studies.items():
         for name, title in _draw(study, out, prior):
@@ -121,12 +122,6 @@ def _importances(study: Any) -> None:
     axes.barh(list(found), list(found.values()))
     axes.invert_yaxis()
     axes.set_xlabel("importance (PED-ANOVA)")
-
-
-def _markdown(headings: Sequence[str], rows: Rows) -> list[str]:
-    names = [heading.removesuffix(">") for heading in headings]
-    rule = ["---:" if heading.endswith(">") else "---" for heading in headings]
-    return [f"| {' | '.join(cells)} |" for cells in (names, rule, *rows)]
 
 
 def _number(value: float | None) -> str:
