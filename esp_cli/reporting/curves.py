@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_cli.evaluation.final import Mode
-from esp_cli.training.build import build_environment
+from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config
 from esp_cli.training.metrics import column, read_metrics
@@ -41,7 +41,7 @@ class RunCurve:
     @cached_property
     def spec(self) -> TaskSpec:
         """What the task says of itself, the convention of its returns among it."""
-        return build_environment(self.config.model_copy(update={"device": "cpu"}), 1, "shape").spec
+        return spec_of(self.config.model_copy(update={"device": "cpu"}))
 
     @property
     def last_step(self) -> int:

@@ -122,6 +122,11 @@ class Trainer:
         return self.iteration >= self.total_iterations
 
     @property
+    def all_stopped(self) -> bool:
+        """Whether no seed has finite numbers any more."""
+        return len(self.stopped_seeds) == len(self.config.seeds)
+
+    @property
     def convention(self) -> str:
         """The reward convention in which returns are counted."""
         return self.learner.spec.convention
@@ -153,11 +158,10 @@ class Trainer:
                 self.elapsed_s = time.monotonic() - started
                 row["time/elapsed_s"] = self.elapsed_s
                 going = self._record(writer, row, listener)
-                all_broken = len(self.stopped_seeds) == len(self.config.seeds)
-                if self.is_complete or not going or all_broken or tick > due:
+                if self.is_complete or not going or self.all_stopped or tick > due:
                     cost = self._checkpoint()
                     due = time.monotonic() + max(CHECKPOINT_SECONDS, CHECKPOINT_SPACING * cost)
-                if all_broken:
+                if self.all_stopped:
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
                 if not going and not self.is_complete:
                     return False
@@ -175,8 +179,7 @@ class Trainer:
         row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}
         self._stop_broken_seeds(result.finite)
         seconds = time.monotonic() - begun
-        all_stopped = len(self.stopped_seeds) == len(self.config.seeds)
-        if self.step // self.config.evaluation.every_steps > before or self.is_complete or all_stopped:
+        if self.step // self.config.evaluation.every_steps > before or self.is_complete or self.all_stopped:
             row |= self._evaluate()
         return row, seconds
 
@@ -251,11 +254,8 @@ class Trainer:
                 stands = Standing.model_validate(meta)
             except ValidationError:
                 raise ValueError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
-            self.iteration, self.elapsed_s, self.stopped_seeds = (
-                stands.iteration,
-                stands.elapsed_s,
-                stands.stopped_seeds,
-            )
+            self.iteration, self.elapsed_s = stands.iteration, stands.elapsed_s
+            self.stopped_seeds = stands.stopped_seeds
             if self.step != stands.step or not set(self.stopped_seeds) <= set(range(len(self.config.seeds))):
                 raise ValueError(f"the checkpoint in {self.folder.path} is of another run; train anew")
             version = self.learner.spec.version
