@@ -130,8 +130,7 @@ class Trials:
         trials = self.studies[prior].get_trials(deepcopy=False)
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         best = max(done, key=lambda t: (t.value, -t.number), default=None)
-        runs = [self.folder.path / "trials" / f"{prior}-{t.number:03d}" / METRICS for t in trials]
-        rows = [read_last_row(run) for run in runs]
+        rows = [read_last_row(self.folder.trial_path(prior, t.number) / METRICS) for t in trials]
         seeds = len(self.tuning.trial_seeds)
         return Outcome(
             prior=prior,

@@ -147,13 +147,17 @@ class TuningFolder(StudyFolder):
         """Return whether a folder holds a tuning."""
         return (path / _TUNING).is_file()
 
+    def trial_path(self, prior: str, number: int) -> Path:
+        """Return the run folder of a trial."""
+        return self.path / _TRIALS / f"{prior}-{number:03d}"
+
     def cell(self, prior: str, number: int, settings: Mapping[str, object]) -> Cell:
         """Return the run of a trial."""
-        name = f"{prior}-{number:03d}"
+        name = self.trial_path(prior, number).name
         return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
 
     def run_path(self, cell: Cell) -> Path:
-        """Return the run folder of a trial."""
+        """Return the run folder of a trial's cell."""
         return self.path / _TRIALS / cell.name
 
     def is_finished(self, cell: Cell) -> bool:
