@@ -122,9 +122,9 @@ class SeedMLP(nn.Module):
 
     @torch.no_grad()
     def idle_units(self, x: Tensor) -> Tensor:
-        """Return the share of hidden units that no row of x [S, B, in] wakes: [S]; of relu networks.
+        """Return the share of hidden units that are 0 for every row of x [S, B, in]: [S]; of relu networks.
 
-        A unit that is 0 everywhere gets no gradient and is lost to the network (Sokar et al., 2023).
+        Such a unit gets no gradient and is lost to the network (Sokar et al., 2023).
         """
         x = x if self.norms is None else self.norms[0](x)
         idle = []

@@ -1,4 +1,4 @@
-"""The equivariant ensemble: any network, asked about every image of a scene, its answers brought home and averaged."""
+"""The equivariant ensemble: the outputs of any network for all images of its input, pulled back and averaged."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from esp_cli.symmetry.maps import rows_map
 
 
 class Symmetrised(Network):
-    """y = 1 / G sum_g rho_out(g)^-1 f(rho_in(g) x): equivariant whatever f is, at G times its price.
+    """y = 1 / G sum_g rho_out(g)^-1 f(rho_in(g) x): equivariant whatever f is, at G times its cost.
 
     What a recurrent f remembers of each image is kept apart.
 
@@ -33,7 +33,7 @@ class Symmetrised(Network):
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
         self.image = rows_map(io.layout, self.group.elements, io.spaces.num_agents)
-        home = [
+        back = [
             torch.block_diag(
                 *(
                     torch.as_tensor(b.matrices[g], dtype=torch.float32)
@@ -43,8 +43,8 @@ class Symmetrised(Network):
             )
             for g in range(self.group.order)
         ]
-        self.home: Tensor
-        self.register_buffer("home", torch.stack(home), False)
+        self.back: Tensor
+        self.register_buffer("back", torch.stack(back), False)
 
     def _images(self, x: Tensor) -> Tensor:
         """Return all images of rows x [S, B, D], one behind the other: [S, G * B, D]."""
@@ -58,8 +58,8 @@ class Symmetrised(Network):
         return super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
 
     def _mean(self, y: Tensor) -> Tensor:
-        """Bring outputs [S, G * B, out] home and average them: [S, B, out]."""
-        return torch.matmul(y.unflatten(1, (self.group.order, -1)), self.home).mean(1)
+        """Pull outputs [S, G * B, out] back and average them: [S, B, out]."""
+        return torch.matmul(y.unflatten(1, (self.group.order, -1)), self.back).mean(1)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Advance one step with every image."""

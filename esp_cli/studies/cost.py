@@ -112,7 +112,7 @@ def _probe(config: RunConfig, episodes: int) -> Cost:
 def _clock(config: RunConfig) -> Callable[[], float]:
     """Return what seconds are read from: the processor time of this process, to which other work adds little.
 
-    Where a GPU or processes of their own for the worlds work, this one waits, and time is what a watch says.
+    Where a GPU or processes of their own for the worlds work, this one waits, and time is that of a clock on the wall.
     """
     alone = config.device == "cpu" and not multiprocessing.active_children()
     return time.process_time if alone else time.monotonic

@@ -26,7 +26,7 @@ class Job(Protocol):
 class Engine(Protocol):
     """Starts jobs. The scheduler reads their progress from the run folders.
 
-    A job that runs on another machine therefore brings back what it writes; the folder here is the truth.
+    A job that runs on another machine therefore copies what it writes into the folder here.
     """
 
     def places(self, device: str) -> int:

@@ -1,4 +1,4 @@
-"""Trackers: where metrics go beside `metrics.jsonl`, which stays the truth. None of them can stop a run."""
+"""Trackers: where metrics go beside `metrics.jsonl`, which has them all. A tracker that fails does not stop a run."""
 
 from __future__ import annotations
 

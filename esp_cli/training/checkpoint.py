@@ -1,8 +1,8 @@
 """Checkpoint files: named tensors and a JSON description in one safetensors file, written whole or not at all.
 
-Loading never runs code, and trusts nothing: the header is checked against the size of the file before anything is
-parsed or allocated, and a SHA-256 over description and tensors is verified, so that a flipped bit, a truncated copy or
-a hostile file ends in one :class:`CheckpointError`. Policy files are the same container under another ``format_name``.
+Loading never runs code, and trusts nothing. The header is checked against the size of the file before anything is
+parsed or allocated. A SHA-256 over description and tensors is verified. So a flipped bit, a truncated copy or a hostile
+file ends in one :class:`CheckpointError`. Policy files are the same container under another ``format_name``.
 
 Layout: the safetensors metadata has the key ``esp``, whose text is a JSON object with ``format``, ``version``,
 ``sha256`` and, beside these three, the writer's own description.

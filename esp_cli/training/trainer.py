@@ -1,4 +1,4 @@
-"""The collect-learn-evaluate loop: resumable bit for bit, stoppable at any moment, silent (a listener speaks)."""
+"""The collect-learn-evaluate loop: resumable bit for bit, stoppable at any moment, printing nothing."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Sizes:
     action: int | None
     """Width of a continuous action; None for a discrete one."""
     choices: int = 0
-    """Discrete actions that a mask speaks of; 0 without masks."""
+    """Discrete actions of a mask; 0 without masks."""
 
 
 class Board:

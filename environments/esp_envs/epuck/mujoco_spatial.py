@@ -35,7 +35,7 @@ MOTOR_INERTIA = MASS_KG / 2 * WHEEL_RADIUS_M**2
 one after the other, and a light wheel on a firm servo would be torn from the floor at every time step."""
 MOTOR_TORQUE_N_M = 0.007
 """Of each motor at its wheel, ours: a little less than the floor holds, wheels and casters sharing the weight. So a
-robot that pushes something stalls; wheels that spin would shake it, and its fate would be chaos."""
+robot that pushes something stalls. Wheels that spin would shake it, and its path would be chaotic."""
 _SETTLING_STEPS = 300
 _FLOOR = 2
 """Collision bit of the floor, which holds wheels and casters only; everything else meets at MuJoCo's own bit 1."""
