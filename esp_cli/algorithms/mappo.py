@@ -17,13 +17,7 @@ from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.closed_form import carries, critic_gradient, policy_gradient, weights_of
 from esp_cli.algorithms.closed_gaussian import gaussian_gradient
 from esp_cli.algorithms.learner import Iteration, Learner
-from esp_cli.algorithms.losses import (
-    clipped_surrogate,
-    explained_variance,
-    gae,
-    normalise_per_seed,
-    value_loss,
-)
+from esp_cli.algorithms.losses import clipped_surrogate, explained_variance, gae, normalise_per_seed, value_loss
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
@@ -88,9 +82,7 @@ class Mappo(Learner):
         self.optimisers = {"adam": self.optimiser}
         self.collector = Collector(env, self.policy, self.generators["learner"])
         self._old: tuple[StochasticPolicy, Critic] | None = None
-        reevaluates = config.clip_value or self.prior.recomputes
-        partial = spec.masks or spec.agents_end
-        self._closed_form = not reevaluates and not partial
+        self._closed_form = not (config.clip_value or self.prior.recomputes or spec.masks or spec.agents_end)
 
     @classmethod
     def build_policy(
@@ -143,11 +135,8 @@ class Mappo(Learner):
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
         valid = None
         if rollout.alive is not None and rollout.gone is not None and self.num_values > 1:
-            terminated, ended = (
-                terminated | rollout.gone,
-                ended | rollout.gone,
-            )  # what follows an agent's end is not its
-            valid = rollout.alive
+            # what follows an agent's end is not its
+            terminated, ended, valid = terminated | rollout.gone, ended | rollout.gone, rollout.alive
         advantage = gae(reward, value, next_value, terminated, ended, config.gamma, config.gae_lambda)
         target = advantage + value
         self.normaliser.update(target, valid)

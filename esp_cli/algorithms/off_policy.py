@@ -216,9 +216,8 @@ class OffPolicyLearner(Learner):
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return what a resumed run needs; a complete run's replay is left out."""
         out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}
-        return (
-            out if complete else out | {f"replay.{name}": tensor for name, tensor in self.replay.state_dict().items()}
-        )
+        replay = {} if complete else self.replay.state_dict()
+        return out | {f"replay.{name}": tensor for name, tensor in replay.items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned; see `Learner.load_state_dict`."""

@@ -65,11 +65,8 @@ class Qmix(OffPolicyLearner):
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
         self.optimiser = self.adam(self.policy, self.mixer, learning_rate=config.learning_rate)
-        self.modules |= {
-            "mixer": self.mixer,
-            "target_policy": self.target_policy,
-            "target_mixer": self.target_mixer,
-        }
+        targets = {"target_policy": self.target_policy, "target_mixer": self.target_mixer}
+        self.modules |= {"mixer": self.mixer, **targets}
         self.optimisers = {"adam": self.optimiser}
 
     @classmethod

@@ -13,14 +13,7 @@ from esp_cli.evaluation.spread import EpisodeSpread, spread_over_episodes
 from esp_cli.evaluation.statistics import SeedSummary, summarise
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
-from esp_cli.training.play import (
-    Controller,
-    Episodes,
-    HeuristicController,
-    PolicyController,
-    RandomController,
-    play,
-)
+from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
 from esp_envs.registry import task_class
 

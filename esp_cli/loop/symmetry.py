@@ -247,7 +247,7 @@ class Symmetry:
         from esp_cli.checking import Transitions, candidates, check_transitions, collect  # noqa: PLC0415 - it trains too
 
         data = source if isinstance(source, Transitions) else collect(source)
-        if not self.spaces.num_agents > 1 and data.reward.dim() == 2:
+        if self.spaces.num_agents == 1 and data.reward.dim() == 2:
             held = {field.name: getattr(data, field.name) for field in fields(data)}
             data = Transitions(**{name: value.unsqueeze(2) for name, value in held.items() if value is not None})
         lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))

@@ -63,11 +63,7 @@ class RayEngine:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        address: str | None = None,
-        gpus: float = 1.0,
-        silence_s: float = SILENCE_S,
+        self, folder: Path, address: str | None = None, gpus: float = 1.0, silence_s: float = SILENCE_S
     ) -> None:
         self.folder, self.gpus, self.silence_s = folder, gpus, silence_s
         self.owner = f"process {os.getpid()} on {platform.node()} ({secrets.token_hex(4)})"
