@@ -16,7 +16,7 @@ from esp_cli.evaluation.statistics import summarise
 from esp_cli.reporting.curves import RunCurve, read_curve
 from esp_cli.reporting.results import CellResult, Passing, Results, flat
 from esp_cli.reporting.summary import returns_of
-from esp_cli.studies.kinds import KINDS
+from esp_cli.studies.kinds import KINDS, OTHER
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
 from esp_cli.training.folder_names import CONFIG, METRICS
@@ -69,9 +69,8 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
         thresholds: returns whose first passing is looked for; by default those of this kind of study, or that which
             the cell's reference ended with.
     """
-    study, kind = folder.study, KINDS.get(folder.study.kind)
-    mode = mode or (kind.mode if kind else "greedy")
-    thresholds = thresholds or (kind.thresholds if kind else ())
+    study, kind = folder.study, KINDS.get(folder.study.kind, OTHER)
+    mode, thresholds = mode or kind.mode, thresholds or kind.thresholds
     states = {}
     for cell in study.cells:
         run = folder.run_path(cell)
@@ -79,7 +78,7 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
         final = read_evaluation(run) if folder.is_trained(cell) else None
         states[cell.name] = RunState(step, _read_curve(run, cell, mode), final)
     results = results_of(study, states, mode, thresholds)
-    if kind is not None and kind.network_cost:
+    if kind.network_cost:
         cells = []
         for found, config in zip(results.cells, (cell.config for cell in study.cells), strict=True):
             cost = {"parameters": network_parameters(config), "flops_per_action": flops_per_action(config)}
@@ -146,8 +145,8 @@ def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonVa
             "episodes": cell.config.evaluation.episodes,
             "returns": {mode: _rounded(compared.values[-1])},
         }
-    kind = KINDS.get(study.kind)
-    if curve is not None and kind is not None and kind.breakings and (early := curve.until(cell.config.steps // 5)):
+    breaks = KINDS.get(study.kind, OTHER).breakings
+    if curve is not None and breaks and (early := curve.until(cell.config.steps // 5)):
         found["early"] = _rounded(early.values[-1])
     if "returns" in found and compared is not None:
         found["evaluations"] = len(compared.steps)

@@ -101,6 +101,8 @@ def _team(agents: int, landmarks: int | None) -> Team:
     return Team(label, {"task.num_agents": agents, "task.num_landmarks": landmarks}, place)
 
 
+OTHER = StudyKind("", rows="variants", varies=frozenset(), variants={})
+"""What a report takes for a study of none of these kinds, such as runs put together by hand."""
 KINDS: Mapping[str, StudyKind] = {
     "table1": StudyKind(
         "Table 1 of the paper",
