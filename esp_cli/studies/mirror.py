@@ -14,8 +14,8 @@ from pathlib import Path
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import remove_file, replace_file, replacing
 from esp_cli.studies.worker import CHUNK_BYTES, WHOLE_FILES, News
-from esp_cli.training.checkpoint_names import FILE_NAME, step_of, superseded
-from esp_cli.training.folder_names import CHECKPOINTS, FINAL, LOG, METRICS
+from esp_cli.training.checkpoint_names import FILE_NAME, checkpoints_in, place_of, step_of, superseded
+from esp_cli.training.folder_names import FINAL, LOG, METRICS
 
 Stamp = tuple[int, int]
 
@@ -41,13 +41,13 @@ class Mirror:
     @property
     def newest_step(self) -> int:
         """Step of the newest checkpoint that is here; -1 where there is none."""
-        return max(map(step_of, self._checkpoints()), default=-1)
+        return max(map(step_of, checkpoints_in(self.path)), default=-1)
 
     def outgoing(self) -> Iterator[tuple[str, bytes]]:
         """Yield name and content of what a job needs to go on, in parts."""
         names = [name for name in (*WHOLE_FILES, METRICS) if (self.path / name).is_file()]
-        for name in (*names, *(file.name for file in self._checkpoints())):
-            with self._path(name).open("rb") as file:
+        for name in (*names, *(file.name for file in checkpoints_in(self.path))):
+            with place_of(self.path, name).open("rb") as file:
                 while part := file.read(CHUNK_BYTES):
                     yield name, part
 
@@ -95,23 +95,16 @@ class Mirror:
         if name == FINAL:
             replace_file(self.path / name, _renamed(b"".join(_parts(stamp[0], read)), remote, str(self.path)))
         else:
-            self._path(name).parent.mkdir(exist_ok=True)
+            place_of(self.path, name).parent.mkdir(exist_ok=True)
             if FILE_NAME.fullmatch(name):
                 _sync(self.path / METRICS)
-            with replacing(self._path(name)) as write:
+            with replacing(place_of(self.path, name)) as write:
                 for part in _parts(stamp[0], read):
                     write(part)
         self._known[name] = stamp
         if FILE_NAME.fullmatch(name):
-            for file in superseded(self._checkpoints(), step_of(Path(name))):
+            for file in superseded(checkpoints_in(self.path), step_of(Path(name))):
                 remove_file(file)
-
-    def _path(self, name: str) -> Path:
-        return self.path / CHECKPOINTS / name if FILE_NAME.fullmatch(name) else self.path / name
-
-    def _checkpoints(self) -> list[Path]:
-        folder = self.path / CHECKPOINTS
-        return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name)) if folder.is_dir() else []
 
 
 class FileGoneError(Exception):

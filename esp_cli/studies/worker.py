@@ -19,7 +19,7 @@ from typing import TypedDict
 
 from esp_cli.studies.engine_local import APPLICATION, LocalEngine, LocalJob
 from esp_cli.studies.versions import versions
-from esp_cli.training.checkpoint_names import FILE_NAME
+from esp_cli.training.checkpoint_names import FILE_NAME, checkpoints_in, place_of
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, FINAL, LOCK, LOG, METRICS, POLICY
 from esp_cli.training.locking import acquire, is_held
 
@@ -199,13 +199,12 @@ class CellWorker:
     def _path(self, name: str) -> Path:
         if name not in (*WHOLE_FILES, METRICS) and not FILE_NAME.fullmatch(name):
             raise ValueError(f"a run folder has no file '{name}'")
-        return self._run / CHECKPOINTS / name if FILE_NAME.fullmatch(name) else self._run / name
+        return place_of(self._run, name)
 
     def _files(self) -> dict[str, tuple[int, int]]:
         """Return size and time of each whole file that is there."""
         found = {}
-        names = [file.name for file in (self._run / CHECKPOINTS).iterdir() if FILE_NAME.fullmatch(file.name)]
-        for name in (*sorted(names), *WHOLE_FILES):
+        for name in (*(file.name for file in checkpoints_in(self._run)), *WHOLE_FILES):
             try:
                 status = self._path(name).stat()
             except FileNotFoundError:

@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from esp_cli.training.folder_names import CHECKPOINTS
+
 FILE_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
@@ -14,6 +16,17 @@ KEPT_CHECKPOINTS = 2
 def file_name(step: int, final: bool) -> str:
     """Return the name of the checkpoint at a step (env steps per seed); `final` means that training is done."""
     return f"step-{step:012d}{'-final' if final else ''}.safetensors"
+
+
+def place_of(run: Path, name: str) -> Path:
+    """Return where a file of a run folder is: checkpoints have a folder of their own."""
+    return run / CHECKPOINTS / name if FILE_NAME.fullmatch(name) else run / name
+
+
+def checkpoints_in(run: Path) -> list[Path]:
+    """Return the checkpoint files of a run folder, oldest first."""
+    folder = run / CHECKPOINTS
+    return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name)) if folder.is_dir() else []
 
 
 def step_of(path: Path) -> int:

@@ -31,7 +31,7 @@ from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from esp_cli.training.checkpoint_names import FILE_NAME, file_name, is_final, step_of, superseded
+from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
@@ -164,14 +164,11 @@ class RunFolder:
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""
-        return self.path / CHECKPOINTS / file_name(step, final)
+        return place_of(self.path, file_name(step, final))
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint files, oldest first."""
-        folder = self.path / CHECKPOINTS
-        if not folder.is_dir():
-            return []
-        return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name))
+        return checkpoints_in(self.path)
 
     def write_checkpoint(
         self, step: int, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], final: bool = False
