@@ -118,7 +118,7 @@ class Results(BaseModel):
 
     def document(self) -> dict[str, JsonValue]:
         """Return the document as `esp report --json` and `--results` write it."""
-        return {"format": RESULTS_FORMAT.name, "version": RESULTS_FORMAT.version, **self.content()}
+        return RESULTS_FORMAT.document(self.content())
 
 
 def read_results(path: Path) -> Results:
