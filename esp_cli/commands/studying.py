@@ -54,7 +54,7 @@ def run_study(
     out, study = choices.folder(kind), plan(kind, request)
     others = [StudyFolder.open(path) for path in choices.reuse or ()]
     for cell in () if choices.dry_run else study.cells:  # refuses what does not go together before there is a folder
-        build_learner(cell.config.model_copy(update={"seeds": cell.config.seeds[:1], "device": "cpu"}))
+        build_learner(cell.config.of_one_seed())
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(study.cells[0].config.device)
         if choices.dry_run:

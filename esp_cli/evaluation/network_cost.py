@@ -11,7 +11,7 @@ from esp_cli.training.config import RunConfig
 
 def network_parameters(config: RunConfig) -> dict[str, int]:
     """Build the networks of one seed of a run, and return their weights by name, "policy" among them."""
-    modules = build_learner(config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})).modules
+    modules = build_learner(config.of_one_seed()).modules
     names = [name for name in ("policy", "critic") if name in modules]
     return {name: sum(p.numel() for p in modules[name].parameters()) for name in names}
 
@@ -23,7 +23,7 @@ def flops_per_action(config: RunConfig) -> float:
     What is done once for any number of observations, such as putting constrained weights together, does not count; nor
     does it count that equal pictures need to be encoded only once.
     """
-    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
+    config = config.of_one_seed()
     policy = build_learner(config).policy
     worlds = 16  # many pictures, so that no odd number is rounded up
     counts = []

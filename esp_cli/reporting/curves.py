@@ -41,7 +41,7 @@ class RunCurve:
     @cached_property
     def spec(self) -> TaskSpec:
         """What the task says of itself, the convention of its returns among it."""
-        return spec_of(self.config.model_copy(update={"device": "cpu"}))
+        return spec_of(self.config.of_one_seed())
 
     @property
     def last_step(self) -> int:

@@ -67,6 +67,10 @@ class RunConfig(BaseModel):
             raise ValueError("a seed stands there twice")
         return seeds
 
+    def of_one_seed(self) -> RunConfig:
+        """Return the configuration of the first seed alone, on the CPU, for what all seeds and devices share."""
+        return self.model_copy(update={"seeds": self.seeds[:1], "device": "cpu"})
+
     def own_words(self) -> list[str]:
         """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""
         chosen = (("--task", self.task), ("--algo", self.algorithm), ("--network", self.network.name))
