@@ -9,10 +9,10 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
+from esp_cli.files.documents import Strict
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
@@ -33,10 +33,8 @@ class Iteration:
     finite: Tensor
 
 
-class LearnerConfig(BaseModel):
+class LearnerConfig(Strict):
     """What the hyperparameters of every algorithm have in common."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_envs: int
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from esp_cli.files.documents import DocumentFormat
+from esp_cli.files.documents import DocumentFormat, Strict
 
 MANIFEST_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
 MANIFEST = "manifest.json"
@@ -15,10 +15,8 @@ _FOLDER = "checkpoints"
 NAME_PATTERN = r"[a-z0-9]+(-[a-z0-9]+)*"
 
 
-class Score(BaseModel):
+class Score(Strict):
     """How well the policy does greedily; mean, s.e.m. and interval are over episodes, as there is one seed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mean: float
     sem: float
@@ -26,10 +24,8 @@ class Score(BaseModel):
     episodes: int = Field(ge=2)
 
 
-class Entry(BaseModel):
+class Entry(Strict):
     """One bundled policy, as the manifest describes it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=f"^{NAME_PATTERN}$", max_length=100)
     file: str = Field(pattern=rf"^{NAME_PATTERN}\.safetensors$", max_length=120)
@@ -54,10 +50,8 @@ class Entry(BaseModel):
         return self.name == standard_name(self.task, self.algorithm, self.prior)
 
 
-class Manifest(BaseModel):
+class Manifest(Strict):
     """What a manifest lists."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     policies: tuple[Entry, ...]
 

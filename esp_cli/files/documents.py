@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import read_regular
@@ -22,6 +22,12 @@ MAX_DOCUMENT_BYTES = 16 * 2**20
 """Parsed JSON takes some 20 times the space of its text."""
 MAX_NESTING = 64
 _MAX_INTEGER = 2**63
+
+
+class Strict(BaseModel):
+    """A model whose fields cannot change, and that refuses a field which it does not have."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class DocumentError(ValueError):

@@ -8,9 +8,10 @@ from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor, nn
 
+from esp_cli.files.documents import Strict
 from esp_cli.networks.io_spec import IoSpec
 
 ActivationName = Literal["relu", "tanh"]
@@ -19,15 +20,13 @@ Pull = Callable[[Tensor], list[Tensor]]
 """From the gradient by a network's outputs to those by its parameters."""
 
 
-class NetworkConfig(BaseModel, ABC):
+class NetworkConfig(Strict, ABC):
     """The settings of one kind of network; a subclass has the fields of its kind and builds it.
 
     Attributes:
         name: by which the user chose the network.
         recurrent: whether the network carries memory from step to step.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recurrent: ClassVar[bool] = False
 

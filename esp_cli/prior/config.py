@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from esp_cli.files.documents import Strict
 
 _AUTO = {"kind": "esp", "trust": "measured", "fade": 0.5}
 """What `kind` "auto" stands for, under what else the user chooses."""
@@ -13,15 +15,13 @@ SAID_BY_AUTO = frozenset({*_AUTO, "transforms", "weights"})
 """Settings that another prior has no say in where a user asks for "auto"."""
 
 
-class PriorConfig(BaseModel):
+class PriorConfig(Strict):
     """The symmetry prior: which elements, and how they enter learning.
 
     `kind` "esp" has both parts, copies and consistency losses; "augment" and "consistency" have one of them; "none" is
     the plain learner. "auto" is short for "esp" with trust "measured" that fades: elements that hold stay, the others
     count by how nearly they hold, and only for the first half of the run. It weighs all of d4, whatever a preset has.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["esp", "augment", "consistency", "none", "auto"] = Field(
         "esp", description="copies and losses, one of them alone, neither (plain), or auto: what holds in the task"

@@ -20,11 +20,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from esp_cli import __version__
 from esp_cli.evaluation.final import FinalEvaluation
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, parse_object, shortened, validate
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.build import spec_of
@@ -46,7 +46,7 @@ class StudyError(ValueError):
 STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
 
 
-class Cell(BaseModel):
+class Cell(Strict):
     """One run of a study, and where it stands in tables and pictures.
 
     Attributes:
@@ -58,8 +58,6 @@ class Cell(BaseModel):
         paper: place of the paper's number, see `paper.reported`; None where there is none that compares.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     name: str
     panel: str
     variant: str
@@ -68,7 +66,7 @@ class Cell(BaseModel):
     paper: tuple[str, ...] | None = None
 
 
-class Study(BaseModel):
+class Study(Strict):
     """A named list of runs.
 
     Attributes:
@@ -79,8 +77,6 @@ class Study(BaseModel):
         esp_version: of the program that planned it.
         cells: in the order in which they are run and shown.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: str
     title: str

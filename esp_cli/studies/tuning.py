@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import Field, JsonValue
 
 from esp_cli.checking.measured import planned
-from esp_cli.files.documents import DocumentFormat
+from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
 from esp_cli.studies.tuning_space import Dimension, space_of
@@ -30,7 +30,7 @@ _TUNING, _TRIALS = "tuning.json", "trials"
 NAMES = {"none": "plain", "esp": "ESP", "augment": "augmentation", "consistency": "loss"}
 
 
-class Tuning(BaseModel):
+class Tuning(Strict):
     """What is asked for.
 
     Attributes:
@@ -49,8 +49,6 @@ class Tuning(BaseModel):
         command: the command line behind it.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     task: str
     algorithm: str
     preset: str = "default"
@@ -60,7 +58,7 @@ class Tuning(BaseModel):
     reach: float | None = None
     steps: int = Field(ge=1)
     trial_seeds: tuple[int, ...]
-    overrides: dict[str, JsonValue] = {}
+    overrides: dict[str, JsonValue] = Field({})
     space: dict[str, Dimension]
     device: str = "cpu"
     command: str = ""

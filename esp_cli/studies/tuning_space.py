@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, JsonValue, model_validator
+from pydantic import JsonValue, model_validator
 
-from esp_cli.files.documents import parse_value
+from esp_cli.files.documents import Strict, parse_value
 from esp_cli.files.tables import flat, read_table
 from esp_cli.training.config import validated
 
 
-class Dimension(BaseModel):
+class Dimension(Strict):
     """What is tried of one setting: a range from `low` to `high`, or `choices`.
 
     Attributes:
@@ -23,8 +23,6 @@ class Dimension(BaseModel):
         log: whether to draw orders of magnitude evenly.
         choices: the values, where it is no range.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     low: int | float | None = None
     high: int | float | None = None

@@ -8,11 +8,11 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.files.documents import one_sentence, parse_value, shortened
+from esp_cli.files.documents import Strict, one_sentence, parse_value, shortened
 from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -24,28 +24,22 @@ SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "ev
 _OPTIONS = {"prior.kind": "--prior", "network.name": "--network"}
 
 
-class EvaluationConfig(BaseModel):
+class EvaluationConfig(Strict):
     """How a run is evaluated while it trains (the field's protocol: 32 episodes every 10k steps)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     every_steps: int = Field(10_000, ge=1, description="environment steps per seed between evaluations")
     episodes: int = Field(32, ge=1, description="per seed, greedy and stochastic each")
 
 
-class InitialPolicy(BaseModel):
+class InitialPolicy(Strict):
     """The policy that a run started from; the run's folder holds a copy of it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     source: str = Field(max_length=4096, description="where it was found: a run folder, a file, a bundled policy")
     sha256: str = Field(pattern="^[0-9a-f]{64}$", description="of its weights")
 
 
-class RunConfig(BaseModel):
+class RunConfig(Strict):
     """Everything that decides a run's numbers. Two runs of one config on one machine are equal bit for bit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: str = Field(max_length=100)
     algorithm: str = Field(max_length=100)
