@@ -70,7 +70,7 @@ class Registry(Mapping[str, type[T]]):
         if name in self._registered:
             return self._registered[name]
         if name in self._built_in:
-            return self._checked(_load(self._built_in[name]), name)
+            return self._checked(load(self._built_in[name]), name)
         if entry := self._installed().get(name):
             _FOREIGN.add(entry.module.partition(".")[0])
             try:
@@ -126,7 +126,7 @@ class Registry(Mapping[str, type[T]]):
         return self._checked(getattr(module, class_name), name)
 
     def _checked(self, cls: object, name: str) -> type[T]:
-        base: type[T] = _load(self._base)
+        base: type[T] = load(self._base)
         if not (isinstance(cls, type) and issubclass(cls, base)):
             article = "an" if self.noun[0] in "aeiou" else "a"
             raise ValueError(
@@ -151,7 +151,8 @@ def raised_in(failure: BaseException) -> str | None:
     return place
 
 
-def _load(target: str) -> Any:
+def load(target: str) -> Any:
+    """Import "module:name" and return what it names."""
     module, attribute = target.split(":")
     return getattr(import_module(module), attribute)
 

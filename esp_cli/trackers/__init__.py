@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 
 from esp_cli.trackers.sink import Guarded, Sink, TrackedRun
 from esp_envs.extras import install
+from esp_envs.installed import load
 
 __all__ = ["TRACKERS", "Guarded", "Sink", "TrackedRun", "open_trackers", "require"]
 
@@ -49,5 +49,4 @@ def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], N
 
 
 def _made(name: str, run: TrackedRun) -> Sink:
-    module, attribute = TRACKERS[name].split(":")
-    return getattr(import_module(module), attribute)(run)
+    return load(TRACKERS[name])(run)

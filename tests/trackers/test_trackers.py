@@ -57,9 +57,9 @@ class Failing:
 def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
-    monkeypatch.setitem(trackers.TRACKERS, "wandb", "tests.trackers.test_trackers:Failing")
+    monkeypatch.setitem(trackers.TRACKERS, "wandb", "of a test")
     monkeypatch.setattr(trackers, "find_spec", lambda name: True)
-    monkeypatch.setattr(trackers, "import_module", lambda name: sys.modules[__name__])
+    monkeypatch.setattr(trackers, "load", lambda target: Failing)
     monkeypatch.setattr(Failing, "way", way)
     monkeypatch.setattr(Failing, "rows", 0)
     told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", "wandb", "--out", tmp_path / "run")

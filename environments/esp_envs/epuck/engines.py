@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.physics import Physics
+from esp_envs.installed import load
 
 ENGINES = {
     "mujoco": "esp_envs.epuck.mujoco_planar:MujocoPlanar",
@@ -24,9 +23,8 @@ def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: flo
     if name not in ENGINES:
         raise ValueError(f"unknown physics '{name}'; there are {', '.join(ENGINES)}")
     forget_missing_backend()
-    module, attribute = ENGINES[name].split(":")
     try:
-        engine: type[Physics] = getattr(import_module(module), attribute)
+        engine: type[Physics] = load(ENGINES[name])
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
