@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
     from esp_cli.studies.tuner import Outcome, Trials
-    from esp_cli.studies.tuning import Tuning
+    from esp_cli.studies.tuning import Goal, Tuning
 
 EPILOG = """Examples:\n
     esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
@@ -75,7 +75,7 @@ def _tuning(
     priors: Sequence[str],
     budget: int,
     space: Path | None,
-    goal: Literal["return", "steps", "seconds"],
+    goal: Goal,
     reach: float | None,
     trial_seeds: int,
 ) -> Tuning:

@@ -25,6 +25,8 @@ STATES = 10_000
 """On which the observations built from poses are compared with the task's."""
 TOLERANCE = 1e-5
 """Largest difference of an observation's number; float32 in metres gives 1e-6."""
+Observer = Callable[[Floats, Floats, Floats], Floats]
+"""(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
 _WORLDS = 100
 _JITTER_M = 0.001
 """Of positions that are met in the task: in a perfect square two robots are equally near."""
@@ -89,12 +91,12 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, met: bool)
     return poses, items("goals"), items("obstacles"), seen
 
 
-def compare_scenes(scenes: Scenes, observe: Callable[[Floats, Floats, Floats], Floats]) -> float:
+def compare_scenes(scenes: Scenes, observe: Observer) -> float:
     """Return the largest difference between the task's observations and those built from poses.
 
     Args:
         scenes: states and what the task shows in them.
-        observe: (poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D].
+        observe: builds observations from poses.
 
     Raises:
         RuntimeError: they do not agree, which is a bug.
@@ -106,12 +108,12 @@ def compare_scenes(scenes: Scenes, observe: Callable[[Floats, Floats, Floats], F
     return gap
 
 
-def python_observer(description: Mapping[str, Any]) -> Callable[[Floats, Floats, Floats], Floats]:
+def python_observer(description: Mapping[str, Any]) -> Observer:
     """Return what the Python controllers do."""
     return Pilot(dict(description), lambda obs: obs).observations
 
 
-def c_observer(folder: Path, width: int) -> Callable[[Floats, Floats, Floats], Floats]:
+def c_observer(folder: Path, width: int) -> Observer:
     """Compile esp_epuck.c and policy.c, and return what they do, robot by robot.
 
     Raises:
