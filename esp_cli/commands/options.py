@@ -103,18 +103,13 @@ def register_learners(algorithms: Iterable[str | None], networks: Iterable[objec
     Raises:
         ValueError: a module cannot be imported, or holds no such algorithm or network.
     """
-    own = [name for name in algorithms if name is not None and ":" in name]
-    if own:
-        from esp_cli.algorithms.registry import ALGORITHMS
+    from esp_envs.installed import load
 
-        for name in own:
-            ALGORITHMS.register(name)
-    own = [name for name in networks if isinstance(name, str) and ":" in name]
-    if own:
-        from esp_cli.networks.build import NETWORKS
-
-        for name in own:
-            NETWORKS.register(name)
+    homes = {"esp_cli.algorithms.registry:ALGORITHMS": algorithms, "esp_cli.networks.build:NETWORKS": networks}
+    for home, names in homes.items():
+        for name in names:
+            if isinstance(name, str) and ":" in name:
+                load(home).register(name)
 
 
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
