@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from esp_cli.commands.options import check_finite
+from esp_cli.commands.options import Mode, check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 
@@ -30,7 +30,7 @@ def compare_homomorphic(
     ] = None,
     group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = GROUP,
     mode: Annotated[
-        Literal["greedy", "stochastic"] | None,
+        Mode | None,
         typer.Option("--mode", help="Which evaluations the tables state; by default stochastic."),
     ] = None,
     threshold: Annotated[

@@ -185,6 +185,7 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
         ),
     ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
+Mode = Literal["greedy", "stochastic"]
 Device = Literal["auto", "cpu", "cuda"]
 DeviceOption = Annotated[
     Device,

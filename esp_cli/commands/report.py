@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,7 @@ from esp_cli import console
 from esp_cli.commands.counts import parse_count
 from esp_cli.commands.options import (
     JsonOption,
+    Mode,
     OwnAlgoOption,
     OwnNetworkOption,
     OwnTaskOption,
@@ -32,9 +33,6 @@ EPILOG = """Examples:\n
     esp report runs/cn-mappo runs/cn-mappo-esp\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --at 500k --at 3M --threshold -125 --plot curves.png\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --out comparison"""
-
-Mode = Literal["greedy", "stochastic"]
-
 
 RunsArgument = Annotated[
     list[str] | None,
