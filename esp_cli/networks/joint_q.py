@@ -62,7 +62,9 @@ class OneValue:
         Returns:
             [S, W, N, K].
         """
-        return _exchanged(critic, seen, joint, others)
+        shape = joint.shape[1:-2]
+        rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
+        return with_one_exchanged(critic, *rows).unflatten(1, shape).squeeze(-1)
 
 
 class OneValueEach(OneValue):
@@ -95,13 +97,7 @@ class OneValueEach(OneValue):
         """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `OneValue`."""
         # the agent's own action is the last of its row, and the only one that is exchanged
         seen = torch.cat([seen, in_a_circle(joint)[..., : -joint.shape[-1]]], -1)
-        return _exchanged(critic, seen, joint.unsqueeze(-2), others.unsqueeze(-3)).squeeze(-2)
-
-
-def _exchanged(critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-    shape = joint.shape[1:-2]
-    rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
-    return with_one_exchanged(critic, *rows).unflatten(1, shape).squeeze(-1)
+        return super().exchanged(critic, seen, joint.unsqueeze(-2), others.unsqueeze(-3)).squeeze(-2)
 
 
 def in_a_circle(items: Tensor) -> Tensor:
