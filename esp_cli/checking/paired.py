@@ -12,6 +12,7 @@ A random prey or a noisy sensor is thus no false alarm, and no task has to turn 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -74,17 +75,7 @@ def _outcomes(env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned
         env.reset()  # draws chance of its own
         start = env.set_state(state if turned is None else turned.state(state))
         step = env.step(action if turned is None else turned.action(action))
-        reached = step.final or step.next
-        steps.append(
-            Step(
-                next=start,
-                reward=step.reward,
-                terminated=step.terminated,
-                truncated=step.truncated,
-                final=reached,
-                metrics={},
-            )
-        )
+        steps.append(replace(step, next=start, final=step.reached, metrics={}))
     return steps
 
 

@@ -65,7 +65,7 @@ def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> T
         for _ in range(min(steps, env.spec.horizon)):
             action = env.random_action()
             step = env.step(action)
-            row: tuple[Tensor, ...] = (observation.obs, action, step.reward, (step.final or step.next).obs)
+            row: tuple[Tensor, ...] = (observation.obs, action, step.reward, step.reached.obs)
             row += () if observation.action_mask is None else (observation.action_mask,)
             if rows:
                 row = tuple(
@@ -73,7 +73,7 @@ def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> T
                     for old, new in zip(rows[-1], row, strict=True)
                 )
             rows.append(row)
-            over = over | step.terminated | step.truncated
+            over = over | step.ended
             observation = step.next
         found.append(rows)
     parts = [

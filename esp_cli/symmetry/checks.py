@@ -87,21 +87,17 @@ def environment_errors(
     errors |= {"reward": 0.0, "next_obs": 0.0, "next_state": 0.0, "end": 0.0}
     alive = torch.ones(state.shape[:2], dtype=torch.bool, device=state.device)
     for step, turned in zip(steps, turned_steps, strict=True):
-        reached, turned_reached = step.final or step.next, turned.final or turned.next
+        reached, turned_reached = step.reached, turned.reached
         pairs = {
             "reward": (transform.per_agent(step.reward), turned.reward),
             "next_obs": (transform.obs(reached.obs), turned_reached.obs),
             "next_state": (transform.state(reached.state), turned_reached.state),
-            "end": (_ended(step).float(), _ended(turned).float()),
+            "end": (step.ended.float(), turned.ended.float()),
         }
         for name, (expected, got) in pairs.items():
             errors[name] = max(errors[name], _gap(expected[alive], got[alive]))
-        alive = alive & ~_ended(step) & ~_ended(turned)
+        alive = alive & ~step.ended & ~turned.ended
     return errors
-
-
-def _ended(step: Step) -> Tensor:
-    return step.terminated | step.truncated
 
 
 def _gap(a: Tensor, b: Tensor) -> float:
