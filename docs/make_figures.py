@@ -27,7 +27,7 @@ RESULTS = {
 """Results in docs/measured -> their figures, of which each learner has one."""
 BREAKING = {
     "breaking-navigation": ("breaking-navigation", "breaking-navigation-others"),
-    "breaking-predator-prey": ("breaking-predator-prey",),
+    "breaking-predator-prey": ("breaking-predator-prey", "breaking-predator-prey-others"),
     "breaking-formation": ("breaking-formation",),
 }
 """Figures in docs/measured, one for each setting -> the results that are drawn together."""
