@@ -22,6 +22,21 @@ settings.register_profile("esp", deadline=None, derandomize=True, database=None)
 settings.load_profile("esp")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def nothing_left() -> Iterator[None]:
+    """Take back what a module's tests registered: a process runs other modules after them."""
+    from esp_cli.algorithms.registry import ALGORITHMS
+    from esp_cli.networks.build import NETWORKS
+    from esp_envs import installed
+    from esp_envs.registry import TASKS
+
+    with pytest.MonkeyPatch.context() as patch:
+        for registry in (TASKS, ALGORITHMS, NETWORKS):
+            patch.setattr(registry, "_registered", dict(registry._registered))
+        patch.setattr(installed, "_FOREIGN", set(installed._FOREIGN))
+        yield
+
+
 @pytest.fixture(scope="session")
 def like_machine() -> None:
     """Skip where the weights on file are out of reach."""

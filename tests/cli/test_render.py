@@ -150,6 +150,7 @@ def test_without_graphics_the_view_is_from_above_and_a_note_says_why(
     robots: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(gl, "is_installed", lambda backend: False)
+    monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)  # which MuJoCo has set if this process drew before
     told = esp("render", robots, "-o", tmp_path / "film.gif", "--size", 64)
     assert "apt-get install libosmesa6 (Fedora: dnf install mesa-libOSMesa); so the view is from above\n" in told.stderr
     with Image.open(tmp_path / "film.gif") as film:
