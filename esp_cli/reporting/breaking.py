@@ -36,7 +36,7 @@ class Verdict:
 
     Attributes:
         method: its name.
-        unbroken: whether it is within one standard error of ESP where nothing is broken, in every series.
+        unbroken: whether it is at most one standard error behind ESP where nothing is broken, in every series.
         largest: whether it is not behind the plain learner at the largest strength, in every series.
         between: whether it is ahead of the plain learner and of ESP or level with them, at all strengths in between.
     """
@@ -135,7 +135,7 @@ def _unbroken(results: Results, one: Series, method: str) -> bool | None:
     if found[0] is None or found[1] is None or found[0].mean is None or found[1].mean is None:
         return None
     error = max(found[0].sem or 0.0, found[1].sem or 0.0)
-    return abs(found[0].mean - found[1].mean) <= error
+    return found[0].mean >= found[1].mean - error
 
 
 def _largest(results: Results, one: Series, method: str) -> bool | None:

@@ -194,11 +194,11 @@ def verdicts_table(results: Results) -> Table | None:
     said = {True: "yes", False: "no", None: NOTHING}
     rows = tuple((v.method, said[v.unbroken], said[v.largest], said[v.between]) for v in verdicts(results))
     caption = (
-        "Where nothing is broken, a default is within one standard error of ESP. At the largest strength it is not "
-        "behind the plain learner. In between it is ahead of both or level with them. All of it holds in every task. "
+        "Where nothing is broken, a default is at most one standard error behind ESP. At the largest strength it is "
+        "not behind the plain learner. In between it is ahead of both or level with them. All holds in every task. "
         f"{NOTHING}: runs are missing."
     )
-    headings = ("method", "as ESP unbroken", "not behind plain at the largest", "ahead or level in between")
+    headings = ("method", "not behind ESP unbroken", "not behind plain at the largest", "ahead or level in between")
     return Table("Could it be the default?", headings, rows, caption) if rows else None
 
 
