@@ -28,7 +28,7 @@ RESULTS = {
 BREAKING = {
     "breaking-navigation": ("breaking-navigation", "breaking-navigation-others", "breaking-navigation-relaxed"),
     "breaking-predator-prey": ("breaking-predator-prey", "breaking-predator-prey-others"),
-    "breaking-formation": ("breaking-formation", "breaking-formation-others"),
+    "breaking-formation": ("breaking-formation", "breaking-formation-others", "breaking-formation-relaxed"),
 }
 """Figures in docs/measured, one for each setting -> the results that are drawn together."""
 Row = dict[str, str]
