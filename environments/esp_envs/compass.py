@@ -34,7 +34,7 @@ class Compass(Environment):
         super().__init__(inner.settings, inner.num_envs, inner.generators)
         self.inner = inner
         spec = inner.spec
-        self._joint = spec.state == joint_layout(spec.observation, spec.num_agents)
+        self._joint = spec.is_joint
         self.spec = framed(spec, labels)
         frame = torch.tensor([length, 0.0, 0.0, length], device=self.device)
         label = torch.linspace(-length, length, spec.num_agents, device=self.device) if labels else frame[:0]
@@ -93,6 +93,6 @@ def framed(spec: TaskSpec, labels: bool = False) -> TaskSpec:
     own = (Field("label", Kind.SCALAR),) if labels else ()
     each = (Field("labels", Kind.SCALAR, spec.num_agents, items=Items.AGENTS),) if labels else ()
     observation = layout(*spec.observation.fields, frame, *own)
-    if spec.state == joint_layout(spec.observation, spec.num_agents):
+    if spec.is_joint:
         return replace(spec, observation=observation, state=joint_layout(observation, spec.num_agents))
     return replace(spec, observation=observation, state=layout(*spec.state.fields, frame, *each))

@@ -246,6 +246,11 @@ class Spaces:
     masks: bool = False
 
     @property
+    def is_joint(self) -> bool:
+        """Whether the state is all agents' observations end to end."""
+        return self.state == joint_layout(self.observation, self.num_agents)
+
+    @property
     def label(self) -> str:
         """What messages call these spaces."""
         return "the task"

@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 from esp_cli.symmetry import Element, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.groups import swap_and_round
 from esp_cli.symmetry.parse import Factors
 from esp_envs.spec import Spaces
@@ -45,7 +46,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
 
 def _orders(name: str, count: int) -> list[str]:
     """Return the names of elements that generate all orders of some things."""
-    return ["-".join(map(str, (name, *order))) for order in swap_and_round(count)]
+    return [order_name(name, order) for order in swap_and_round(count)]
 
 
 def _refusal(element: Element, spaces: Spaces) -> str | None:
@@ -60,7 +61,7 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
     factors = Factors.of(spaces.symmetry)
-    if not all(factors.order(name, len(places)) for name, places in element.orders):
+    if not all(factors.allow(name, len(places)) for name, places in element.orders):
         return False
     if element.in_place.is_identity:
         return True
@@ -78,11 +79,10 @@ def found_group(holding: Collection[str], spaces: Spaces) -> str:
             plane = name
     if "rot57" in holding:
         plane = "o2" if "flip23" in holding else "so2"
-    agents = ["agents"] if any(name.startswith("agents-") for name in holding) else []
-    items = [
-        f"{name}-{count}" for name, count in exchangeable(spaces).items() if set(_orders(name, count)) <= set(holding)
-    ]
-    return "*".join((plane, *agents, *items))
+    agents = any(name.startswith("agents-") for name in holding)
+    counts = exchangeable(spaces).items()
+    items = {name: count for name, count in counts if set(_orders(name, count)) <= set(holding)}
+    return Factors(plane, agents, items).name
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:

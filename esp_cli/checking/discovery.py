@@ -19,6 +19,7 @@ from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup
 from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.parse import parse_elements
 from esp_envs.spec import Spaces
 
@@ -219,7 +220,7 @@ def _exchanges(name: str, count: int) -> list[str]:
     for a, b in itertools.islice(itertools.combinations(range(count), 2), _EXCHANGES):
         order = list(range(count))
         order[a], order[b] = b, a
-        texts.append("-".join(map(str, (name, *order))))
+        texts.append(order_name(name, order))
     return texts
 
 

@@ -21,7 +21,7 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, judged
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
-from esp_envs.spec import Layout, TaskSpec, joint_layout
+from esp_envs.spec import Layout, TaskSpec
 
 MakeWorlds = Callable[[int, Sequence[int]], Environment]
 _MOST_WORLDS = 256
@@ -141,7 +141,6 @@ def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
 
 def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) -> Outcomes:
     """Return everything that the steps gave by field, transformed."""
-    joint = spec.state == joint_layout(spec.observation, spec.num_agents)
     parts: dict[str, list[Tensor]] = {}
 
     def add(prefix: str, layout: Layout, rows: Tensor) -> None:
@@ -152,7 +151,7 @@ def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) 
         for prefix, seen in (("start ", step.next), ("", step.final)):
             assert isinstance(seen, Observation)
             add(f"{prefix}obs.", spec.observation, seen.obs if transform is None else transform.obs(seen.obs))
-            if not joint:
+            if not spec.is_joint:
                 add(f"{prefix}state.", spec.state, seen.state if transform is None else transform.state(seen.state))
             if seen.action_mask is not None:
                 mask = seen.action_mask if transform is None else transform.push_outputs(seen.action_mask)

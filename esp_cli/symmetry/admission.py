@@ -11,7 +11,7 @@ from esp_cli.symmetry.elements import Element, item_places
 from esp_cli.symmetry.groups import MOST_ITEMS, Group
 from esp_cli.symmetry.parse import Factors, is_item_name, parse_elements
 from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
-from esp_envs.spec import Continuous, Discrete, Items, Spaces, joint_layout
+from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
 DISCOVERED = "discovered:"
 """Begins transforms that were found in data, and that the task need not declare."""
@@ -67,19 +67,14 @@ def exchangeable(spaces: Spaces) -> dict[str, int]:
         field.name: field.count
         for field in spaces.observation.fields
         if field.items is Items.FIXED and field.pixels is None and 2 <= field.count <= MOST_ITEMS
-        if field.name in own or _is_joint(spaces)
+        if field.name in own or spaces.is_joint
         if is_item_name(field.name)
     }
 
 
 def unrestricted(spaces: Spaces) -> Spaces:
     """Return spaces whose task may have any symmetry: actions and layouts alone say what is carried."""
-    orders = (f"{name}-{count}" for name, count in exchangeable(spaces).items())
-    return replace(spaces, nearly="*".join(("o2*agents", *orders)))
-
-
-def _is_joint(spaces: Spaces) -> bool:
-    return spaces.state == joint_layout(spaces.observation, spaces.num_agents)
+    return replace(spaces, nearly=Factors("o2", True, exchangeable(spaces)).name)
 
 
 def _carries(name: str, spaces: Spaces) -> bool:
@@ -148,7 +143,7 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         return f"the permutation is not one of its {spaces.num_agents} agents"
     if not Factors.of(_usable(spaces)).agents:
         return f"its declared symmetry, {_usable(spaces)}, does not say that agents may be exchanged"
-    if not _is_joint(spaces) and all(f.items is not Items.AGENTS for f in spaces.state.fields):
+    if not spaces.is_joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
         joint_sources(spaces.observation, np.array([moving[0].permutation]))
@@ -164,9 +159,9 @@ def _items_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     for name, places in dict.fromkeys(order for element in elements for order in element.items):
         if name not in seen:
             return f"it has no field '{name}', but {', '.join(seen)}"
-        if not Factors.of(usable).order(name, len(places)):
+        if not Factors.of(usable).allow(name, len(places)):
             return f"its declared symmetry, {usable}, does not say that its {name} may be exchanged"
-        if not _is_joint(spaces) and all(field.name != name for field in spaces.state.fields):
+        if not spaces.is_joint and all(field.name != name for field in spaces.state.fields):
             return f"its state does not hold its {name}"
     return None
 

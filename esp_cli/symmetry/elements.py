@@ -98,6 +98,11 @@ def places_of(elements: Sequence[Element], num_agents: int) -> Indices | None:
     return np.array([element.permutation or stay for element in elements], dtype=np.int64)
 
 
+def order_name(name: str, places: Sequence[int]) -> str:
+    """Return the name of an order of agents or items: "agents-1-0-2"."""
+    return "-".join(map(str, (name, *places)))
+
+
 def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
     """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
 
-from esp_cli.symmetry.elements import Element
+from esp_cli.symmetry.elements import Element, order_name
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,
     MOST_ITEMS,
@@ -21,6 +21,7 @@ from esp_cli.symmetry.groups import (
     item_orders,
     orthogonal,
     special_orthogonal,
+    swap_and_round,
 )
 from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
 
@@ -36,6 +37,8 @@ _DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
 _ORDER = r"(?!(?i:rot|flip|agents)-)([A-Za-z]\w*)((?:-\d{1,4})+)"
 """A field and numbers: how many items it has, or the place that each of them moves to."""
 _MAX_FOLD = 360
+_PLANE = (0, "")
+"""Rank of planar groups in a direct product, see `_rank`."""
 
 
 def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
@@ -75,13 +78,12 @@ def parse_group(text: str, num_agents: int) -> Group:
     groups = [f for f in factors if isinstance(f, Group)]
     if len(groups) != len(factors):
         raise ValueError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
-    ranked = sorted(groups, key=_rank)
-    ranks = [_rank(group) for group in ranked]
-    if len(set(ranks)) < len(ranks) or (len(groups) > 1 and _rank(groups[-1]) == _PLANE):
+    ranked = {_rank(group): group for group in groups}
+    if len(ranked) < len(groups) or (len(groups) > 1 and next(reversed(ranked)) == _PLANE):
         raise ValueError(
             f"'{text}' is not a direct product; write a planar group, agents and fields, each once, as d4*agents"
         )
-    return ranked[0] if len(ranked) == 1 else direct_product(*ranked)
+    return groups[0] if len(groups) == 1 else direct_product(*(ranked[rank] for rank in sorted(ranked)))
 
 
 @dataclass(frozen=True)
@@ -119,11 +121,16 @@ class Factors:
         return cls("*".join(plane), "agents" in words, items)
 
     @property
+    def name(self) -> str:
+        """The symmetry as a task declares it."""
+        return "*".join((*filter(None, [self.plane]), *(["agents"] if self.agents else []), *self.orders))
+
+    @property
     def orders(self) -> list[str]:
         """The groups of all orders of items: ["landmarks-3"]."""
         return [f"{name}-{count}" for name, count in self.items.items()]
 
-    def order(self, name: str, count: int) -> bool:
+    def allow(self, name: str, count: int) -> bool:
         """Return whether agents (so named), or the items of a field, may take any order."""
         return self.agents if name == "agents" else self.items.get(name) == count
 
@@ -131,9 +138,6 @@ class Factors:
 def is_item_name(name: str) -> bool:
     """Return whether orders of the items of a field with this name can be written: "landmarks-1-0-2"."""
     return "-" not in name and re.fullmatch(_ORDER, f"{name}-2") is not None
-
-
-_PLANE = (0, "")
 
 
 def _rank(group: Group) -> tuple[int, str]:
@@ -221,7 +225,7 @@ def _order(word: str, count: int) -> tuple[int, ...]:
     name, *numbers = word.split("-")
     places = tuple(map(int, numbers))
     if sorted(places) != list(range(count)):
-        example = "-".join(map(str, (name, *range(1, count), 0)))
+        example = order_name(name, swap_and_round(count)[1])
         raise ValueError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
     return places
 

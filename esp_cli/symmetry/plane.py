@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Floats, Indices, Orders, compose_permutations
+from esp_cli.symmetry.elements import Element, Floats, Indices, Orders, compose_permutations, order_name
 from esp_envs.spec import Field, Kind
 
 _PIXEL_TOLERANCE = 1e-6
@@ -183,7 +183,7 @@ class PlaneElement(Element):
             parts.append(_MIRROR_NAMES.get(axis, f"flip{_number(axis)}"))
         elif self.turn:
             parts.append(f"rot{_number(self.degrees)}")
-        parts += ["-".join(map(str, (name, *places))) for name, places in self.orders]
+        parts += [order_name(name, places) for name, places in self.orders]
         return "*".join(parts) or "identity"
 
     def __matmul__(self, other: PlaneElement) -> PlaneElement:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from esp_cli.symmetry.elements import Element, Floats, Indices, item_places, places_of
-from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, joint_layout
+from esp_envs.spec import Discrete, Field, Items, Layout, Spaces
 
 _MATCH_TOLERANCE = 1e-6
 
@@ -131,7 +131,7 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
     places = places_of(elements, spaces.num_agents)
     if places is None:
         return layout_matrix(spaces.state, elements)
-    if spaces.state == joint_layout(spaces.observation, spaces.num_agents):
+    if spaces.is_joint:
         return joint_matrix(spaces.observation, elements, places)
     came_from = np.argsort(places, axis=1)
     group, num_agents = places.shape

@@ -102,7 +102,7 @@ def test_factors_of_a_product_may_stand_in_any_order_behind_the_plane() -> None:
 def test_what_a_symmetry_moves() -> None:
     factors = Factors.of("d4 * agents*Marks-3*cars-2")
     assert (factors.plane, factors.agents, factors.items) == ("d4", True, {"Marks": 3, "cars": 2})
-    assert (factors.order("agents", 5), factors.order("Marks", 3), factors.order("cars", 3)) == (True, True, False)
+    assert (factors.allow("agents", 5), factors.allow("Marks", 3), factors.allow("cars", 3)) == (True, True, False)
     assert Factors.of("flip-y") == Factors("flip-y", False, {})
     with pytest.raises(ValueError, match="'marks-1-0' is one order of items; declare all of them, as in marks-2"):
         Factors.of("d4*marks-1-0")
