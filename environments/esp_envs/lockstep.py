@@ -28,7 +28,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
-from esp_envs.spec import Continuous, Kind, TaskSpec
+from esp_envs.spec import TaskSpec
 
 World = dict[str, Tensor]
 """The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
@@ -184,7 +184,7 @@ class BatchedTask(LockstepTask):
                 raise ValueError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
 
     def _play(self, action: Tensor) -> Outcome:
-        reward, metrics = self._advance(self.world, self._admissible(action))
+        reward, metrics = self._advance(self.world, self.spec.action.admissible(action))
         if reward.dim() == 2:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
         require_shape("reward", reward, self.action_shape[:3])
@@ -209,23 +209,6 @@ class BatchedTask(LockstepTask):
         parts = state.split([field.width for field in self.spec.state.fields], -1)
         fields = self.spec.state.fields
         return {f.name: part.unflatten(-1, (f.count, f.item_width)) for f, part in zip(fields, parts, strict=True)}
-
-    def _admissible(self, action: Tensor) -> Tensor:
-        """Scale vectors back to length 1 and clip other numbers, as a continuous action space promises."""
-        if not isinstance(self.spec.action, Continuous):
-            return action
-        parts = []
-        for field, part in zip(
-            self.spec.action.layout.fields,
-            action.split([f.width for f in self.spec.action.layout.fields], -1),
-            strict=True,
-        ):
-            if field.kind is Kind.VECTOR:
-                vectors = part.unflatten(-1, (-1, 2))
-                parts.append((vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1.0)).flatten(-2))
-            else:
-                parts.append(part.clamp(-1.0, 1.0))
-        return torch.cat(parts, -1)
 
 
 def to_others(position: Tensor) -> Tensor:

@@ -16,7 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -200,6 +203,10 @@ class Discrete:
         """A, the number of actions."""
         return len(self.points)
 
+    def admissible(self, action: Tensor) -> Tensor:
+        """Return actions as the task takes them: as they are."""
+        return action
+
 
 @dataclass(frozen=True)
 class Continuous:
@@ -215,6 +222,15 @@ class Continuous:
     def width(self) -> int:
         """Numbers per agent."""
         return self.layout.width
+
+    def admissible(self, action: Tensor) -> Tensor:
+        """Return actions [..., width] as the task takes them: vectors of length 1 at most, other numbers clipped."""
+        within = action.clamp(-1.0, 1.0)
+        for part, where in zip(self.layout.fields, self.layout.slices().values(), strict=True):
+            if part.kind is Kind.VECTOR:
+                vectors = action[..., where].unflatten(-1, (-1, 2))
+                within[..., where] = (vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1.0)).flatten(-2)
+        return within
 
 
 ActionSpace = Discrete | Continuous

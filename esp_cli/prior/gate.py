@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from esp_cli.symmetry import Transform
-from esp_envs.spec import Continuous, Discrete, Kind, Spaces
+from esp_envs.spec import Discrete, Spaces
 
 if TYPE_CHECKING:  # a loop of one's own brings no environment of ours
     from esp_envs.base import Environment
@@ -140,7 +140,7 @@ class Gate:
             obs: [S, B, T, N, D].
             action: [S, B, T, N] int64, or [S, B, T, N, width] float32.
         """
-        width, action = obs.shape[-1], _bounded(self.spaces, action)
+        width, action = obs.shape[-1], self.spaces.action.admissible(action)
         here = self._predicted(obs, action)
         there = self._predicted(transform.obs(obs), transform.action(action))
         pushed = torch.cat([transform.obs(here[..., :width]), transform.per_agent(here[..., width]).unsqueeze(-1)], -1)
@@ -169,7 +169,7 @@ def fitted(env: Environment, doubt: float, certain: Collection[str], alike: bool
     """
     spaces = env.spec
     obs, action, outputs = _played(env)
-    inputs = inputs_of(spaces, obs, _bounded(spaces, action))
+    inputs = inputs_of(spaces, obs, spaces.action.admissible(action))
     # every second episode: the first and the last half may be of two policies
     parts = [_moments(inputs[part], outputs[part], alike) for part in (slice(0, None, 2), slice(1, None, 2))]
     whole = _solved(parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
@@ -219,15 +219,3 @@ def _moments(inputs: Tensor, outputs: Tensor, alike: bool) -> tuple[Tensor, Tens
 def _solved(gram: Tensor, cross: Tensor) -> Tensor:
     ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
     return torch.linalg.solve(gram + ridge, cross).float()
-
-
-def _bounded(spaces: Spaces, action: Tensor) -> Tensor:
-    """Return actions as the task takes them: continuous ones within their bounds."""
-    if not isinstance(spaces.action, Continuous):
-        return action
-    bounded = action.clamp(-1, 1)
-    for field, where in zip(spaces.action.layout.fields, spaces.action.layout.slices().values(), strict=True):
-        if field.kind is Kind.VECTOR:
-            vector = action[..., where].unflatten(-1, (-1, 2))
-            bounded[..., where] = (vector / vector.norm(dim=-1, keepdim=True).clamp_min(1)).flatten(-2)
-    return bounded

@@ -13,8 +13,9 @@ from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_thres
 from esp_cli.evaluation.final import FinalEvaluation, Mode
 from esp_cli.evaluation.network_cost import flops_per_action, network_parameters
 from esp_cli.evaluation.statistics import summarise
+from esp_cli.files.tables import flat
 from esp_cli.reporting.curves import RunCurve, read_curve
-from esp_cli.reporting.results import CellResult, Passing, Results, flat
+from esp_cli.reporting.results import CellResult, Passing, Results
 from esp_cli.reporting.summary import returns_of
 from esp_cli.studies.kinds import KINDS, OTHER
 from esp_cli.studies.paper import reported
@@ -90,7 +91,7 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
 
 def results_of(study: Study, states: Mapping[str, RunState], mode: Mode, thresholds: Sequence[float]) -> Results:
     """Return the results of a study whose runs stand where these states say."""
-    configs = {cell.name: flat(cell.config.model_dump(mode="json")) for cell in study.cells}
+    configs = {cell.name: dict(flat(cell.config.model_dump(mode="json"))) for cell in study.cells}
     first = next(iter(configs.values()))
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
     cells = []

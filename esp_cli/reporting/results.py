@@ -5,7 +5,7 @@ Everything that tables state is computed from this document by `summary`, so the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -150,12 +150,3 @@ def join(several: Sequence[Results]) -> Results:
         raise ValueError(f"{twice[0]} stands in two of the results files")
     command = "\n".join(dict.fromkeys(results.command for results in several))
     return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells)})
-
-
-def flat(config: Mapping[str, JsonValue], prefix: str = "") -> dict[str, JsonValue]:
-    """Return a configuration with dotted names, so that two of them can be compared."""
-    out: dict[str, JsonValue] = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        out |= flat(value, f"{name}.") if isinstance(value, dict) and value else {name: value}
-    return out

@@ -30,10 +30,11 @@ def markdown_text(text: str) -> str:
 
 
 def markdown_rows(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table in Markdown; a heading that ends in ">" is aligned to the right."""
+    """Return the lines of a table of texts in Markdown; a heading that ends in ">" is aligned to the right."""
     names = [heading.removesuffix(">") for heading in headings]
     rule = ["---:" if heading.endswith(">") else "---" for heading in headings]
-    return [f"| {' | '.join(cells)} |" for cells in (names, rule, *rows)]
+    first, *others = ([markdown_text(cell) for cell in row] for row in (names, *rows))
+    return [f"| {' | '.join(cells)} |" for cells in (first, rule, *others)]
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,7 @@ class Table:
 
     def markdown(self) -> str:
         """Return the table as Markdown, without its title."""
-        headings, *rows = ([markdown_text(cell) for cell in row] for row in (self.headings, *self.rows))
-        lines = markdown_rows(headings, rows)
+        lines = markdown_rows(self.headings, self.rows)
         return "\n".join([*lines, *(["", markdown_text(self.caption)] if self.caption else [])])
 
 

@@ -27,6 +27,7 @@ from esp_cli.studies.mirror import FileGoneError, Mirror
 from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect, offers, refuse_what_no_node_has
 from esp_cli.studies.versions import refuse_difference
 from esp_cli.studies.worker import SILENCE_S, CellWorker, Lease, LeaseLostError, News
+from esp_cli.training.build import spec_of
 from esp_cli.training.loading import parse_config
 from esp_cli.training.memory import process_bytes
 from esp_cli.training.run_folder import RunFolder
@@ -85,7 +86,7 @@ class RayEngine:
         """Start the application with these arguments on some node; what it prints is appended to the log."""
         run = RunFolder.open(log.parent)
         config = parse_config(run.config, run.path)
-        gpus, memory = self.gpus if config.device == "cuda" else 0.0, process_bytes(config)
+        gpus, memory = self.gpus if config.device == "cuda" else 0.0, process_bytes(config, spec_of(config))
         self._offers += [offer for offer in offers() if offer not in self._offers]
         refuse_what_no_node_has({"CPU": 1, "GPU": gpus, "memory": memory}, run.path.name, self._offers)
         key = f"{self._identity()}/{run.path.name}/{arguments[0]}"

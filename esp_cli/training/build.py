@@ -25,8 +25,8 @@ def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Envi
 
 
 def spec_of(config: RunConfig) -> TaskSpec:
-    """Return the contract of a run's task as its policy meets it."""
-    return build_environment(config, 1, "shape").spec
+    """Return the contract of a run's task as its policy meets it; needs no GPU."""
+    return build_environment(config.model_copy(update={"device": "cpu"}), 1, "shape").spec
 
 
 def build_learner(config: RunConfig) -> Learner:

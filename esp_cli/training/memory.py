@@ -9,7 +9,6 @@ import torch
 from esp_cli.algorithms.learner import LearnerConfig
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
-from esp_envs.registry import make
 from esp_envs.spec import TaskSpec
 
 _FLOAT_BYTES = 4
@@ -57,14 +56,14 @@ def least_bytes(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> d
     return {name: size * len(config.seeds) for name, size in sizes.items()}
 
 
-def process_bytes(config: RunConfig) -> int:
+def process_bytes(config: RunConfig, spec: TaskSpec) -> int:
     """Return the memory that a process which trains a run is given on a cluster: twice what it has to hold, and torch.
 
-    Raises:
-        ValueError: parts of the configuration do not go together.
+    Args:
+        config: of the run.
+        spec: of its task as the policy meets it.
     """
     settings = ALGORITHMS[config.algorithm].config_class(**config.algorithm_settings)
-    spec = make(config.task, 1, config.seeds[:1], config.task_settings).spec
     return _PROCESS_BYTES + 2 * sum(least_bytes(config, settings, spec).values())
 
 

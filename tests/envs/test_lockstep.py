@@ -82,6 +82,17 @@ class Plain(BatchedTask):
         return world["position"]
 
 
+def test_actions_beyond_the_bounds_are_taken_as_the_nearest_within() -> None:
+    action = torch.tensor([[3.0, -4.0, 2.0], [0.3, -0.4, -1.5], [0.0, 0.0, 0.25]])
+    given = action.clone()
+    expected = torch.tensor([[0.6, -0.8, 1.0], [0.3, -0.4, -1.0], [0.0, 0.0, 0.25]])
+    assert torch.allclose(worlds(Plain).spec.action.admissible(action), expected)
+    assert torch.equal(action, given)
+    many = Continuous(layout(Field("wheels", Kind.WHEELS), Field("pushes", Kind.VECTOR, 2)))
+    row = torch.tensor([2.0, -3.0, 0.0, 5.0, 0.6, 0.8])
+    assert torch.allclose(many.admissible(row), torch.tensor([1.0, -1.0, 0.0, 1.0, 0.6, 0.8]))
+
+
 @pytest.mark.parametrize("method", ["heuristic", "scene", "set_state"])
 def test_what_a_task_lacks_is_said_in_one_sentence(method: str) -> None:
     class Bare(Plain):

@@ -208,7 +208,7 @@ def test_a_full_disk_of_the_driver_fails_a_run_that_the_same_command_finishes(
 def test_a_run_that_no_node_has_room_for_fails_at_once(
     folder: StudyFolder, engine: RayEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_ray, "process_bytes", lambda config: 10**15)
+    monkeypatch.setattr(engine_ray, "process_bytes", lambda config, spec: 10**15)
     runs = scheduled(folder, engine, lambda _: True).runs
     assert [run.status for run in runs] == ["failed"] * 2
     sentence = f"no node of the cluster offers what {runs[0].cell.name} needs (a core, 1000000.0 GB of memory)"

@@ -6,7 +6,7 @@ import pytest
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training import memory
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import build_learner, spec_of
 from esp_cli.training.config import resolve_config
 
 
@@ -45,14 +45,23 @@ def test_a_machine_with_less_memory_refuses_what_a_larger_one_takes(monkeypatch)
 def test_every_seed_counts():
     one, ten = (resolve_config("formation", seeds=range(count)) for count in (1, 10))
     settings = ALGORITHMS["mappo"].config_class(**one.algorithm_settings)
-    spec = build_environment(one, 1, "shape").spec
-    needed = memory.least_bytes(one, settings, spec)
-    assert memory.least_bytes(ten, settings, spec) == {name: 10 * size for name, size in needed.items()}
+    needed = memory.least_bytes(one, settings, spec_of(one))
+    assert memory.least_bytes(ten, settings, spec_of(ten)) == {name: 10 * size for name, size in needed.items()}
 
 
 def test_a_process_on_a_cluster_is_given_room_for_its_replay_and_its_libraries():
     small, large = (resolve_config("navigation", "qmix", seeds=range(count)) for count in (1, 10))
     settings = ALGORITHMS["qmix"].config_class(**small.algorithm_settings)
-    held = sum(memory.least_bytes(small, settings, build_environment(small, 1, "shape").spec).values())
-    assert memory.process_bytes(small) > 500e6 + held
-    assert memory.process_bytes(large) - memory.process_bytes(small) == 2 * 9 * held
+    held = sum(memory.least_bytes(small, settings, spec_of(small)).values())
+    given = [memory.process_bytes(config, spec_of(config)) for config in (small, large)]
+    assert given[0] > 500e6 + held
+    assert given[1] - given[0] == 2 * 9 * held
+
+
+def test_the_frame_of_a_compass_takes_room_in_every_row():
+    plain, framed = (resolve_config("navigation", "qmix", overrides={"prior.compass": length}) for length in (0.0, 1.0))
+    settings = ALGORITHMS["qmix"].config_class(**plain.algorithm_settings)
+    rows = [memory.least_bytes(config, settings, spec_of(config))["qmix.replay_episodes"] for config in (plain, framed)]
+    frame_width = 4  # two vectors, seen by each of three agents and once in the state
+    steps = settings.replay_episodes * spec_of(plain).horizon
+    assert rows[1] - rows[0] == steps * (3 + 1) * frame_width * 4
