@@ -26,11 +26,11 @@ RESULTS = {
 }
 """Results in docs/measured -> their figures, of which each learner has one."""
 BREAKING = {
-    "breaking-navigation": ("breaking-navigation", "breaking-navigation-others", "breaking-navigation-relaxed"),
-    "breaking-predator-prey": ("breaking-predator-prey", "breaking-predator-prey-others"),
-    "breaking-formation": ("breaking-formation", "breaking-formation-others", "breaking-formation-relaxed"),
+    "breaking-navigation": ("", "-others", "-relaxed"),
+    "breaking-predator-prey": ("", "-others"),
+    "breaking-formation": ("", "-others", "-measured", "-relaxed"),
 }
-"""Figures in docs/measured, one for each setting -> the results that are drawn together."""
+"""Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 Row = dict[str, str]
 
 
@@ -130,9 +130,9 @@ def draw_results() -> None:
             learner = cells[0].name.split("-")[1]
             _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
             svg.unlink()  # the pages show PNGs
-    for picture, names in BREAKING.items():
-        both = join([read_results(MEASURED / f"{name}.json") for name in names])
-        for _, svg in draw_over_strength(both, MEASURED / picture):
+    for picture, parts in BREAKING.items():
+        whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
+        for _, svg in draw_over_strength(whole, MEASURED / picture):
             svg.unlink()
 
 

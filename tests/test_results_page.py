@@ -142,8 +142,8 @@ def test_every_figure_of_results_can_be_drawn_again_and_is_on_a_page() -> None:
 def test_every_figure_of_broken_symmetry_can_be_drawn_again_and_is_on_its_page() -> None:
     drawing = runpy.run_path(str(DOCS / "make_figures.py"))
     page = (DOCS / "measurements" / "breaking.md").read_text(encoding="utf-8")
-    for picture, names in drawing["BREAKING"].items():
-        both = drawing["join"]([drawing["read_results"](DOCS / "measured" / f"{name}.json") for name in names])
+    for picture, parts in drawing["BREAKING"].items():
+        both = drawing["join"]([drawing["read_results"](DOCS / "measured" / f"{picture}{part}.json") for part in parts])
         for k, _ in enumerate(series_of(both), 1):
             assert f"(../measured/{picture}-{k}.png)" in page
             assert (DOCS / "measured" / f"{picture}-{k}.png").is_file()
