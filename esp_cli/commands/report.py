@@ -111,7 +111,7 @@ def report(
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
     y_limits = _limits(y_limits, view)
-    if TuningFolder.is_tuning(Path(runs[0])):
+    if TuningFolder.is_one(Path(runs[0])):
         fresh = shlex.quote(str(Path(runs[0]) / "fresh"))
         raise ValueError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
     is_study = StudyFolder.is_one(Path(runs[0]))

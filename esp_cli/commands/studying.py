@@ -60,9 +60,9 @@ def run_study(
         if choices.dry_run:
             _dry_run(StudyFolder(out, study), others, jobs, choices.json)
             return
-        folder = StudyFolder.create(out, study)
         begun = time.monotonic()
-        with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
+        with StudyFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
+            folder = StudyFolder.create(out, study)
             complete, failed = run_cells(folder, study, others, jobs, engine, requests)
     if not complete:
         console.note(f"stopped; go on with: {study.command}{choices.engine_words()}")
@@ -172,7 +172,8 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
         print_tables(results)
     if json is not None:
         console.write_json(json, results.document())
-    console.note(f"next: {shlex.join(['esp', 'report', str(folder.path)])}")
+    words = ["esp", "report", str(folder.path), *(word for one in thresholds for word in ("--threshold", repr(one)))]
+    console.note(f"next: {shlex.join(words)}")
 
 
 def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:

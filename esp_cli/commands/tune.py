@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -57,7 +57,7 @@ def tune(
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
     words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
-    words += ["--for", goal, *(("--reach", f"{reach:g}") if reach is not None else ())]
+    words += ["--for", goal, *(("--reach", repr(reach)) if reach is not None else ())]
     words += ["--trial-seeds", str(trial_seeds)]
     request = choices.request("tune", "tune", *words)
     tuning = _tuning(request, priors, budget, space, goal, reach, trial_seeds)
@@ -65,7 +65,7 @@ def tune(
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(tuning.device)
         if choices.dry_run:
-            _dry_run(tuning, request.seeds, request.episodes, jobs)
+            _dry_run(tuning, request.seeds, request.episodes, jobs, choices.json)
             return
         _tune(tuning, request, choices, engine, jobs)
 
@@ -94,6 +94,10 @@ def _tuning(
         if name not in NAMES or priors.count(name) > 1:
             raise ValueError(f"--prior names each kind once; they are {', '.join(NAMES)}")
     task, algorithm = (request.tasks or ("navigation",))[0], (request.algorithms or ("mappo",))[0]
+    meant, steps = (request.steps or ((None, 500_000),))[0]
+    if meant not in (None, task):
+        raise ValueError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
+    own = f"{task}."
     tuning = Tuning(
         task=task,
         algorithm=algorithm,
@@ -102,14 +106,17 @@ def _tuning(
         budget=budget,
         goal=goal,
         reach=reach,
-        steps=request.steps[0][1] if request.steps else 500_000,
+        steps=steps,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
-        overrides=dict(request.overrides),
+        overrides={
+            f"task.{name.removeprefix(own)}" if name.startswith(own) else name: value
+            for name, value in request.overrides.items()
+        },
         space=dict(read_space(space) if space else default_space(algorithm)),
         device=request.device,
         command=request.command,
     )
-    tuning.check()
+    tuning.check(request.seeds)
     return tuning
 
 
@@ -126,26 +133,26 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TuningFolder, fresh_study
 
-    fresh_study(tuning, {}, request.seeds, request.episodes)  # refuses seeds of the trials while there is no folder
-    others = [StudyFolder.open(path) for path in choices.reuse or ()]
-    folder, fresh = TuningFolder.begin(choices.folder("tune"), tuning), None
-    with folder.lock(), stop_requests("stopping every run after its iteration") as requests:
-        trials = Trials(folder)
-        complete, failed = follow(Tuner(trials, jobs, engine), folder.study.title, requests)
+    out, others, fresh = choices.folder("tune"), [StudyFolder.open(path) for path in choices.reuse or ()], None
+    with TuningFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
+        trials = Trials(TuningFolder.begin(out, tuning))
+        complete, failed = follow(Tuner(trials, jobs, engine), trials.folder.study.title, requests)
         outcomes = [trials.outcome(prior) for prior in tuning.priors]
         best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
+        _report(trials, outcomes, write_presets(trials.folder, outcomes), quiet=choices.json == "-")
         if complete and not failed and best:
             study = fresh_study(tuning, best, request.seeds, request.episodes)
-            fresh = StudyFolder.create(folder.path / "fresh", study)
+            fresh = StudyFolder.create(out / "fresh", study)
             complete, failed = run_cells(fresh, study, others, jobs, engine, requests)
-        _report(trials, outcomes, write_presets(folder, outcomes), quiet=choices.json == "-")
     if fresh is not None and complete:
-        report_study(fresh, choices.json, None, ())
+        report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
     if not complete:
         console.note(f"stopped; go on with: {tuning.command}{choices.engine_words()}")
         raise typer.Exit(130)
     if failed:
         raise ValueError(f"{len(failed)} runs failed ({', '.join(failed)}); the same command tries them again")
+    if not best:
+        raise ValueError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 
 
 def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path], quiet: bool) -> None:
@@ -157,29 +164,47 @@ def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path]
         console.table(headings, rows, title=trials.folder.study.title, caption=budget_sentence(trials.tuning))
         if any(found.settings for found in outcomes):
             console.table(*settings_table(outcomes), title="Best settings")
-    if not any(found.settings for found in outcomes):
-        console.note("no trial has a score yet; with --reach, a lower return is easier to come to")
+    refused = [reason for found in outcomes for reason in found.refused]
+    if refused:
+        console.note(f"{len(refused)} trials had settings that do not go together, the first: {refused[0]}")
     console.note(f"report -> {write_page(trials, outcomes, trials.folder.path / 'report')}")
     for path in presets:
-        console.note(f"next: {shlex.join(['esp', 'train', '--config', str(path)])}")
+        own = trials.tuning.config("none", {}).own_words()
+        console.note(f"next: {shlex.join(['esp', 'train', *own, '--config', str(path)])}")
 
 
-def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int) -> None:
+def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, json: str | None) -> None:
     """Print what the search costs at most, and what it costs where successive halving ends two of three trials."""
     from esp_cli.studies.cost import probe
     from esp_cli.studies.tuning import REDUCTION, RUNGS
     from esp_cli.studies.tuning_space import space_of
 
-    rows, most, likely = [], 0.0, 0.0
-    share = sum(REDUCTION ** (k - RUNGS) * (1 - 1 / REDUCTION) / REDUCTION**k for k in range(RUNGS)) + REDUCTION**-RUNGS
+    searches: list[dict[str, Any]] = []
+    most = likely = 0.0
+    share = (1 + RUNGS * (1 - 1 / REDUCTION)) / REDUCTION**RUNGS
     for prior in tuning.priors:
         trial = probe(tuning.config(prior, {}), episodes)
         final = probe(tuning.config(prior, {}, seeds), episodes)
         judged = 2 * (final.training_s + final.evaluation_s)
         whole = tuning.budget * trial.training_s
         most, likely = most + whole + judged, likely + share * whole + judged
-        names = ", ".join(space_of(tuning.space, prior))
-        rows.append((prior, str(tuning.budget), console.format_duration(trial.training_s), names))
+        names = list(space_of(tuning.space, prior))
+        searches.append({"prior": prior, "trials": tuning.budget, "trial_s": trial.training_s, "settings": names})
+    if json is not None:
+        document = {
+            "command": tuning.command,
+            "searches": searches,
+            "at_most_s": most,
+            "likely_s": likely,
+            "jobs": jobs,
+        }
+        console.write_json(json, document)
+    if json == "-":
+        return
+    rows = [
+        (one["prior"], str(one["trials"]), console.format_duration(one["trial_s"]), ", ".join(one["settings"]))
+        for one in searches
+    ]
     console.table(("prior", "trials>", "each at most>", "settings"), rows, title=tuning.command)
     console.say(
         f"on one core at most {console.format_duration(most)}, and about {console.format_duration(likely)} with "

@@ -10,7 +10,7 @@ import numpy as np
 from esp_cli.evaluation.statistics import Floats, difference, summarise
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import Side, floats, returns_of, side_of
-from esp_cli.studies.kinds import KINDS, OTHER, UNBROKEN
+from esp_cli.studies.kinds import UNBROKEN, kind_of
 
 PLAIN, ESP = "plain", "ESP"
 
@@ -52,7 +52,7 @@ def series_of(results: Results) -> list[Series]:
     found: dict[tuple[str, str], dict[float, dict[str, CellResult]]] = {}
     heads = [
         (task, setting, strength, f"{task}, {setting} {strength:g}, " if strength else f"{task}, {UNBROKEN}, ")
-        for task, settings in KINDS.get(results.kind, OTHER).breakings.items()
+        for task, settings in kind_of(results.kind).breakings.items()
         for setting, strengths in settings.items()
         for strength in (0.0, *strengths)
     ]

@@ -17,7 +17,7 @@ from esp_cli.files.tables import flat
 from esp_cli.reporting.curves import RunCurve, read_curve
 from esp_cli.reporting.results import CellResult, Passing, Results
 from esp_cli.reporting.summary import returns_of
-from esp_cli.studies.kinds import KINDS, OTHER
+from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
 from esp_cli.training.folder_names import CONFIG, METRICS
@@ -70,7 +70,7 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
         thresholds: returns whose first passing is looked for; by default those of this kind of study, or that which
             the cell's reference ended with.
     """
-    study, kind = folder.study, KINDS.get(folder.study.kind, OTHER)
+    study, kind = folder.study, kind_of(folder.study.kind)
     mode, thresholds = mode or kind.mode, thresholds or kind.thresholds
     states = {}
     for cell in study.cells:
@@ -146,7 +146,7 @@ def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonVa
             "episodes": cell.config.evaluation.episodes,
             "returns": {mode: _rounded(compared.values[-1])},
         }
-    breaks = KINDS.get(study.kind, OTHER).breakings
+    breaks = kind_of(study.kind).breakings
     if curve is not None and breaks and (early := curve.until(cell.config.steps // 5)):
         found["early"] = _rounded(early.values[-1])
     if "returns" in found and compared is not None:

@@ -27,7 +27,7 @@ from esp_cli.reporting.plots import Curve, Group, dots
 from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results
 from esp_cli.reporting.summary import floats, returns_of
 from esp_cli.reporting.tables import all_tables, markdown_text
-from esp_cli.studies.kinds import KINDS, OTHER
+from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
 from esp_cli.training.loading import load_policy
 
@@ -124,7 +124,7 @@ def _panels(material: Material) -> list[Panel]:
         cells = [cell for cell in material.study.cells if cell.panel == name and cell.name in material.curves]
         found = [material.curves[cell.name] for cell in cells]
         lines: dict[str, float] = next((dict(a) for cell in cells if (a := entries[cell.name].anchors)), {})
-        if KINDS.get(material.study.kind, OTHER).network_cost:
+        if kind_of(material.study.kind).network_cost:
             own = (entries[cell.name] for cell in cells)
             lines |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
         if found:

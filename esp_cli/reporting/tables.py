@@ -13,7 +13,7 @@ from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell
 from esp_cli.studies import paper
 from esp_cli.studies.catalogue import paper_cells
-from esp_cli.studies.kinds import UNBROKEN
+from esp_cli.studies.kinds import UNBROKEN, kind_of
 
 NOT_RUN, _STOPPED = "not run", "every seed stopped"
 _AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", None: NOTHING}
@@ -101,7 +101,7 @@ def comparison_table(results: Results) -> Table:
             texts |= _compared(cell, found)
         rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
     caption = (
-        "The reference is the plain learner (the first run) of the same panel, compared seed by seed; over all pairs: "
+        f"The reference is {kind_of(results.kind).reference}, compared seed by seed; over all pairs: "
         "every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. Ours and the paper's "
         "means are compared by Welch's test at 5 %. No interval is widened for the number of comparisons."
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 from collections.abc import Iterator, Sequence
@@ -60,9 +61,12 @@ def budget_sentence(tuning: Tuning) -> str:
     each = " each" if len(tuning.priors) > 1 else ""
     seeds = f"{len(tuning.trial_seeds)} seed{'s' if len(tuning.trial_seeds) > 1 else ''}"
     reach = "" if tuning.reach is None else f" {tuning.reach:g}"
+    looks = f"looks {RUNGS} times before the end"
+    if tuning.goal == "seconds":
+        looks = "compares trials after equal seconds, once the first has come to its end"
     return (
         f"Budget: {tuning.budget} trials{each} of {seeds} and at most "
-        f"{format_count(tuning.steps)} steps per seed; successive halving looks {RUNGS} times before the end, and "
+        f"{format_count(tuning.steps)} steps per seed; successive halving {looks}, and "
         f"one of {REDUCTION} trials goes on. Trial 0 has the default settings, as far as the space holds "
         f"them. Score: {_MEANING[tuning.goal]}{reach}."
     )
@@ -111,7 +115,9 @@ def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
             warnings.simplefilter("ignore")
             draw(study)
             figure = plt.gcf()
-            figure.savefig(out / name, dpi=110, bbox_inches="tight")
+            picture = io.BytesIO()
+            figure.savefig(picture, dpi=110, bbox_inches="tight")
+            replace_file(out / name, picture.getvalue())
             plt.close(figure)
         yield name, title
 

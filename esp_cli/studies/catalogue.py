@@ -9,7 +9,7 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import planned
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
-from esp_cli.studies.kinds import GROUP, KINDS, OTHER, UNBROKEN, Settings, StudyKind, Team
+from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
 from esp_cli.studies.study import Cell, Study
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_envs.registry import task_names
@@ -203,7 +203,7 @@ def _count(steps: int) -> str:
 
 def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield panel, variant and place of every number that the paper's table of this kind has; none for ablations."""
-    kind = KINDS.get(name, OTHER)
+    kind = kind_of(name)
     if kind.rows == "variants":
         return
     for task in kind.tasks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from esp_cli.evaluation.final import Mode
@@ -75,6 +75,7 @@ class StudyKind:
         mode: evaluations that are reported, unless the user asks for others.
         thresholds: returns whose first passing is reported; by default that which the reference ended with.
         network_cost: whether to state the sizes of the networks, and to draw the paper's numbers as lines.
+        reference: what a run is compared with, in words.
     """
 
     title: str
@@ -93,6 +94,7 @@ class StudyKind:
     mode: Mode = "greedy"
     thresholds: tuple[float, ...] = ()
     network_cost: bool = False
+    reference: str = "the plain learner (the first run) of the same panel"
 
 
 def _team(agents: int, landmarks: int | None) -> Team:
@@ -101,8 +103,6 @@ def _team(agents: int, landmarks: int | None) -> Team:
     return Team(label, {"task.num_agents": agents, "task.num_landmarks": landmarks}, place)
 
 
-OTHER = StudyKind("", rows="variants", varies=frozenset(), variants={})
-"""What a report takes for a study of none of these kinds, such as runs put together by hand."""
 KINDS: Mapping[str, StudyKind] = {
     "table1": StudyKind(
         "Table 1 of the paper",
@@ -224,3 +224,13 @@ KINDS: Mapping[str, StudyKind] = {
         network_cost=True,
     ),
 }
+_OTHER = StudyKind("", rows="variants", varies=frozenset(), variants={})
+_TUNED = replace(
+    _OTHER,
+    reference="the plain run, tuned beside tuned and default beside default, and of a tuned plain run the default one",
+)
+
+
+def kind_of(name: str) -> StudyKind:
+    """Return what tells a kind of study from others; there are some that no command plans, such as tuned settings."""
+    return _TUNED if name == "tuned" else KINDS.get(name, _OTHER)

@@ -18,7 +18,7 @@ import re
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -105,7 +105,12 @@ class StudyFolder:
     Attributes:
         path: the folder.
         study: all that was ever planned in it.
+        document: name of the file that makes a folder one.
+        noun: what messages call what it holds.
     """
+
+    document: ClassVar[str] = _STUDY
+    noun: ClassVar[str] = "study"
 
     def __init__(self, path: Path, study: Study) -> None:
         names = [cell.name for cell in study.cells]
@@ -115,31 +120,29 @@ class StudyFolder:
                 raise StudyError(f"{path / _STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
         self.path, self.study = path, study
 
-    @staticmethod
-    def is_one(path: Path) -> bool:
-        """Return whether a folder holds a study."""
-        return (path / _STUDY).is_file()
+    @classmethod
+    def is_one(cls, path: Path) -> bool:
+        """Return whether a folder holds one."""
+        return (path / cls.document).is_file()
 
     @classmethod
     def create(cls, path: Path, study: Study) -> StudyFolder:
         """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
+
+        A cell that it has keeps its run, and may be compared with another one than before.
 
         Raises:
             StudyError: the folder holds another study, or something foreign.
         """
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
-        if path.is_file():
-            raise StudyError(f"{path} is a file; choose another --out")
+        cls.make(path)
         if not cls.is_one(path):
-            foreign = [entry.name for entry in path.iterdir() if entry.name != _LOCK] if path.is_dir() else []
-            if foreign:
-                raise StudyError(f"{path} is not empty and no study (it has {foreign[0]!r}); choose another --out")
-            path.mkdir(parents=True, exist_ok=True)
             return cls._written(path, study)
         there = cls.open(path).study
         known = {cell.name: cell for cell in there.cells}
-        changed = [cell.name for cell in study.cells if cell.name in known and cell != known[cell.name]]
+        again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
+        changed = [new.name for new, old in again if new != old.model_copy(update={"reference": new.reference})]
         if there.kind != study.kind or there.episodes != study.episodes or changed:
             raise StudyError(
                 f"{path} holds another study{f' ({changed[0]} differs)' if changed else ''}; go on with it by "
@@ -147,7 +150,7 @@ class StudyFolder:
             )
         wanted = {cell.name for cell in study.cells}
         rest = tuple(cell for cell in there.cells if cell.name not in wanted)
-        if not wanted - set(known):
+        if not wanted - set(known) and all(new == old for new, old in again):
             return cls(path, there)
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
         merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
@@ -172,14 +175,32 @@ class StudyFolder:
         STUDY_FORMAT.write(path / _STUDY, study.model_dump(mode="json"))
         return folder
 
-    @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
-        """Hold the study, so that no second process works on it.
+    @classmethod
+    def make(cls, path: Path) -> None:
+        """Make the folder, empty, unless it is there.
 
         Raises:
+            StudyError: it holds something foreign.
+        """
+        if path.is_file():
+            raise StudyError(f"{path} is a file; choose another --out")
+        if not cls.is_one(path) and path.is_dir():
+            foreign = [entry.name for entry in path.iterdir() if entry.name != _LOCK]
+            if foreign:
+                raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
+        path.mkdir(parents=True, exist_ok=True)
+
+    @classmethod
+    @contextlib.contextmanager
+    def held(cls, path: Path) -> Iterator[None]:
+        """Hold the folder, made if missing, so that no second process plans or works in it.
+
+        Raises:
+            StudyError: it holds something foreign.
             LockError: another process holds it.
         """
-        descriptor = acquire(self.path / _LOCK)
+        cls.make(path)
+        descriptor = acquire(path / _LOCK)
         try:
             yield
         finally:
@@ -232,10 +253,13 @@ class StudyFolder:
         return None
 
     def adopt(self, cell: Cell, twin: Path) -> None:
-        """Take a finished run of the same configuration over as this cell's; its log says where it is from."""
+        """Take a finished run of the same configuration over as this cell's; its log says where it is from.
+
+        Links in its folder are left out: they would bring in files from anywhere.
+        """
         part = self.path / _RUNS / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
-        shutil.copytree(twin, part)
+        shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:
             log.write(f"taken over from {twin}\n")
         part.rename(self.run_path(cell))

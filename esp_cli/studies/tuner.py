@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,19 @@ import optuna
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
+from esp_cli.files.documents import shortened
 from esp_cli.files.writing import remove_file, replace_file
 from esp_cli.studies.engine import Engine
 from esp_cli.studies.scheduler import Run, Scheduler
+from esp_cli.studies.study import StudyError
 from esp_cli.studies.tuning import REDUCTION, RUNGS, Point, TuningFolder, score
 from esp_cli.studies.tuning_space import space_of
+from esp_cli.training.build import build_learner
 from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
-_JOURNAL = "journal.jsonl"
+_JOURNAL, _REFUSED = "journal.jsonl", "refused"
 _SEED = 0
 
 
@@ -36,6 +39,7 @@ class Outcome:
         trials: that were begun.
         completed: trials with a score.
         pruned: trials that were ended early, broke, or did not reach the return.
+        refused: why settings did not go together, one text for each such trial; they count as pruned.
         env_steps: environment steps of all seeds of all trials.
         seconds: of training, all trials added up.
         best: number of the best trial; None where no trial has a score.
@@ -48,6 +52,7 @@ class Outcome:
     trials: int
     completed: int
     pruned: int
+    refused: tuple[str, ...]
     env_steps: int
     seconds: float
     best: int | None
@@ -68,8 +73,11 @@ class Trials:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         path = folder.path / _JOURNAL
         _cut_torn_line(path)
-        storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock()))
-        self.studies = {prior: self._study(storage, prior) for prior in self.tuning.priors}
+        try:
+            storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock()))
+            self.studies = {prior: self._study(storage, prior) for prior in self.tuning.priors}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:  # whatever Optuna stumbles over
+            raise StudyError(f"{path} is damaged: {shortened(str(error))}; choose another --out") from None
 
     def _study(self, storage: Any, prior: str) -> Any:
         pruner = optuna.pruners.SuccessiveHalvingPruner(
@@ -116,14 +124,20 @@ class Trials:
         known = self.studies[prior].get_trials(deepcopy=False)
         return number < len(known) and known[number].state.is_finished()
 
-    def report(self, trial: Any, points: Iterator[Point]) -> None:
-        """Record evaluations of a trial that are not recorded yet."""
+    def keeps_up(self, trial: Any, points: Sequence[Point]) -> bool:
+        """Record evaluations of a trial that are not recorded yet; return whether the trial may go on after each.
+
+        The first trial may always go on, and so may one that has all its steps.
+        """
         known = trial.study.get_trials(deepcopy=False)[trial.number].last_step
         for point in points:
             resource = int(point.seconds) if self.tuning.goal == "seconds" else point.step
             if (known is None or resource > known) and math.isfinite(point.value):
                 trial.report(point.value, resource)
                 known = resource
+                if trial.number > 0 and point.step < self.tuning.steps and trial.should_prune():
+                    return False
+        return True
 
     def outcome(self, prior: str) -> Outcome:
         """Return what came out for one prior."""
@@ -137,6 +151,7 @@ class Trials:
             trials=sum(t.state != TrialState.WAITING for t in trials),
             completed=len(done),
             pruned=sum(t.state == TrialState.PRUNED for t in trials),
+            refused=tuple(t.user_attrs[_REFUSED] for t in trials if _REFUSED in t.user_attrs),
             env_steps=seeds * sum(int(row.get("step", 0)) for row in rows),
             seconds=sum(float(row.get("time/elapsed_s") or 0.0) for row in rows),
             best=None if best is None else best.number,
@@ -155,9 +170,11 @@ class Tuner(Scheduler):
         engine: starts them.
     """
 
+    folder: TuningFolder
+
     def __init__(self, trials: Trials, jobs: int, engine: Engine) -> None:
-        folder: TuningFolder = trials.folder
-        self.trials, self.tuning, self.trial_folder = trials, folder.tuning, folder
+        folder = trials.folder
+        self.trials, self.tuning = trials, folder.tuning
         keys = [(prior, number) for number in range(folder.tuning.budget) for prior in folder.tuning.priors]
         # the settings of a trial are proposed when there is room for it; until then its run has the default ones
         super().__init__(folder, [folder.cell(*key, {}) for key in keys], jobs, engine)
@@ -166,15 +183,22 @@ class Tuner(Scheduler):
         self._ended: set[str] = set()
         for run in self.runs:
             run.status = "finished" if trials.is_done(*self._keys[run.cell.name]) else "waiting"
+            if run.status == "finished" and folder.run_path(run.cell).is_dir():  # a kill may have left them
+                self._remove_checkpoints(run)
 
     def _start(self, run: Run) -> None:
         """Begin the trial of a run, or go on with it; record one that is trained to its end."""
         prior, number = self._keys[run.cell.name]
+        if run.cell.name in self._ended:  # while a process that a killed search left went on with it
+            run.status = "finished"
+            return
         if run.cell.name not in self._begun:
             trial = self._begun[run.cell.name] = self.trials.trial(prior, number)
             try:
-                run.cell = self.trial_folder.cell(prior, number, self.trials.settings(prior, trial))
+                run.cell = self.folder.cell(prior, number, self.trials.settings(prior, trial))
+                build_learner(run.cell.config.of_one_seed())
             except ValueError as error:  # these settings do not go together
+                trial.set_user_attr(_REFUSED, str(error))
                 self._tell(run, trial, None)
                 run.status, run.message = "finished", str(error)
                 return
@@ -199,15 +223,15 @@ class Tuner(Scheduler):
         if self.trials.is_done(*self._keys[run.cell.name]):
             self._ended.add(run.cell.name)
             return
-        curve = self.trial_folder.curve(run.cell)
+        curve = self.folder.curve(run.cell)
         if not curve:
             return
-        self.trials.report(trial, iter(curve))
-        value, complete = score(curve, tuning), self.trial_folder.is_trained(run.cell)
+        keeps_up = self.trials.keeps_up(trial, curve)
+        value, complete = score(curve, tuning), self.folder.is_trained(run.cell)
         broken = not math.isfinite(curve[-1].mean)
         if not broken and value is not None and (complete or tuning.goal != "return"):
             self._tell(run, trial, value)
-        elif broken or complete or (trial.number > 0 and trial.should_prune()):
+        elif broken or complete or not keeps_up:
             self._tell(run, trial, None)
 
     def _tell(self, run: Run, trial: Any, value: float | None) -> None:

@@ -26,7 +26,7 @@ RUNGS = 2
 """Times that successive halving looks at a trial before its end."""
 REDUCTION = 3
 """One of so many trials goes on at each rung, and trains so many times as long."""
-_TUNING, _TRIALS = "tuning.json", "trials"
+_TRIALS = "trials"
 NAMES = {"none": "plain", "esp": "ESP", "augment": "augmentation", "consistency": "loss"}
 
 
@@ -76,12 +76,19 @@ class Tuning(Strict):
         )
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
 
-    def check(self) -> None:
+    def check(self, seeds: Sequence[int]) -> None:
         """Refuse what cannot be run.
 
+        Args:
+            seeds: of the runs that judge the best settings.
+
         Raises:
-            ValueError: a setting of the space is unknown or refuses a value, or the goal lacks its return.
+            ValueError: a trial has one of the seeds, a setting of the space is unknown or refuses a value, or the goal
+                lacks its return.
         """
+        shared = set(seeds) & set(self.trial_seeds)
+        if shared:
+            raise ValueError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
         if (self.goal == "return") != (self.reach is None):
             what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
             raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
@@ -112,6 +119,9 @@ class TuningFolder(StudyFolder):
         study.lock          held by the process that works on it
     """
 
+    document = "tuning.json"
+    noun = "tuning"
+
     def __init__(self, path: Path, tuning: Tuning) -> None:
         title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
         super().__init__(
@@ -126,24 +136,17 @@ class TuningFolder(StudyFolder):
         Raises:
             StudyError: the folder holds another tuning, or something foreign.
         """
-        file = path / _TUNING
-        if file.is_file():
+        cls.make(path)
+        file = path / cls.document
+        if cls.is_one(path):
             there = TUNING_FORMAT.parse(file, Tuning)
             same = {"budget": there.budget, "command": there.command}
             if tuning.model_copy(update=same) != there or tuning.budget < there.budget:
                 raise StudyError(
                     f"{path} holds another tuning; go on with it by '{there.command}', or choose another --out"
                 )
-        elif path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise StudyError(f"{path} is not empty and no tuning; choose another --out")
-        path.mkdir(parents=True, exist_ok=True)
         TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))
         return cls(path, tuning)
-
-    @classmethod
-    def is_tuning(cls, path: Path) -> bool:
-        """Return whether a folder holds a tuning."""
-        return (path / _TUNING).is_file()
 
     def trial_path(self, prior: str, number: int) -> Path:
         """Return the run folder of a trial."""
@@ -214,27 +217,40 @@ def fresh_study(
 ) -> Study:
     """Plan the study that judges the best settings of each prior, beside the default ones, on seeds of its own.
 
+    Default settings are compared with those of the plain learner, tuned ones with the tuned plain learner. Where that
+    is missing or the run itself, tuned settings are compared with the default ones.
+
     Args:
         tuning: what was asked for.
-        best: by prior, the number of the best trial and its settings.
+        best: by prior, the number of the best trial and its settings; a prior without a score is left out.
         seeds: of every run.
         episodes: per seed, of the final evaluations.
-
-    Raises:
-        ValueError: a trial had one of the seeds.
     """
-    shared = set(seeds) & set(tuning.trial_seeds)
-    if shared:
-        raise ValueError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
     panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
     cells: list[Cell] = []
-    for prior, (number, settings) in best.items():
-        variants = {f"{NAMES[prior]}, default": {}, f"{NAMES[prior]}, tuned (trial {number})": settings}
-        for variant, own in variants.items():
-            config, reference = tuning.config(prior, own, seeds), cells[0].name if cells else None
-            if all(cell.config != config for cell in cells):  # unless the default settings were the best
-                name = file_name(variant)
-                cells.append(Cell(name=name, panel=panel, variant=variant, config=config, reference=reference))
+    plain: tuple[Cell, Cell] | None = None  # with the default settings and with the best
+    for prior in sorted(tuning.priors, key=lambda name: name != "none"):
+
+        def cell(variant: str, settings: Mapping[str, object], beside: Cell | None, prior: str = prior) -> Cell:
+            return Cell(
+                name=file_name(variant),
+                panel=panel,
+                variant=variant,
+                config=tuning.config(prior, settings, seeds),
+                reference=None if beside is None else beside.name,
+            )
+
+        default = tuned = cell(f"{NAMES[prior]}, default", {}, plain and plain[0])
+        cells.append(default)
+        if prior in best:
+            number, settings = best[prior]
+            tuned = cell(f"{NAMES[prior]}, tuned (trial {number})", settings, plain[1] if plain else default)
+        if tuned.config != default.config:  # unless the default settings were the best
+            cells.append(tuned)
+        else:
+            tuned = default
+        if prior == "none":
+            plain = default, tuned
     return Study(
         kind="tuned",
         title=f"Tuned settings of {tuning.algorithm.upper()} on {tuning.task}, judged on fresh seeds",

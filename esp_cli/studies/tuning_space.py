@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,16 @@ class Dimension(Strict):
         return self
 
     def corners(self) -> tuple[JsonValue, ...]:
-        """Return the values that show whether the setting takes all of them: both ends, or all choices."""
-        return self.choices if self.choices is not None else (self.low, self.high)
+        """Return the values that show whether the setting takes all of them: all choices, or both ends.
+
+        Of a range with fractions also one between, which is no whole number.
+        """
+        if self.choices is not None:
+            return self.choices
+        assert self.low is not None
+        assert self.high is not None
+        whole = isinstance(self.low, int) and isinstance(self.high, int)
+        return (self.low, self.high) if whole else (self.low, self.low + (self.high - self.low) / math.e, self.high)
 
     def suggest(self, trial: Any, name: str) -> JsonValue:
         """Return the value that a trial of Optuna tries."""
@@ -56,7 +65,7 @@ class Dimension(Strict):
     def encoded(self, value: JsonValue) -> object:
         """Return a value as a trial of Optuna holds it; None where it is outside of the space."""
         if self.choices is not None:
-            return json.dumps(value) if value in self.choices else None
+            return next((json.dumps(choice) for choice in self.choices if choice == value), None)
         inside = isinstance(value, int | float) and self.low is not None and self.high is not None
         return value if inside and self.low <= value <= self.high else None  # type: ignore[operator] # inside
 

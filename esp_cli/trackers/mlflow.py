@@ -8,11 +8,15 @@ import time
 # read when mlflow is imported or a store is opened; what the user has set stays
 os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
 os.environ.setdefault("MLFLOW_ALLOW_FILE_STORE", "true")
+# a server that does not answer ends the tracking within seconds, not minutes
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
+os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
 from esp_cli.files.tables import flat
+from esp_cli.files.writing import replace_file
 from esp_cli.trackers.sink import Row, TrackedRun, scalars
 
 _MOST_PARAMS = 100
@@ -39,7 +43,7 @@ class MlFlow:
         for begin in range(0, len(params), _MOST_PARAMS):
             self._client.log_batch(self._run_id, params=params[begin : begin + _MOST_PARAMS])
         file.parent.mkdir(exist_ok=True)
-        file.write_text(self._run_id, encoding="utf-8")
+        replace_file(file, self._run_id.encode())
 
     def write(self, step: int, values: Row) -> None:
         """Log the means under their names, and each seed's number under seed-k/NAME."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import wandb
 
+from esp_cli.files.writing import replace_file
 from esp_cli.trackers.sink import Row, TrackedRun, scalars
 
 _PLACES = ("CACHE", "CONFIG", "DATA", "ARTIFACT")
@@ -62,5 +63,5 @@ def _run_id(run: TrackedRun) -> str:
     file = run.folder / "wandb" / "run-id"
     if not file.is_file():
         file.parent.mkdir(exist_ok=True)
-        file.write_text(secrets.token_hex(4), encoding="utf-8")
+        replace_file(file, secrets.token_hex(4).encode())
     return file.read_text(encoding="utf-8").strip()

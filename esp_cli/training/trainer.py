@@ -165,7 +165,8 @@ class Trainer:
                     raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
                 if not going and not self.is_complete:
                     return False
-        self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
+            # before the trackers are closed: what another program does there must not keep a run from its policy
+            self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
         return True
 
     def _iterate(self) -> tuple[dict[str, Any], float]:

@@ -27,6 +27,9 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
     assert "on one core at most" in told.stdout
     assert "3 runs side by side" in told.stdout
     assert not (tmp_path / "t").exists()
+    planned = json.loads(esp(*command, "--prior", "esp,none", "--steps", 300, "--dry-run", "--json", "-").stdout)
+    assert [(one["prior"], one["trials"]) for one in planned["searches"]] == [("esp", 30), ("none", 30)]
+    assert 0 < planned["likely_s"] < planned["at_most_s"]
 
 
 @pytest.mark.parametrize(
@@ -40,12 +43,13 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
         (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
+        (["--steps", "formation=500k"], "--steps formation=500000 concerns no run of this tuning"),
     ],
 )
 def test_what_is_wrong_is_told_before_there_is_a_folder(
     command: list[object], tmp_path: Path, options: list[str], sentence: str
 ) -> None:
-    assert sentence in refused(*command, "--steps", "300", *options)
+    assert sentence in refused(*command, *(() if "--steps" in options else ("--steps", "300")), *options)
     assert not (tmp_path / "t").exists()
 
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from esp_cli.studies.engine_local import LocalEngine
-from esp_cli.studies.study import StudyFolder, read_evaluation
+from esp_cli.studies.study import StudyError, StudyFolder, read_evaluation
 from esp_cli.training.locking import LockError, is_held
 from tests.studies.small_studies import small_study, write_study
 
@@ -68,13 +68,49 @@ def test_a_damaged_study_is_told_in_one_sentence(tmp_path, content, sentence):
 
 
 def test_one_process_holds_a_study(tmp_path):
-    folder = StudyFolder.create(tmp_path / "s", small_study())
-    with folder.lock():
-        with pytest.raises(LockError, match="is in use by process"), folder.lock():
+    path = tmp_path / "s"
+    with StudyFolder.held(path):
+        StudyFolder.create(path, small_study())
+        with pytest.raises(LockError, match="is in use by process"), StudyFolder.held(path):
             pass
-        assert is_held(folder.path / "study.lock")
-    assert not is_held(folder.path / "study.lock")
-    assert not is_held(folder.path / "no such file")
+        assert is_held(path / "study.lock")
+    assert not is_held(path / "study.lock")
+    assert not is_held(path / "no such file")
+
+
+def test_no_lock_is_made_in_a_folder_of_something_else(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(StudyError, match="is not empty and no study"), StudyFolder.held(tmp_path):
+        pass
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_run_may_be_compared_with_another_one_than_before_and_with_no_other_settings(tmp_path):
+    study = small_study()
+    StudyFolder.create(tmp_path / "s", study)
+    first, *others = study.cells
+    again = study.model_copy(update={"cells": (first, *(c.model_copy(update={"reference": None}) for c in others))})
+    StudyFolder.create(tmp_path / "s", again)
+    assert [cell.reference for cell in StudyFolder.open(tmp_path / "s").study.cells] == [None] * len(study.cells)
+    config = first.config.model_copy(update={"steps": 10**6})
+    changed = study.model_copy(update={"cells": (first.model_copy(update={"config": config}), *others)})
+    with pytest.raises(StudyError, match=f"{first.name} differs"):
+        StudyFolder.create(tmp_path / "s", changed)
+
+
+def test_links_in_a_run_that_is_taken_over_stay_behind(tmp_path):
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "key").write_text("mine")
+    theirs, ours = (StudyFolder.create(tmp_path / name, small_study()) for name in "ab")
+    cell = theirs.study.cells[0]
+    run = theirs.prepare(cell).path
+    (run / "leak").symlink_to(tmp_path / "secret")
+    (run / "checkpoints" / "leak").symlink_to(tmp_path / "secret" / "key")
+    ours.adopt(ours.study.cells[0], run)
+    copied = {path.name for path in ours.run_path(ours.study.cells[0]).rglob("*")}
+    assert "config.json" in copied
+    assert "leak" not in copied
+    assert "key" not in copied
 
 
 def test_finished_is_trained_and_evaluated(tmp_path):
@@ -189,7 +225,7 @@ def test_planted_links_at_the_lock_and_the_log_are_not_written_to(tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("mine")
     (folder.path / "study.lock").symlink_to(mine)
-    with pytest.raises(LockError, match="no regular file is there; remove it"), folder.lock():
+    with pytest.raises(LockError, match="no regular file is there; remove it"), StudyFolder.held(folder.path):
         pass
     log = tmp_path / "log.txt"
     log.symlink_to(mine)

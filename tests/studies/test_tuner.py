@@ -13,6 +13,7 @@ pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
 from optuna.trial import TrialState
 
 from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
+from esp_cli.studies.study import StudyError
 from esp_cli.studies.tuner import Trials, Tuner, write_presets
 from esp_cli.studies.tuning import Tuning, TuningFolder
 from esp_cli.studies.tuning_space import Dimension
@@ -24,8 +25,9 @@ from tests.studies.test_tuning import tuning
 class CurveEngine:
     """Trains by formula: the return is the better the nearer the learning rate is to 1e-2, and rises with the steps."""
 
-    def __init__(self, fails: str = "", breaks: str = "") -> None:
-        self.fails, self.breaks, self.started, self.running, self.most = fails, breaks, [], 0, 0
+    def __init__(self, fails: str = "", breaks: str = "", late: bool = False) -> None:
+        self.fails, self.breaks, self.late = fails, breaks, late
+        self.started, self.running, self.most = [], 0, 0
 
     def places(self, device):
         return 2
@@ -53,16 +55,19 @@ class CurveJob:
             return self._end(130)
         if self.path.name == self.engine.fails:
             return self._end(2)
+        if self.step >= self.config["steps"]:  # a look later than the last row, as writing a policy takes a while
+            return self._finish()
         self.step += 100
         value = None if self.path.name == self.engine.breaks else -100 * self.distance + self.step / 100
         row = {"step": self.step, "eval/return_greedy": [value] * 2, "time/elapsed_s": self.step / 10}
         with (self.path / "metrics.jsonl").open("a") as file:
             file.write(json.dumps(row) + "\n")
         (self.path / "checkpoints" / f"step-{self.step:012d}.safetensors").touch()
-        if self.step >= self.config["steps"]:
-            (self.path / "policy.safetensors").write_bytes(b"weights")
-            return self._end(0)
-        return None
+        return self._finish() if self.step >= self.config["steps"] and not self.engine.late else None
+
+    def _finish(self) -> int:
+        (self.path / "policy.safetensors").write_bytes(b"weights")
+        return self._end(0)
 
     def _end(self, code: int) -> int:
         self.code = code
@@ -190,12 +195,61 @@ def test_a_trial_whose_settings_do_not_go_together_is_ended(tmp_path):
     both = {"network.separate_parts": flag, "network.symmetrise": Dimension(choices=(None, "c4"))}
     plan, engine = tuning(priors=("none",), budget=16, space=both), CurveEngine()
     tuner = search(tmp_path / "t", plan, engine)
-    refused = [run for run in tuner.runs if "separate_parts and symmetrise exclude each other" in run.message]
+    refused = [run for run in tuner.runs if run.message]
     assert 0 < len(refused) < 16
+    assert any("separate_parts and symmetrise exclude each other" in run.message for run in refused)
+    assert sorted(tuner.trials.outcome("none").refused) == sorted(run.message for run in refused)
     assert all(run.status == "finished" for run in tuner.runs)
     assert len(engine.started) == 16 - len(refused)
     assert all(state.is_finished() for state in states(tuner.trials, "none"))
     assert search(tmp_path / "t", plan, CurveEngine()).engine.started == []
+
+
+def test_settings_that_only_building_the_learner_refuses_end_their_trial(tmp_path):
+    space = {"mappo.num_minibatches": Dimension(choices=(1, 9999))}
+    plan, engine = tuning(priors=("none",), budget=6, space=space), CurveEngine()
+    tuner = search(tmp_path / "t", plan, engine)
+    found = tuner.trials.outcome("none")
+    assert all("num_minibatches" in reason for reason in found.refused)
+    assert 0 < len(found.refused) == 6 - len(engine.started)
+    assert found.completed + found.pruned == 6
+
+
+def test_a_trial_that_has_all_its_steps_is_complete_whenever_it_is_looked_at(tmp_path):
+    tuner = search(tmp_path / "t", tuning(priors=("none",), budget=24), CurveEngine(late=True))
+    paths = [tmp_path / "t" / "trials" / f"none-{k:03d}" for k in range(24)]
+    whole = [state == TrialState.COMPLETE for state in states(tuner.trials, "none")]
+    assert whole == [last_step(path) == 900 for path in paths]
+    assert 3 < sum(whole) < 24
+
+
+def test_a_damaged_journal_is_told_in_one_sentence(tmp_path):
+    search(tmp_path / "t", tuning(priors=("none",), budget=1))
+    journal = tmp_path / "t" / "journal.jsonl"
+    first, *others = journal.read_bytes().splitlines(keepends=True)
+    journal.write_bytes(first + b"{torn}\n" + b"".join(others))
+    with pytest.raises(StudyError, match=r"journal.jsonl is damaged"):
+        Trials(TuningFolder.begin(tmp_path / "t", tuning(priors=("none",), budget=1)))
+
+
+def test_checkpoints_that_a_kill_left_behind_are_removed(tmp_path):
+    plan = tuning(priors=("none",), budget=2)
+    search(tmp_path / "t", plan)
+    left = tmp_path / "t" / "trials" / "none-001" / "checkpoints" / "step-000000000100.safetensors"
+    left.touch()
+    search(tmp_path / "t", plan)
+    assert not left.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "choices"), [("mappo.value_coef", (1, 2)), ("mappo.anneal_entropy", (0, 1)), ("mappo.num_epochs", (1, 10))]
+)
+def test_the_first_trial_has_the_default_settings_however_a_number_is_written(tmp_path, name, choices):
+    plan = tuning(priors=("none",), budget=1, space={name: Dimension(choices=choices)})
+    default = plan.config("none", {}).algorithm_settings[name.removeprefix("mappo.")]
+    assert default in choices
+    tuner = search(tmp_path / "t", plan)
+    assert tuner.trials.outcome("none").settings == {name: default}
 
 
 def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budgets(tmp_path):

@@ -39,7 +39,7 @@ def points(*means: float) -> list[Point]:
 def test_every_algorithm_has_a_space_whose_corners_are_settings_that_it_takes(algorithm):
     assert algorithm in ALGORITHMS
     for task in ("navigation", "predator-prey"):
-        tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm)).check()
+        tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm)).check((0, 1))
     without = space_of(default_space(algorithm), "none")
     assert set(default_space(algorithm)) - set(without) == {"prior.consistency_coef"}
 
@@ -90,12 +90,12 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
 )
 def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
-        tuning(**changes).check()
+        tuning(**changes).check((0, 1))
 
 
 def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
     found = tuning(overrides={"task.wind": 0.3}, priors=("auto",))
-    found.check()
+    found.check((0, 1))
     prior = found.config("auto", {}).prior
     assert (prior.kind, prior.trust, prior.weights["flip-x"]) == ("esp", "measured", 1.0)
     assert prior.weights["rot180"] < 0.1
@@ -141,12 +141,31 @@ def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
 def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
     best = {"esp": (3, {"mappo.learning_rate": 0.002}), "none": (0, {})}
     study = fresh_study(tuning(), best, (0, 1), 4)
-    assert [cell.variant for cell in study.cells] == ["ESP, default", "ESP, tuned (trial 3)", "plain, default"]
+    # trial 0 of the plain learner has the default settings, so that it is both
+    assert [cell.variant for cell in study.cells] == ["plain, default", "ESP, default", "ESP, tuned (trial 3)"]
     assert {cell.config.seeds for cell in study.cells} == {(0, 1)}
-    assert study.cells[1].config.algorithm_settings["learning_rate"] == 0.002
-    assert [cell.reference for cell in study.cells] == [None, study.cells[0].name, study.cells[0].name]
+    assert study.cells[2].config.algorithm_settings["learning_rate"] == 0.002
+    assert [cell.reference for cell in study.cells] == [None, "plain-default", "plain-default"]
     later = fresh_study(tuning(), best | {"esp": (5, {"mappo.learning_rate": 0.003})}, (0, 1), 4)
-    assert [cell for cell in later.cells if "tuned" not in cell.variant] == [study.cells[0], study.cells[2]]
-    assert later.cells[1].reference == study.cells[1].reference, "another best adds a cell and changes no other"
+    assert later.cells[:2] == study.cells[:2], "another best adds a cell and changes no other"
     with pytest.raises(ValueError, match="seed 1001 belongs to the trials"):
-        fresh_study(tuning(), best, (0, 1001), 4)
+        tuning().check((0, 1001))
+
+
+def test_tuned_is_compared_with_tuned_and_default_with_default():
+    faster, slower = ({"mappo.learning_rate": rate} for rate in (0.002, 0.0002))
+    study = fresh_study(tuning(), {"esp": (3, faster), "none": (2, slower)}, (0, 1), 4)
+    assert {cell.name: cell.reference for cell in study.cells} == {
+        "plain-default": None,
+        "plain-tuned-trial-2": "plain-default",
+        "esp-default": "plain-default",
+        "esp-tuned-trial-3": "plain-tuned-trial-2",
+    }
+    alone = fresh_study(tuning(priors=("esp",)), {"esp": (3, faster)}, (0, 1), 4)
+    assert {cell.name: cell.reference for cell in alone.cells} == {
+        "esp-default": None,
+        "esp-tuned-trial-3": "esp-default",
+    }
+    without = fresh_study(tuning(), {"esp": (3, faster)}, (0, 1), 4)
+    assert [cell.name for cell in without.cells] == ["plain-default", "esp-default", "esp-tuned-trial-3"]
+    assert without.cells[2].reference == "plain-default"

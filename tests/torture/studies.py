@@ -29,10 +29,9 @@ def study_job(path: Path, engine: Engine) -> None:
     """Run a small study, or go on with it, two runs at once."""
     trainer.CHECKPOINT_SECONDS = trainer.CHECKPOINT_SPACING = 0
     os.environ["ESP_CHECKPOINT_SECONDS"] = "0"  # of real processes
-    folder = StudyFolder.create(
-        path, plan("table1", request(tasks=("navigation",), seeds=(0, 1), steps=((None, 200),)))
-    )
-    with folder.lock():
+    study = plan("table1", request(tasks=("navigation",), seeds=(0, 1), steps=((None, 200),)))
+    with StudyFolder.held(path):
+        folder = StudyFolder.create(path, study)
         scheduler = Scheduler(folder, folder.study.cells, 2, engine)
         scheduler.run(lambda snapshot: True, 0.02)
     failed = [run.message for run in scheduler.runs if run.status != "finished"]
