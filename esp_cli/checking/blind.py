@@ -43,34 +43,40 @@ _HIDDEN, _ROUNDS, _UPDATES, _BATCH, _STEP = 256, 16, 500, 1024, 4e-3
 def discover_blindly_in_task(make: MakeWorlds) -> Discovery:
     """Find the symmetries of a task by transitions of the random policy; see `discover_blindly`."""
     env = make(_WORLDS, [0])
-    _refuse_wide(env.spec)
+    action = env.spec.action
+    _refuse_wide(env.spec.observation.width + (action.count if isinstance(action, Discrete) else action.width))
     return discover_blindly(env.spec.name, env.spec, collect(env, _EPISODES, _STEPS))
 
 
-def discover_blindly(source: str, spaces: Spaces, data: Transitions) -> Discovery:
+def discover_blindly(source: str, spaces: Spaces | None, data: Transitions) -> Discovery:
     """Find the symmetries of transitions, told only how many numbers and actions there are.
 
     What is found is named afterwards, where the spaces have a name for it.
 
     Args:
         source: the task or file.
-        spaces: of the transitions.
+        spaces: of the transitions; None where nobody knows them, so that nothing gets a name.
         data: of a policy that prefers no direction, from starts that prefer none.
 
     Raises:
         ValueError: there are too many numbers, or masks of actions.
     """
-    _refuse_wide(spaces)
+    actions = None if data.action.is_floating_point() else int(data.action.max()) + 1
+    if spaces is not None and isinstance(spaces.action, Discrete):
+        actions = spaces.action.count
+    _refuse_wide(data.obs.shape[-1] + (actions or data.action.shape[-1]))
     if data.action_mask is not None:
         raise ValueError("--blind does not look at masks of actions, which these transitions have; leave --blind out")
-    tried, is_complete = search(data, spaces.action.count if isinstance(spaces.action, Discrete) else None)
+    tried, is_complete = search(data, actions)
     results = judged_elements([verdict for _, verdict in tried], TOLERATED)
     maps = [one for (one, _), result in zip(tried, results, strict=True) if result.accepted]
     generators = [Permutation(points) for one in maps if (points := _points(one.matrix))]
     group = PermutationGroup(generators or [Permutation(1)])
-    known = [element for element in default_candidates(spaces) if element.permutation is None]
-    name, transforms = named(_held(known, spaces, data, maps, group), known)
-    found = f"{name} among {'' if is_complete else 'at least '}{group.order()} maps of numbers"
+    found, transforms = f"{'' if is_complete else 'at least '}{group.order()} maps of numbers", ""
+    if spaces is not None:
+        known = [element for element in default_candidates(spaces) if element.permutation is None]
+        name, transforms = named(_held(known, spaces, data, maps, group), known)
+        found = f"{name} among {found}"
     return Discovery(source, BLIND, found, transforms, results)
 
 
@@ -106,9 +112,8 @@ def search(data: Transitions, actions: int | None) -> tuple[list[tuple[NumberMap
     return tried, not moments.gave_up
 
 
-def _refuse_wide(spaces: Spaces) -> None:
-    acts = spaces.action.count if isinstance(spaces.action, Discrete) else spaces.action.width
-    if (numbers := spaces.observation.width + acts) > WIDEST:
+def _refuse_wide(numbers: int) -> None:
+    if numbers > WIDEST:
         raise ValueError(f"--blind searches up to {WIDEST} numbers that an agent sees and does, not {numbers}")
 
 

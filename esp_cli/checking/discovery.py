@@ -18,7 +18,7 @@ from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup
-from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.admission import DISCOVERED, exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.parse import parse_elements
 from esp_envs.spec import Spaces
@@ -105,7 +105,7 @@ def accepted_of(p_values: Sequence[float]) -> list[bool]:
 
 
 def named(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, str]:
-    """Return the name of the largest group that the accepted elements close to, and its `--transforms`.
+    """Return the name of the largest group that the accepted elements close to, and what `--transforms` takes.
 
     A planar group counts where all of its elements that were tried are accepted, and at least one was tried. All orders
     of agents, or of a field's items, count where the accepted exchanges of two connect each with each.
@@ -121,7 +121,7 @@ def named(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, s
     glue = "," if "," in plane else "*"
     product = glue.join(part for part in (text, *whole) if part)
     texts = (",".join(part for part in (product, *single) if part), product, text)
-    return name, next((part for part in texts if _is_readable(part, accepted)), "")
+    return name, next((DISCOVERED + part for part in texts if part and _is_readable(part, accepted)), "")
 
 
 def _orders_of(accepted: Sequence[Element]) -> tuple[list[str], list[str]]:

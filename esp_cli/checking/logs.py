@@ -18,13 +18,13 @@ _MOST_BYTES = 2**31
 _NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask",)
 
 
-def read_transitions(path: Path, spaces: Spaces) -> Transitions:
+def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
     """Read the transitions of a file; reading never runs code.
 
     Args:
         path: of an .npz file with obs and next_obs [M, T, N, D], action [M, T, N] of integers or [M, T, N, width],
             reward [M, T, N], and action_mask [M, T, N, A] where the task has masks; the axis T may be left out.
-        spaces: what the numbers are.
+        spaces: what the numbers are; None where nobody knows, so that the arrays alone say how many there are.
 
     Raises:
         ValueError: it is missing, damaged or too large, or does not fit the spaces.
@@ -33,12 +33,21 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
         raise ValueError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
-    discrete = isinstance(spaces.action, Discrete)
-    agents, width = spaces.num_agents, spaces.observation.width
+    if spaces is None:
+        if min(arrays["obs"].ndim, arrays["action"].ndim) < 2:
+            raise ValueError(
+                f"'obs' or 'action' of {path} has no axis of agents; save [episodes, steps, agents, width]"
+            )
+        agents, width = arrays["obs"].shape[-2:]
+        count, acts = None, arrays["action"].shape[-1]
+        discrete = arrays["action"].dtype.kind in "iu"
+    else:
+        agents, width, discrete = spaces.num_agents, spaces.observation.width, isinstance(spaces.action, Discrete)
+        count, acts = (spaces.action.count, 0) if isinstance(spaces.action, Discrete) else (None, spaces.action.width)
     shapes = {"obs": (agents, width), "next_obs": (agents, width), "reward": (agents,)}
-    shapes["action"] = (agents,) if isinstance(spaces.action, Discrete) else (agents, spaces.action.width)
-    if isinstance(spaces.action, Discrete) and "action_mask" in arrays:
-        shapes["action_mask"] = (agents, spaces.action.count)
+    shapes["action"] = (agents,) if discrete else (agents, acts)
+    if discrete and "action_mask" in arrays:
+        shapes["action_mask"] = (agents, arrays["action_mask"].shape[-1] if count is None else count)
     tensors: dict[str, Tensor] = {}
     for name, shape in shapes.items():
         tensors[name] = _tensor(path, name, arrays[name], shape, integer=discrete and name == "action")
@@ -47,10 +56,10 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
         raise ValueError(f"the arrays of {path} hold different numbers of transitions; give each the same")
     if len(tensors["obs"]) < FEWEST:
         raise ValueError(f"{path} holds {len(tensors['obs'])} episodes; record at least {FEWEST}")
-    if isinstance(spaces.action, Discrete):
+    if discrete:
         chosen = tensors["action"]
-        if int(chosen.min()) < 0 or int(chosen.max()) >= spaces.action.count:
-            raise ValueError(f"the actions of {path} are not all from 0 to {spaces.action.count - 1}; save indices")
+        if int(chosen.min()) < 0 or (count is not None and int(chosen.max()) >= count):
+            raise ValueError(f"the actions of {path} are not all from 0 to {(count or 1) - 1}; save indices")
     mask = tensors.get("action_mask")
     return Transitions(
         tensors["obs"], tensors["action"], tensors["reward"], tensors["next_obs"], None if mask is None else mask > 0

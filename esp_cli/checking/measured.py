@@ -26,20 +26,19 @@ _HORIZON = 50
 def prepared(config: RunConfig) -> RunConfig:
     """Return a configuration with all that its prior leaves to be measured; others come back as they are.
 
-    Transforms "discovered" become what is found, and without a finding there is no prior. Where trust is "measured" or
-    a "gate", each element gets its weight. What was measured stands in the configuration: nothing is measured twice.
+    Transforms "discovered" become what is found; nothing found is written as "discovered:", and then there is no prior.
+    Where trust is "measured" or a "gate", each element gets its weight. That is the idea of PSE (Yu et al., 2024,
+    arXiv:2401.00167), which quantifies the breaking during training; to measure it before, and how, is ours. What was
+    measured stands in the configuration: nothing is measured twice.
     """
     prior = config.prior
     if prior.kind == "none":
         return config
     if prior.transforms == DISCOVERED.rstrip(":"):
-        found = discover_in_task(_Maker(config)).transforms
+        found = discover_in_task(_Maker(config)).transforms.removeprefix(DISCOVERED)
         if prior.copies == "all" or prior.trust != "full":
             found = _listed(found, config)
-        change: dict[str, object] = (
-            {"transforms": DISCOVERED + found} if found else {"kind": "none", "transforms": "d4"}
-        )
-        prior = prior.model_copy(update=change)
+        prior = prior.model_copy(update={"transforms": DISCOVERED + found} | ({} if found else {"kind": "none"}))
     if prior.kind != "none" and prior.trust != "full" and not prior.weights:
         gaps = _breaking(_Maker(config), prior.transforms)
         weights = {name: math.exp(-prior.doubt * gap) if gap < math.inf else 0.0 for name, gap in gaps}
@@ -95,7 +94,8 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     elements = admitted_elements(transforms, spec)
     if isinstance(elements, Group):
         raise ValueError(
-            f"prior.trust=measured or gate weighs each element, but '{transforms}' is sampled; choose a finite group"
+            f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "
+            "finite group, such as d4"
         )
     if env.has("set_state"):
         return tuple((verdict.element, _worst(verdict)) for verdict in check_paired(make_worlds, elements))

@@ -28,7 +28,9 @@ def discover(
     ],
     task: Annotated[
         str | None,
-        typer.Option("--task", "-t", help="Task whose layout the transitions of a file have.", metavar="TASK"),
+        typer.Option(
+            "--task", "-t", help="Task whose layout the transitions of a file have; without it --blind.", metavar="TASK"
+        ),
     ] = None,
     transforms: Annotated[
         str | None,
@@ -67,13 +69,13 @@ def _discovery(
     register_tasks([task or "", what if ":" in what and not Path(what).exists() else ""])
     path = Path(what)
     if path.suffix == ".npz" or path.is_file():
-        if task is None:
-            raise ValueError(f"{what} does not say what its numbers are; name the task that has its layout with --task")
-        spec = make(task, 1, [0], settings).spec
+        spec = None if task is None else make(task, 1, [0], settings).spec
         data = read_transitions(path, spec)
-        if blind:
+        if spec is None or blind:
             from esp_cli.checking.blind import discover_blindly
 
+            if transforms is not None:
+                raise ValueError(f"{what} does not say what its numbers are, as --transforms needs; add --task")
             return discover_blindly(what, spec, data)
         return discover_in_transitions(what, spec, data, transforms)
     name = what
@@ -97,8 +99,6 @@ def _discovery(
 
 
 def _print(found: Discovery) -> None:
-    from esp_cli.symmetry.admission import DISCOVERED
-
     rows = [
         (
             one.element,
@@ -113,6 +113,8 @@ def _print(found: Discovery) -> None:
     caption = f"worst field: gap ± standard error in {unit}; p: that a field is off by the tolerance or more"
     console.table(("element", "result", "p>", "worst field"), rows, title=title, caption=caption)
     if found.transforms:
-        console.note(f"use it with: --transforms {DISCOVERED}{found.transforms}")
+        console.note(f"use it with: --transforms {found.transforms}")
+    elif any(one.accepted for one in found.tried):
+        console.note("what was found has no name that --transforms takes")
     else:
         console.note("nothing that --transforms can name was found: train with --prior none, or with prior.compass")

@@ -198,10 +198,16 @@ def _train(run: Run, trackers: Sequence[str]) -> None:
 
 
 def _announce(config: RunConfig, path: Path, step: int) -> None:
-    prior = config.prior
-    symmetry = (
-        "no prior" if prior.kind == "none" else f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
-    )
+    from esp_cli.symmetry.admission import DISCOVERED
+
+    prior, symmetry = config.prior, "no prior"
+    if prior.kind != "none":
+        symmetry = f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
+        if broken := [weight for weight in prior.weights.values() if weight < 1]:
+            worth = f"{min(broken):.2g} to {max(broken):.2g}" if min(broken) < max(broken) else f"{broken[0]:.2g}"
+            symmetry += f", {len(broken)} of {len(prior.weights)} elements broken and weighed {worth}"
+    elif prior.transforms == DISCOVERED:
+        symmetry = "no prior (no symmetry was discovered)"
     verb = f"resuming at {console.format_count(step)}" if step else "training"
     console.note(
         f"{verb}: {config.algorithm} on {config.task}, {symmetry}, {len(config.seeds)} seed(s), "

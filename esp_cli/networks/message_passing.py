@@ -252,6 +252,12 @@ def _fields(io: IoSpec) -> tuple[Field, Field]:
     fields = io.layout.fields
     pictures = [f for f in fields if f.kind == Kind.PICTURE]
     others = [f for f in fields if f.kind == Kind.VECTOR and f.items is Items.OTHERS]
+    if (len(pictures), len(others)) == (1, 1) and len(fields) > 2:
+        more = ", ".join(field.name for field in fields if field not in (*pictures, *others))
+        raise ValueError(
+            f"message passing takes a picture and the way to each other agent, but {io.spaces.label} shows {more} too; "
+            "use mlp"
+        )
     if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != io.spaces.num_agents - 1:
         raise ValueError(
             f"message passing needs a picture and the way to each other agent, but {io.spaces.label} does not show "

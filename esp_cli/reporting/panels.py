@@ -22,6 +22,8 @@ _LEGEND_INCHES = 0.8
 _MAX_COLUMNS = 3
 _JITTER = 0.08
 """Horizontal distance of the lines of `sensitivity`, so that intervals do not lie upon each other."""
+_WIDEST = 0.4
+"""All lines together, at one value."""
 _BELOW_RANDOM = 0.15
 """How far below the random policy a panel of curves goes, as a share of what is above it."""
 _NAME_HEIGHT = 0.05
@@ -155,9 +157,10 @@ def sensitivity(
     places = {value: k for k, value in enumerate(ordered)}
     with written_figure(path, (6.4, 4.4)) as (figure, files):
         axes = figure.add_subplot()
+        apart = min(_JITTER, _WIDEST / len(lines))
         for index, line in enumerate(lines):
             colour, style = appearance(index)
-            at = np.array([places[value] for value in line.values]) + _JITTER * (index - (len(lines) - 1) / 2)
+            at = np.array([places[value] for value in line.values]) + apart * (index - (len(lines) - 1) / 2)
             means = np.array([mean_and_sem(values)[0] for values in line.values.values()])
             intervals = [bootstrap_interval(values) for values in line.values.values()]
             axes.plot(at, means, color=colour, linestyle=style, marker="o", label=line.label)

@@ -133,20 +133,22 @@ def read_results(path: Path) -> Results:
 def join(several: Sequence[Results]) -> Results:
     """Return the results of studies of one kind as those of one study, the cells in their order.
 
+    A cell that two of them have with the same returns, as a run and its repetition do, counts once.
+
     Raises:
-        ValueError: kinds or evaluations that do not go together, or a cell that two of them have.
+        ValueError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
     """
     first = several[0]
     if any((r.kind, r.mode, r.rows) != (first.kind, first.mode, first.rows) for r in several):
         raise ValueError("results of studies of different kinds, or of different evaluations, have no table in common")
-    cells = [
-        cell.model_copy(update={"config": results.config | cell.config, "episodes": cell.episodes or results.episodes})
-        for results in several
-        for cell in results.cells
-    ]
-    names = [cell.name for cell in cells]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"{twice[0]} stands in two of the results files")
+    cells: dict[str, CellResult] = {}
+    for results in several:
+        for cell in results.cells:
+            there = cells.get(cell.name)
+            if there is None:
+                whole = {"config": results.config | cell.config, "episodes": cell.episodes or results.episodes}
+                cells[cell.name] = cell.model_copy(update=whole)
+            elif (there.returns, there.seeds, there.step) != (cell.returns, cell.seeds, cell.step):
+                raise ValueError(f"{cell.name} stands in two of the results files, with different returns")
     command = "\n".join(dict.fromkeys(results.command for results in several))
-    return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells)})
+    return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells.values())})

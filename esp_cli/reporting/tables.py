@@ -162,7 +162,10 @@ def breaking_table(results: Results) -> Table | None:
                 ]
                 short = _return_at(results, cell, early=True)
                 rows.append((one.name, f"{one.setting} {strength:g}", method, short, _short(results, cell), *beside))
-    caption = "Mean ± standard error over seeds at a fifth of the run and at its end; ahead: at the end, by intervals."
+    caption = (
+        "Mean ± standard error over seeds at the evaluation nearest to a fifth of the run and at its end; ahead: at "
+        "its end, by intervals."
+    )
     headings = ("run", "breaking", "method", "at 20 %>", "at 100 %>", "ahead of plain", "ahead of ESP")
     return Table("Returns over the strength of breaking", headings, tuple(rows), caption) if rows else None
 
@@ -183,7 +186,7 @@ def methods_table(results: Results, early: bool = False) -> Table | None:
         texts = {method: _return_at(results, cell, early) for method, cell in cells.items()}
         label = breaking if shared else f"{name}, {breaking}"
         rows.append((label, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
-    when = "at a fifth of the run" if early else "at the end of the run"
+    when = "at the evaluation nearest to a fifth of the run" if early else "at the end of the run"
     caption = f"Mean ± standard error over seeds {when}; (*): the highest of its row, or not told apart from it."
     headings = (shared or "run", *(f"{method}>" for method in methods))
     return Table(f"Returns {when}", headings, tuple(rows), caption) if rows else None

@@ -111,6 +111,8 @@ def _variants(
         heads = [part for part in (task, strength.label) if part]
         stem = "-".join(file_name(part) for part in (*heads, algorithm)) + f"-{_count(steps)}"
         for variant in variants:
+            if request.variants is None and variant in kind.without.get(task, ()):
+                continue
             choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
             choice |= strength.settings
             config = _config(task, algorithm, steps, request, choice, kind.common)

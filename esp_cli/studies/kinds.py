@@ -71,6 +71,7 @@ class StudyKind:
         only: the one task that the study is about.
         teams: rows beside the task itself.
         breakings: by task the settings that break its symmetry, and their strengths; empty for other studies.
+        without: by task the variants that its networks do not take, and that are left out unless the user names them.
         place: of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none.
         mode: evaluations that are reported, unless the user asks for others.
         thresholds: returns whose first passing is reported; by default that which the reference ended with.
@@ -90,6 +91,7 @@ class StudyKind:
     only: str | None = None
     teams: tuple[Team, ...] = ()
     breakings: Breakings = field(default_factory=dict)
+    without: Mapping[str, frozenset[str]] = field(default_factory=dict)
     place: tuple[str, ...] = ()
     mode: Mode = "greedy"
     thresholds: tuple[float, ...] = ()
@@ -202,6 +204,7 @@ KINDS: Mapping[str, StudyKind] = {
         algorithms=("mappo",),
         steps=(1_000_000,),
         breakings=BREAKINGS,
+        without={"wildlife": frozenset({"compass", "relaxed weights"})},  # its agents see pictures
     ),
     # the standard network, the same with the prior, the equivariant one, and the standard one averaged over the group
     "homomorphic": StudyKind(

@@ -172,6 +172,8 @@ def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
     What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
     """
     found = text.removeprefix(DISCOVERED)
+    if not found and text:
+        raise ValueError("nothing was discovered that transforms could name; choose some, or no prior")
     elements = parse_elements(found, spaces.num_agents)
     admit(found, elements, spaces if found == text else unrestricted(spaces))
     return elements

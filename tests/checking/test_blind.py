@@ -107,7 +107,9 @@ def test_what_is_found_gets_a_name_where_there_is_one(settings, group: str, tran
     moves = FORCE if settings.get("forces") else discrete_moves(("stay", "left", "right", "down", "up"))
     spaces = Spaces(num_agents=1, observation=row, state=row, action=moves, symmetry="c1")
     found = discover_blindly("scene", spaces, scene(**settings))
-    assert (found.group, found.transforms) == (group, transforms)
+    assert (found.group, found.transforms) == (group, transforms and f"discovered:{transforms}")
+    nameless = discover_blindly("scene", None, scene(**settings))
+    assert (f"{group.split(' among ', maxsplit=1)[0]} among {nameless.group}", nameless.transforms) == (group, "")
 
 
 def test_a_point_on_a_rail_has_mirrors_alone() -> None:
@@ -119,7 +121,7 @@ def test_a_point_on_a_rail_has_mirrors_alone() -> None:
     moves = discrete_moves(("stay", "left", "right", "down", "up"))
     spaces = Spaces(num_agents=1, observation=row, state=row, action=moves, symmetry="c1")
     found = discover_blindly("rail", spaces, replace(data, obs=obs, next_obs=next_obs, reward=reward))
-    assert found.transforms == "d2"
+    assert found.transforms == "discovered:d2"
 
 
 def test_agents_whose_winds_oppose_each_other_have_no_mirror_together() -> None:
@@ -139,7 +141,7 @@ def test_navigation_is_found_with_its_exchanges_of_landmarks(monkeypatch: pytest
     env = make("navigation", 512, [0])
     found = discover_blindly("navigation", env.spec, collect(env, 32_768, 2))
     assert found.group == "d4*landmarks-3 among 96 maps of numbers"
-    assert found.transforms == "d4*landmarks-3"
+    assert found.transforms == "discovered:d4*landmarks-3"
 
 
 def test_what_it_cannot_look_at_is_refused() -> None:

@@ -66,7 +66,7 @@ def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> 
     assert (found.method, found.group) == ("paired states", group)
     assert bool(found.transforms) == (group != "c1")
     if found.transforms:
-        assert transform_set(f"discovered:{found.transforms}", make(task, 1, [0], settings).spec).names
+        assert transform_set(found.transforms, make(task, 1, [0], settings).spec).names
 
 
 @pytest.mark.slow
@@ -166,14 +166,16 @@ def test_accepted_elements_close_to_the_largest_group(accepted: str, group: str,
     tried = parse_elements("d16,rot57,flip23,agents-1-0-2,agents-0-2-1,agents-2-1-0,marks-1-0-2,marks-0-2-1", 3)
     name, text = named(parse_elements(accepted, 3), tried)
     assert name == group
-    assert text == (group if transforms is None else transforms)
-    if text:
-        parse_elements(text, 3)
+    expected = group if transforms is None else transforms
+    assert text == (f"discovered:{expected}" if expected else "")
+    if expected:
+        parse_elements(expected, 3)
 
 
 def test_what_is_found_is_complete_in_whatever_order_fields_stand() -> None:
     found = parse_elements("d4,obstacles-1-0,marks-1-0,agents-1-0", 2)
-    assert named(found, found) == ("d4*agents*marks-2*obstacles-2",) * 2
+    whole = "d4*agents*marks-2*obstacles-2"
+    assert named(found, found) == (whole, f"discovered:{whole}")
 
 
 def recorded(folder: Path, **changes: object) -> Path:
@@ -191,7 +193,9 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
     shown = esp("discover", path, "--task", "navigation", "--set", "task.actions=continuous", "--json", out)
     assert "found flip-x*agents" in shown.stdout
     assert "--transforms discovered:flip-x*agents" in shown.stderr
-    assert json.loads(out.read_text())["group"] == "flip-x*agents", "so few episodes do not show the landmarks' orders"
+    told = json.loads(out.read_text())
+    assert told["group"] == "flip-x*agents", "so few episodes do not show the landmarks' orders"
+    assert told["transforms"] == "discovered:flip-x*agents"
     spec = make("navigation", 1, [0], FORCES).spec
     data = read_transitions(path, spec)
     flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
@@ -219,8 +223,11 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     junk = tmp_path / "junk.npz"
     junk.write_bytes(b"PK\x03\x04 no archive")
     assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
-    assert "name the task that has its layout" in refused("discover", junk)
-    assert "there is no file" in refused("discover", tmp_path / "none.npz", "--task", "navigation")
+    assert "is not an intact .npz file" in refused("discover", junk)
+    for words in ([], ["--task", "navigation"]):
+        assert "there is no file" in refused("discover", tmp_path / "none.npz", *words)
+    assert "does not say what its numbers are" in refused("discover", recorded(tmp_path), "--transforms", "d4")
+    assert "has no axis of agents" in refused("discover", recorded(tmp_path, obs=np.zeros(64)))
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
     assert "is for a file of transitions" in refused("discover", tmp_path, "--task", "navigation")
@@ -264,7 +271,7 @@ def test_a_gap_that_is_no_number_is_not_accepted() -> None:
 def test_agents_that_were_never_exchanged_are_not_claimed() -> None:
     """Agent 3 of four is in no exchange that was tried."""
     tried = parse_elements("agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3", 4)
-    assert named(tried, tried)[1] == "agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3"
+    assert named(tried, tried)[1] == "discovered:agents-1-0-2-3,agents-0-2-1-3,agents-2-1-0-3"
 
 
 def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settings(tmp_path: Path) -> None:
@@ -327,6 +334,9 @@ def test_an_unknown_field_is_refused() -> None:
 def test_where_nothing_is_found_there_is_no_prior() -> None:
     broken = {f"task.{name}": value for name, value in NOTHING.items()}
     config = resolve_config("navigation", overrides={**broken, "prior.transforms": "discovered"})
-    assert prepared(config).prior.kind == "none"
+    prior = prepared(config).prior
+    assert (prior.kind, prior.transforms) == ("none", "discovered:"), "a run says that it looked"
+    with pytest.raises(ValueError, match="nothing was discovered that transforms could name"):
+        build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:"}))
     plain = resolve_config("navigation")
     assert prepared(plain) is plain

@@ -15,6 +15,8 @@ import torch
 from esp_cli import console
 from esp_cli.algorithms.learner import Iteration
 from esp_cli.algorithms.mappo import Mappo
+from esp_cli.checking import measured
+from esp_cli.checking.discovery import Discovery
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -81,6 +83,20 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         assert f"{last[f'eval/return_{mode}'][0]:.2f}" in row
     assert "training" not in told.stdout
     assert "no prior" in esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "b", "--prior", "none").stderr
+
+
+def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("rot90", "rot180", "rot270", "flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal")
+    gaps = (0.0, 0.0, 0.0, 0.1, 0.5, 0.5, 0.5)
+    monkeypatch.setattr(measured, "_breaking", lambda *_: tuple(zip(names, gaps, strict=True)))
+    told = esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "auto").stderr
+    assert "prior esp (d4, c = 0.1), 4 of 7 elements broken and weighed 0.018 to 0.45, 1 seed(s)" in told
+    monkeypatch.setattr(measured, "_breaking", lambda *_: tuple((name, 0.0) for name in names))
+    assert "broken" not in esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "b").stderr
+    nothing = Discovery("navigation", "paired states", "c1", "", ())
+    monkeypatch.setattr(measured, "discover_in_task", lambda *_: nothing)
+    told = esp("train", *TINY_OPTIONS, "--steps", 50, "--transforms", "discovered", "--out", tmp_path / "c").stderr
+    assert "no prior (no symmetry was discovered)" in told
 
 
 @pytest.mark.parametrize(

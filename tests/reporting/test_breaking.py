@@ -15,6 +15,7 @@ from esp_cli.reporting.tables import breaking_table, methods_table, returns_tabl
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.kinds import BREAKINGS, KINDS
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.build import build_learner
 from esp_envs import make
 from tests.studies.small_studies import request, small_study, write_run, write_study
 
@@ -67,6 +68,22 @@ def test_every_method_meets_every_strength_of_its_task(monkeypatch: pytest.Monke
     assert configs["compass"].prior.compass > 0
     assert (configs["gate"].prior.trust, configs["relaxed weights"].network.relax) == ("gate", 1.0)
     assert all(cell.reference is None or cell.reference.endswith("-plain") for cell in cells)
+
+
+def test_what_a_task_cannot_take_is_left_out_of_its_study(monkeypatch: pytest.MonkeyPatch):
+    turns, mirrors = ("rot90", "rot180", "rot270"), ("flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal")
+    gaps = {"c4": turns, "d4": turns + mirrors}
+    monkeypatch.setattr(measured, "_breaking", lambda _, text: tuple((name, 0.5) for name in gaps[text]))
+    left_out = {"compass", "relaxed weights"}
+    cells = plan("ablate-breaking", request(tasks=("wildlife",), seeds=(0,), overrides={})).cells
+    unbroken = {cell.variant: cell.config for cell in cells if cell.panel.startswith("wildlife, unbroken")}
+    assert list(unbroken) == [method for method in METHODS if method not in left_out]
+    for config in unbroken.values():
+        build_learner(config)
+    named = plan("ablate-breaking", request(tasks=("wildlife",), seeds=(0,), variants=tuple(left_out), overrides={}))
+    for cell in named.cells[:2]:
+        with pytest.raises(ValueError, match=r"shows compass too; use mlp|shows pictures"):
+            build_learner(cell.config)
 
 
 def test_weights_are_measured_when_the_study_is_planned_and_methods_that_train_as_esp_does_are_one_run():

@@ -85,5 +85,9 @@ def test_studies_that_do_not_go_together_are_refused(page):
     with pytest.raises(ValueError, match="different kinds"):
         filled(page)
     page.write_text(page.read_text().replace("b.json", "a.json"))
-    with pytest.raises(ValueError, match="navigation-200-mappo-esp stands in two"):
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in filled(page), "what is the same counts once"
+    first, second = (page.parent / "measured" / name for name in ("a.json", "b.json"))
+    second.write_text(first.read_text().replace("-130.0", "-131.0"))
+    page.write_text(page.read_text().replace("a.json", "b.json", 1))
+    with pytest.raises(ValueError, match="navigation-200-mappo-esp stands in two of the results files, with different"):
         filled(page)
