@@ -227,28 +227,21 @@ def fresh_study(
         episodes: per seed, of the final evaluations.
     """
     panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
+
+    def cell(variant: str, config: RunConfig, beside: Cell | None) -> Cell:
+        reference = None if beside is None else beside.name
+        return Cell(name=file_name(variant), panel=panel, variant=variant, config=config, reference=reference)
+
     cells: list[Cell] = []
     plain: tuple[Cell, Cell] | None = None  # with the default settings and with the best
     for prior in sorted(tuning.priors, key=lambda name: name != "none"):
-
-        def cell(variant: str, settings: Mapping[str, object], beside: Cell | None, prior: str = prior) -> Cell:
-            return Cell(
-                name=file_name(variant),
-                panel=panel,
-                variant=variant,
-                config=tuning.config(prior, settings, seeds),
-                reference=None if beside is None else beside.name,
-            )
-
-        default = tuned = cell(f"{NAMES[prior]}, default", {}, plain and plain[0])
+        default = tuned = cell(f"{NAMES[prior]}, default", tuning.config(prior, {}, seeds), plain and plain[0])
         cells.append(default)
-        if prior in best:
-            number, settings = best[prior]
-            tuned = cell(f"{NAMES[prior]}, tuned (trial {number})", settings, plain[1] if plain else default)
-        if tuned.config != default.config:  # unless the default settings were the best
+        number, settings = best.get(prior, (0, {}))
+        config = tuning.config(prior, settings, seeds)
+        if config != default.config:  # else the default settings were the best, or nothing was
+            tuned = cell(f"{NAMES[prior]}, tuned (trial {number})", config, plain[1] if plain else default)
             cells.append(tuned)
-        else:
-            tuned = default
         if prior == "none":
             plain = default, tuned
     return Study(
