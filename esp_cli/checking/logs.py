@@ -59,7 +59,8 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
     if discrete:
         chosen = tensors["action"]
         if int(chosen.min()) < 0 or (count is not None and int(chosen.max()) >= count):
-            raise ValueError(f"the actions of {path} are not all from 0 to {(count or 1) - 1}; save indices")
+            known = "on" if count is None else f"to {count - 1}"
+            raise ValueError(f"the actions of {path} are not all from 0 {known}; save indices")
     mask = tensors.get("action_mask")
     return Transitions(
         tensors["obs"], tensors["action"], tensors["reward"], tensors["next_obs"], None if mask is None else mask > 0

@@ -155,12 +155,17 @@ def _limits(given: tuple[float, float] | None, old: tuple[float, float] | None) 
     return limits
 
 
+def threshold_words(thresholds: Sequence[float]) -> list[str]:
+    """Return the words of the command line that name these thresholds."""
+    return [word for limit in thresholds for word in ("--threshold", f"{limit:.15g}")]
+
+
 def _command(
     runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: str | None, out: Path | None
 ) -> str:
     """Return the command line that gives the same report of the same runs."""
     words = ["esp", "report", *runs, *(word for text in at for word in ("--at", text))]
-    words += [word for limit in thresholds for word in ("--threshold", f"{limit:g}")]
+    words += threshold_words(thresholds)
     words += ["--mode", mode] if mode else []
     return shlex.join(words + (["--out", str(out)] if out else []))
 

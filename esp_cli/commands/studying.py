@@ -164,7 +164,7 @@ def follow(scheduler: Scheduler, title: str, requests: Sequence[int]) -> tuple[b
 
 def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
     """Print the table of a study and say what to do next."""
-    from esp_cli.commands.report import print_tables
+    from esp_cli.commands.report import print_tables, threshold_words
     from esp_cli.reporting.collect import collect
 
     results = collect(folder, mode, thresholds).results
@@ -172,7 +172,7 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
         print_tables(results)
     if json is not None:
         console.write_json(json, results.document())
-    words = ["esp", "report", str(folder.path), *(word for one in thresholds for word in ("--threshold", repr(one)))]
+    words = ["esp", "report", str(folder.path), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")
 
 

@@ -84,6 +84,7 @@ def _tuning(
     Raises:
         ValueError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
     """
+    from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
     from esp_cli.studies.tuning_space import default_space, read_space
 
@@ -97,7 +98,6 @@ def _tuning(
     meant, steps = (request.steps or ((None, 500_000),))[0]
     if meant not in (None, task):
         raise ValueError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
-    own = f"{task}."
     tuning = Tuning(
         task=task,
         algorithm=algorithm,
@@ -108,10 +108,7 @@ def _tuning(
         reach=reach,
         steps=steps,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
-        overrides={
-            f"task.{name.removeprefix(own)}" if name.startswith(own) else name: value
-            for name, value in request.overrides.items()
-        },
+        overrides={task_setting(name, task): value for name, value in request.overrides.items()},
         space=dict(read_space(space) if space else default_space(algorithm)),
         device=request.device,
         command=request.command,
@@ -168,8 +165,8 @@ def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path]
     if refused:
         console.note(f"{len(refused)} trials had settings that do not go together, the first: {refused[0]}")
     console.note(f"report -> {write_page(trials, outcomes, trials.folder.path / 'report')}")
+    own = trials.tuning.config("none", {}).own_words()
     for path in presets:
-        own = trials.tuning.config("none", {}).own_words()
         console.note(f"next: {shlex.join(['esp', 'train', *own, '--config', str(path)])}")
 
 

@@ -84,7 +84,7 @@ def side(results: Results, cell: CellResult, other: CellResult | None, early: bo
         results: of the study.
         cell: one cell.
         other: the other, if there is one.
-        early: at a fifth of the run instead of its end.
+        early: at the evaluation nearest to a fifth of the run instead of its end.
     """
     values = at(results, cell, early)
     others = None if other is None else at(results, other, early)
@@ -100,7 +100,7 @@ def side(results: Results, cell: CellResult, other: CellResult | None, early: bo
 
 
 def at(results: Results, cell: CellResult, early: bool) -> Floats | None:
-    """Return the returns by seed, at a fifth of the run or at its end; None where it was not run so far."""
+    """Return the returns by seed, nearest to a fifth of the run or at its end; None where it was not run so far."""
     if not early:
         return returns_of(cell, results.mode)
     return None if cell.early is None else floats(cell.early)

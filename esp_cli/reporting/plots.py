@@ -29,7 +29,7 @@ from esp_cli.files.failures import attempting
 from esp_cli.files.writing import write_file
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Okabe and Ito, "Color Universal Design", 2008, without the yellow, which is too light for lines on white."""
+"""Okabe and Ito, "Color Universal Design", 2008, without the yellow, too light for lines on white, and a grey."""
 
 LineStyle = str | tuple[int, tuple[int, ...]]
 

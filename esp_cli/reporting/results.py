@@ -49,7 +49,7 @@ class CellResult(BaseModel):
         anchors: mean returns of the reference policies.
         metrics: the task's measures of the greedy policy.
         evaluations: on the way.
-        early: returns at a fifth of the run, by seed, in a study of broken symmetry.
+        early: returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry.
         area_under_curve: mean height of the learning curve, by seed.
         steps_to: first steps at thresholds.
         parameters: weights by network, of one seed.

@@ -59,14 +59,13 @@ def plan(name: str, request: Request) -> Study:
         ValueError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
     """
     kind = KINDS[name]
-    for setting in request.overrides:
-        section, _, rest = setting.rpartition(".")
-        if (f"task.{rest}" if section in task_names() else setting) in kind.varies:
-            raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
     if not variants or len(set(variants)) < len(variants) or not set(variants) <= set(kind.variants):
         raise ValueError(f"name each variant of this study once; they are {', '.join(kind.variants)}")
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
+    for setting in request.overrides:
+        if any(task_setting(setting, task) in kind.varies for task in tasks):
+            raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
     _refuse_unused(kind, request, tasks, algorithms)
     build = _pairs if kind.rows == "panels" else _variants
     cells = tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
@@ -128,6 +127,12 @@ def _variants(
             )
 
 
+def task_setting(name: str, task: str) -> str:
+    """Return a setting as a run of the task calls it: "navigation.wind" is "task.wind" in a run of navigation."""
+    section, _, rest = name.rpartition(".")
+    return f"task.{rest}" if section == task else name
+
+
 def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
     """Return the numbers of steps of a task.
 
@@ -148,11 +153,9 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
     """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
     settings = dict(common)
     for name, value in request.overrides.items():
-        section, _, rest = name.rpartition(".")
-        if section == task:
-            settings[f"task.{rest}"] = value
-        elif section == algorithm or section not in (*ALGORITHMS, *task_names()):
-            settings[name] = value
+        section = name.rpartition(".")[0]
+        if section in (task, algorithm) or section not in (*ALGORITHMS, *task_names()):
+            settings[task_setting(name, task)] = value
     settings |= choice
     return planned(resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings))
 
