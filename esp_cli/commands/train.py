@@ -146,12 +146,15 @@ def train(
         "device": device,
         "init_from": init_from,
     }
+    said = set(overrides)
     if config is not None:
         choices, overrides = with_file(context, config, choices, overrides)
     resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, **choices)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
+    if idle := sorted(said & resolved.without_effect()):
+        console.note(f"without effect beside the other settings: {', '.join(idle)}")
     require(trackers)
     _train(begin(resolved, weights, out), trackers)
 
@@ -200,13 +203,13 @@ def _train(run: Run, trackers: Sequence[str]) -> None:
 def _announce(config: RunConfig, path: Path, step: int) -> None:
     from esp_cli.symmetry.admission import DISCOVERED
 
-    prior, symmetry = config.prior, "no prior"
+    prior, symmetry = config.prior.effective(), "no prior"
     if prior.kind != "none":
         symmetry = f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
         if broken := [weight for weight in prior.weights.values() if weight < 1]:
             worth = f"{min(broken):.2g} to {max(broken):.2g}" if min(broken) < max(broken) else f"{broken[0]:.2g}"
             symmetry += f", {len(broken)} of {len(prior.weights)} elements broken and weighed {worth}"
-    elif prior.transforms == DISCOVERED:
+    elif config.prior.transforms == DISCOVERED:
         symmetry = "no prior (no symmetry was discovered)"
     verb = f"resuming at {console.format_count(step)}" if step else "training"
     console.note(

@@ -149,6 +149,10 @@ class EquivariantConfig(NetworkConfig):
         "residual", description="by a plain layer beside each, or by weights that differ between a feature's outputs"
     )
 
+    def without_effect(self) -> frozenset[str]:
+        """Return "relaxation" where nothing is relaxed."""
+        return frozenset() if self.relax else frozenset({"relaxation"})
+
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:

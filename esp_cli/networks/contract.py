@@ -65,6 +65,10 @@ class NetworkConfig(Strict, ABC):
         chosen = {"activation": activation} if "activation" in type(self).model_fields else {}
         return self.model_copy(update=chosen)
 
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset()
+
     def least_parameters(self, inputs: int) -> int:
         """Return a lower bound of the number of weights; a file with fewer is damaged.
 

@@ -89,13 +89,24 @@ class PriorConfig(Strict):
         Two priors with the same effective settings train the same, bit for bit. With a coefficient of 0 there is no
         consistency loss; without both parts the kind is "none".
         """
+        kind, lost = self._effect()
+        kept = {name: value for name, value in self if name not in lost}
+        return PriorConfig(**{**kept, "kind": kind})
+
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        deciding = {"kind", "consistency_coef"} if self.consistency_coef == 0 else {"kind"}
+        return self._effect()[1] - deciding
+
+    def _effect(self) -> tuple[str, frozenset[str]]:
+        """Return the kind that this comes to, and the names of settings that have no effect in it."""
         loses = {
-            "none": set(type(self).model_fields),
-            "augment": {"consistency_coef", "terms", "stop_gradient"},
-            "consistency": {"old_log_prob", "replay"},
-            "esp": set[str](),
+            "none": frozenset(type(self).model_fields),
+            "augment": frozenset({"consistency_coef", "terms", "stop_gradient"}),
+            "consistency": frozenset({"old_log_prob", "replay"}),
+            "esp": frozenset[str](),
         }
-        kind = self.kind
+        kind: str = self.kind
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
         sure = bool(self.weights) and all(weight == 1 for weight in self.weights.values())
@@ -104,5 +115,4 @@ class PriorConfig(Strict):
             lost = lost | {"doubt", "weights"}
         elif sure:  # what is certain does not fade
             lost = lost | {"trust", "doubt", "weights", "fade"}
-        kept = {name: value for name, value in self if name not in lost}
-        return PriorConfig(**{**kept, "kind": kind})
+        return kind, lost

@@ -65,6 +65,11 @@ class RunConfig(Strict):
         """Return the configuration of the first seed alone, on the CPU, for what all seeds and devices share."""
         return self.model_copy(update={"seeds": self.seeds[:1], "device": "cpu"})
 
+    def without_effect(self) -> frozenset[str]:
+        """Return settings of prior and network that change nothing beside the others, as "prior.weights"."""
+        idle = {"prior": self.prior.without_effect(), "network": self.network.without_effect()}
+        return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
+
     def own_words(self) -> list[str]:
         """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""
         chosen = (("--task", self.task), ("--algo", self.algorithm), ("--network", self.network.name))

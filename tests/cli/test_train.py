@@ -85,6 +85,24 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
     assert "no prior" in esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "b", "--prior", "none").stderr
 
 
+@pytest.mark.parametrize(
+    ("options", "idle"),
+    [
+        (["--prior", "none", "--transforms", "c4"], "prior.transforms"),
+        (["--set", 'prior.weights={"rot90":0.5}', "--set", "prior.doubt=2"], "prior.doubt, prior.weights"),
+        (["--prior", "consistency", "--consistency-coef", "0", "--transforms", "c4"], "prior.transforms"),
+        (["--network", "equivariant", "--set", "network.relaxation=weights"], "network.relaxation"),
+        (["--network", "equivariant", "--set", "network.relaxation=weights", "--set", "network.relax=1"], None),
+        (["--consistency-coef", "0.2", "--transforms", "c4"], None),
+    ],
+)
+def test_a_setting_that_changes_nothing_beside_the_others_is_named(tmp_path: Path, options, idle) -> None:
+    told = esp("train", *TINY_OPTIONS, "--steps", 50, *options, "--out", tmp_path / "run").stderr
+    assert ("without effect" in told) == (idle is not None)
+    assert idle is None or f"without effect beside the other settings: {idle}\n" in told
+    assert "broken" not in told
+
+
 def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("rot90", "rot180", "rot270", "flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal")
     gaps = (0.0, 0.0, 0.0, 0.1, 0.5, 0.5, 0.5)
