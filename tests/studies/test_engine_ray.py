@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,15 +21,19 @@ from ray.cluster_utils import Cluster
 
 from esp_cli.library.run import Run
 from esp_cli.studies import engine_ray, versions
+from esp_cli.studies.engine import Engine
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.engine_ray import RayEngine
 from esp_cli.studies.mirror import Mirror
 from esp_cli.studies.ray_cluster import ClusterError
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import Cell, Study, StudyFolder
+from esp_cli.studies.tuning import TuningFolder
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
+from tests.studies.test_tuning import tuning
 from tests.studies.test_worker import wait_for
 from tests.training.runs import TINY
 
@@ -227,3 +232,30 @@ def test_a_cluster_of_another_version_or_none_is_refused_in_one_sentence(
             ClusterError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
         ):
             RayEngine(folder.path, address)
+
+
+def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machine(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
+    from esp_cli.studies.tuner import Outcome, Trials, Tuner
+
+    monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
+    asked = tuning(priors=("esp",), budget=3, steps=STEPS // 2)
+
+    def searched(folder: TuningFolder, engine: Engine) -> Outcome:
+        """Search; stop at the first checkpoint, and go on."""
+        first = folder.run_path(folder.cell("esp", 0, {}))
+        for until in (lambda _: not any(first.glob("checkpoints/step-*.safetensors")), lambda _: True):
+            assert not (first / "policy.safetensors").exists()
+            trials = Trials(TuningFolder.begin(folder.path, asked))
+            Tuner(trials, 1, engine).run(until, 0.05)
+        return trials.outcome("esp")
+
+    here = searched(TuningFolder(tmp_path / "here", asked), LocalEngine())
+    with RayEngine(tmp_path / "there", cluster.address, silence_s=2.0) as engine:
+        there = searched(TuningFolder(tmp_path / "there", asked), engine)
+        assert workers() == []
+    assert there.trials == 3
+    # a trial that is pruned ends some steps after it was judged
+    assert replace(there, seconds=0.0, env_steps=0) == replace(here, seconds=0.0, env_steps=0)
