@@ -92,7 +92,8 @@ def returns_table(results: Results, whole: bool = False) -> Table:
 def comparison_table(results: Results) -> Table:
     """Return each cell beside its reference and the paper's number: intervals, and who is ahead."""
     rows = []
-    columns = _COMPARED + (_PAPER_SIDE if any(cell.paper for cell in results.cells) else ())
+    has_paper = any(cell.paper for cell in results.cells)
+    columns = _COMPARED + (_PAPER_SIDE if has_paper else ())
     columns = ("trained to>", *columns) if any(cell.at is not None for cell in results.cells) else columns
     for cell in results.cells:
         found = summarise_cell(results, cell)
@@ -100,12 +101,14 @@ def comparison_table(results: Results) -> Table:
         if found is not None and found.returns.mean is not None:
             texts |= _compared(cell, found)
         rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
+    welch = "Ours and the paper's means are compared by Welch's test at 5 %. " if has_paper else ""
     caption = (
         f"The reference is {kind_of(results.kind).reference}, compared seed by seed; over all pairs: "
-        "every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. Ours and the paper's "
-        "means are compared by Welch's test at 5 %. No interval is widened for the number of comparisons."
+        f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}"
+        "No interval is widened for the number of comparisons."
     )
-    return Table("Beside the reference and the paper", ("panel", "run", *columns), tuple(rows), caption)
+    title = f"Beside the reference{' and the paper' if has_paper else ''}"
+    return Table(title, ("panel", "run", *columns), tuple(rows), caption)
 
 
 def statistics_table(results: Results) -> Table:
