@@ -157,7 +157,7 @@ def _limits(given: tuple[float, float] | None, old: tuple[float, float] | None) 
 
 def threshold_words(thresholds: Sequence[float]) -> list[str]:
     """Return the words of the command line that name these thresholds."""
-    return [word for limit in thresholds for word in ("--threshold", f"{limit:.15g}")]
+    return [word for limit in thresholds for word in ("--threshold", repr(limit).removesuffix(".0"))]
 
 
 def _command(

@@ -133,9 +133,11 @@ class StudyChoices:
         """Return the study folder of a kind of study."""
         return self.out or Path("runs") / kind
 
-    def engine_words(self) -> str:
-        """Return the options that say what runs the study, as the end of a command line."""
-        words = [] if self.engine == "local" else ["--engine", self.engine]
+    def running_words(self) -> str:
+        """Return the options that say how the study is run and not what, as the end of a command line."""
+        words = [] if self.jobs is None else ["--jobs", str(self.jobs)]
+        words += [word for path in self.reuse or () for word in ("--reuse", str(path))]
+        words += [] if self.engine == "local" else ["--engine", self.engine]
         words += ["--address", self.address] if self.address is not None else []
         words += ["--gpu-share", f"{self.gpu_share:g}"] if self.gpu_share != 1.0 else []
         return "".join(f" {word}" for word in map(shlex.quote, words))
@@ -192,11 +194,19 @@ class StudyChoices:
         return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])
 
 
-def study_command(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them."""
+def study_command(command: Callable[..., None] | None = None, **options: Any) -> Callable[..., Any]:
+    """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them.
+
+    Args:
+        command: the command; without one, a decorator comes back.
+        options: by the name of a field, the annotation of an option that says something else in this command.
+    """
+    if command is None:
+        return functools.partial(study_command, **options)
     own = dict(inspect.signature(command, eval_str=True).parameters)
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
+    shared |= {name: shared[name].replace(annotation=option) for name, option in options.items()}
     named = inspect.Parameter("seed_list", shared["seeds"].kind, default=None, annotation=SeedListOption)
     parameters = [*own.values(), *shared.values(), named]
     parameters.sort(key=lambda parameter: parameter.default is not parameter.empty)

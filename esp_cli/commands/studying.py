@@ -65,7 +65,7 @@ def run_study(
             folder = StudyFolder.create(out, study)
             complete, failed = run_cells(folder, study, others, jobs, engine, requests)
     if not complete:
-        console.note(f"stopped; go on with: {study.command}{choices.engine_words()}")
+        console.note(f"stopped; go on with: {study.command}{choices.running_words()}")
         raise typer.Exit(130)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     report_study(folder, choices.json, mode, thresholds)
@@ -92,6 +92,8 @@ def open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
     if choices.engine == "local":
         if choices.address is not None:
             raise ValueError("--address is that of a Ray cluster; add --engine ray, or leave it out")
+        if choices.gpu_share != 1.0:
+            raise ValueError("--gpu-share is for GPUs of a Ray cluster; add --engine ray, or leave it out")
         yield LocalEngine()
         return
     try:

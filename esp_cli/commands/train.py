@@ -116,6 +116,7 @@ def train(
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     from esp_cli.library.run import Run, begin, plan
     from esp_cli.trackers import require
+    from esp_cli.training.config import resolve_config
     from esp_cli.training.run_folder import RUN_FORMAT
 
     if tensorboard:
@@ -148,12 +149,14 @@ def train(
     }
     said = set(overrides)
     if config is not None:
-        choices, overrides = with_file(context, config, choices, overrides)
-    resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, **choices)
+        choices, overrides, said = with_file(context, config, choices, overrides)
+    init_from = choices.pop("init_from")
+    idle = sorted(said & resolve_config(**choices | {"device": "cpu"}, overrides=overrides).without_effect())
+    resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    if idle := sorted(said & resolved.without_effect()):
+    if idle:
         console.note(f"without effect beside the other settings: {', '.join(idle)}")
     require(trackers)
     _train(begin(resolved, weights, out), trackers)

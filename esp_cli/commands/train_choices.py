@@ -16,7 +16,7 @@ _PARAMETERS = {"algorithm": "algo"}
 
 def with_file(
     context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
-) -> tuple[dict[str, Any], dict[str, object]]:
+) -> tuple[dict[str, Any], dict[str, object], set[str]]:
     """Let a file fill in what the command line leaves open.
 
     Args:
@@ -25,9 +25,13 @@ def with_file(
         given: choices by their name in a file, defaults included.
         settings: of the command line.
 
+    Returns:
+        The choices, the settings, and the names of settings that somebody chose: not those of a whole configuration.
+
     Raises:
         ValueError: the file cannot be read, or does not go with what was given.
     """
+    from esp_cli.deploy.bundled import open_policy
     from esp_cli.prior.config import SAID_BY_AUTO
     from esp_cli.training.config_file import read_config_file
 
@@ -43,10 +47,18 @@ def with_file(
                     "or name a file with only what differs"
                 )
     filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in said}
+    if file.is_complete and (source := filled.get("init_from")) is not None:
+        try:
+            open_policy(Path(source))
+        except ValueError:
+            raise ValueError(
+                f"the run of {path} started from the policy {source}, which cannot be read here; add --init-from POLICY"
+            ) from None
     kept = file.settings
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
-    return given | filled, kept | settings
+    chosen = set(settings) if file.is_complete else {*kept, *settings}
+    return given | filled, kept | settings, chosen
 
 
 def _read(path: Path, name: str, value: Any) -> Any:

@@ -19,6 +19,7 @@ from esp_envs.extras import install
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
+    from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuner import Outcome, Trials
     from esp_cli.studies.tuning import Goal, Tuning
 
@@ -28,11 +29,25 @@ EPILOG = """Examples:\n
     esp tune --task mine:Task --algo mappo --space space.toml --for steps --reach -120\n
     esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
 
+_TaskOption = Annotated[
+    list[str] | None,
+    typer.Option("--task", "--tasks", "-t", help="The task; by default navigation.", metavar="TASK"),
+]
+_AlgoOption = Annotated[
+    list[str] | None,
+    typer.Option("--algo", "--algos", "-a", help="The algorithm; by default mappo.", metavar="ALGO"),
+]
+_StepsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--steps", "-n", help="Environment steps per seed of a whole trial; by default 500k.", metavar="STEPS"
+    ),
+]
 FIRST_TRIAL_SEED = 1000
 """Trials have seeds from here on; what they choose is judged on others."""
 
 
-@study_command
+@study_command(tasks=_TaskOption, algos=_AlgoOption, steps=_StepsOption)
 def tune(
     choices: StudyChoices,
     budget: Annotated[int, typer.Option("--budget", min=1, help="Trials, for each prior.")] = 30,
@@ -44,7 +59,11 @@ def tune(
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option("--prior", help="Kinds of prior, as esp,none; one search each, equal budgets.", metavar="PRIOR"),
+        typer.Option(
+            "--prior",
+            help="esp (the default), none, auto, augment, consistency, or several as esp,none; a search each.",
+            metavar="PRIOR",
+        ),
     ] = None,
     goal: Annotated[
         Literal["return", "steps", "seconds"],
@@ -54,6 +73,8 @@ def tune(
     trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
     """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
+    from esp_cli.studies.study import StudyFolder
+
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
     words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
@@ -64,10 +85,11 @@ def tune(
     out = choices.folder("tune")
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(tuning.device)
+        others = [StudyFolder.open(path) for path in choices.reuse or ()]
         if choices.dry_run:
             _dry_run(tuning, request.seeds, request.episodes, jobs, choices.json)
             return
-        _tune(tuning, request, choices, engine, jobs)
+        _tune(tuning, request, choices, others, engine, jobs)
 
 
 def _tuning(
@@ -84,6 +106,7 @@ def _tuning(
     Raises:
         ValueError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
     """
+    from esp_cli.algorithms.registry import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
     from esp_cli.studies.tuning_space import default_space, read_space
@@ -98,6 +121,8 @@ def _tuning(
     meant, steps = (request.steps or ((None, 500_000),))[0]
     if meant not in (None, task):
         raise ValueError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
+    ALGORITHMS[algorithm]  # a name that nobody has is refused as such, and not for the space that it lacks
+    tried_settings = read_space(space) if space else default_space(algorithm)
     tuning = Tuning(
         task=task,
         algorithm=algorithm,
@@ -109,7 +134,7 @@ def _tuning(
         steps=steps,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
         overrides={task_setting(name, task): value for name, value in request.overrides.items()},
-        space=dict(read_space(space) if space else default_space(algorithm)),
+        space={task_setting(name, task): tried for name, tried in tried_settings.items()},
         device=request.device,
         command=request.command,
     )
@@ -117,7 +142,14 @@ def _tuning(
     return tuning
 
 
-def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engine, jobs: int) -> None:
+def _tune(
+    tuning: Tuning,
+    request: Request,
+    choices: StudyChoices,
+    others: Sequence[StudyFolder],
+    engine: Engine,
+    jobs: int,
+) -> None:
     """Search, then judge the best settings; report both.
 
     Raises:
@@ -130,8 +162,10 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TuningFolder, fresh_study
 
-    out, others, fresh = choices.folder("tune"), [StudyFolder.open(path) for path in choices.reuse or ()], None
+    out, fresh = choices.folder("tune"), None
     with TuningFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
+        if StudyFolder.is_one(out / "fresh"):  # of a search that goes on: other seeds are refused before it does
+            StudyFolder.create(out / "fresh", fresh_study(tuning, {}, request.seeds, request.episodes))
         trials = Trials(TuningFolder.begin(out, tuning))
         complete, failed = follow(Tuner(trials, jobs, engine), trials.folder.study.title, requests)
         outcomes = [trials.outcome(prior) for prior in tuning.priors]
@@ -144,10 +178,13 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices, engine: Engin
     if fresh is not None and complete:
         report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
     if not complete:
-        console.note(f"stopped; go on with: {tuning.command}{choices.engine_words()}")
+        console.note(f"stopped; go on with: {tuning.command}{choices.running_words()}")
         raise typer.Exit(130)
     if failed:
-        raise ValueError(f"{len(failed)} runs failed ({', '.join(failed)}); the same command tries them again")
+        raise ValueError(
+            f"{len(failed)} runs failed ({', '.join(failed)}); see log.txt in their folders below {out}; the same "
+            "command tries them again"
+        )
     if not best:
         raise ValueError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 

@@ -96,23 +96,28 @@ class PriorConfig(Strict):
     def without_effect(self) -> frozenset[str]:
         """Return the names of settings that change nothing beside the others."""
         deciding = {"kind", "consistency_coef"} if self.consistency_coef == 0 else {"kind"}
-        return self._effect()[1] - deciding
+        doubted = {"doubt"} if self.trust == "measured" and self.weights else set()  # it makes weights that are missing
+        return self._effect()[1] - deciding | doubted
 
     def _effect(self) -> tuple[str, frozenset[str]]:
         """Return the kind that this comes to, and the names of settings that have no effect in it."""
-        loses = {
-            "none": frozenset(type(self).model_fields),
-            "augment": frozenset({"consistency_coef", "terms", "stop_gradient"}),
-            "consistency": frozenset({"old_log_prob", "replay"}),
-            "esp": frozenset[str](),
-        }
         kind: str = self.kind
         if kind in ("esp", "consistency") and self.consistency_coef == 0:
             kind = "augment" if kind == "esp" else "none"
         sure = bool(self.weights) and all(weight == 1 for weight in self.weights.values())
-        lost = loses[kind]
+        lost = of_no_use_to(kind)
         if self.trust == "full":
             lost = lost | {"doubt", "weights"}
         elif sure:  # what is certain does not fade
             lost = lost | {"trust", "doubt", "weights", "fade"}
         return kind, lost
+
+
+def of_no_use_to(kind: str) -> frozenset[str]:
+    """Return the names of settings that change nothing in a prior of this kind."""
+    unused = {
+        "none": frozenset(PriorConfig.model_fields),
+        "augment": frozenset({"consistency_coef", "terms", "stop_gradient"}),
+        "consistency": frozenset({"old_log_prob", "replay"}),
+    }
+    return unused.get(kind, frozenset())

@@ -273,7 +273,8 @@ def write_presets(folder: TuningFolder, outcomes: list[Outcome]) -> list[Path]:
             continue
         path = folder.path / f"preset-{found.prior}.json"
         chosen = {**tuning.overrides, "prior.kind": found.prior, **found.settings}
-        document = {"task": tuning.task, "algorithm": tuning.algorithm, "preset": tuning.preset, **chosen}
+        whole = {"task": tuning.task, "algorithm": tuning.algorithm, "preset": tuning.preset, "steps": tuning.steps}
+        document = {**whole, **chosen}
         replace_file(path, (json.dumps(document, indent=2) + "\n").encode())
         written.append(path)
     return written

@@ -27,7 +27,7 @@ RUNGS = 2
 REDUCTION = 3
 """One of so many trials goes on at each rung, and trains so many times as long."""
 _TRIALS = "trials"
-NAMES = {"none": "plain", "esp": "ESP", "augment": "augmentation", "consistency": "loss"}
+NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
 
 
 class Tuning(Strict):
@@ -92,8 +92,8 @@ class Tuning(Strict):
         if (self.goal == "return") != (self.reach is None):
             what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
             raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
-        if "prior.kind" in self.overrides:
-            raise ValueError("a tuning takes the kinds of prior by --prior, not by --set prior.kind")
+        if "prior.kind" in self.overrides or "prior.kind" in self.space:
+            raise ValueError("a tuning takes the kinds of prior by --prior, not by --set or --space")
         for prior in self.priors:
             for name, dimension in space_of(self.space, prior).items():
                 if name in self.overrides:

@@ -12,6 +12,7 @@ from pydantic import JsonValue, model_validator
 
 from esp_cli.files.documents import Strict, parse_value
 from esp_cli.files.tables import flat, read_table
+from esp_cli.prior.config import of_no_use_to
 from esp_cli.training.config import validated
 
 
@@ -151,5 +152,6 @@ def read_space(path: Path) -> Space:
 
 
 def space_of(space: Space, prior: str) -> Space:
-    """Return what concerns runs with this kind of prior: without it, nothing of the prior."""
-    return {name: d for name, d in space.items() if prior != "none" or not name.startswith("prior.")}
+    """Return what changes anything in runs with this kind of prior: without it, nothing of the prior does."""
+    idle = {f"prior.{name}" for name in of_no_use_to(prior)}
+    return {name: d for name, d in space.items() if name not in idle}

@@ -67,7 +67,8 @@ class RunConfig(Strict):
 
     def without_effect(self) -> frozenset[str]:
         """Return settings of prior and network that change nothing beside the others, as "prior.weights"."""
-        idle = {"prior": self.prior.without_effect(), "network": self.network.without_effect()}
+        of_others = "old_log_prob" if ALGORITHMS[self.algorithm].replays else "replay"
+        idle = {"prior": self.prior.without_effect() | {of_others}, "network": self.network.without_effect()}
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
 
     def own_words(self) -> list[str]:

@@ -53,7 +53,10 @@ def read_config_file(path: Path) -> ConfigFile:
             choices[name] = value
         elif "." in name:
             # TOML cannot hold the name of the task and a table of its settings under one key
-            settings[name.replace("task_settings.", "task.", 1)] = value
+            setting = name.replace("task_settings.", "task.", 1)
+            if setting in settings:
+                raise ValueError(f"{path} sets '{setting}' twice; leave one of them out")
+            settings[setting] = value
         else:
             hint = did_you_mean(name, CHOICES) or f"; write one of {', '.join(CHOICES)}, or a setting as SECTION.NAME"
             raise ValueError(f"{path} sets '{name}', which is not a choice of a run{hint}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +109,8 @@ def test_the_command_line_has_the_last_word_over_a_file(tmp_path: Path) -> None:
         ({"colour": 1}, "write one of task, algorithm, preset, steps, seeds, device, init_from, or a setting"),
         ({"mappo.lr": 1}, "unknown setting 'mappo.lr'; did you mean 'mappo.learning_rate'?"),
         ({"mappo": {"gamma": 2}}, "bad value 2 for 'mappo.gamma'"),
+        ({"mappo.gamma": 0.9, "mappo": {"gamma": 0.8}}, "sets 'mappo.gamma' twice; leave one of them out"),
+        ({"task.wind": 0.1, "task_settings": {"wind": 0.2}}, "sets 'task.wind' twice; leave one of them out"),
         ({"steps": "some"}, "'some' is not a number of steps"),
         ({"steps": 1.5}, "sets 'steps' to 1.5; write it as esp train --steps takes it"),
         ({"seeds": [3, 3]}, "name one seed twice"),
@@ -226,6 +229,14 @@ def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp
     run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", finished, steps=50)
     assert read_config_file(run).choices["init_from"] == str(finished)
     assert printed("--config", run) == json.loads((run / "config.json").read_text())
+
+
+def test_a_configuration_names_the_policy_that_it_started_from_where_that_is_gone(copied: Path, tmp_path: Path) -> None:
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
+    shutil.rmtree(copied)
+    assert refused("train", "--config", run, "--print-config") == (
+        f"the run of {run} started from the policy {copied}, which cannot be read here; add --init-from POLICY"
+    )
 
 
 def test_a_configuration_without_the_new_key_is_read_as_before(finished: Path) -> None:

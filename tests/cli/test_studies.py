@@ -170,11 +170,13 @@ def test_without_ray_a_cluster_is_refused_in_one_sentence(tmp_path: Path, monkey
     assert not (tmp_path / "s").exists()
 
 
-def test_the_command_that_goes_on_names_the_engine_and_a_gpu_may_be_elsewhere() -> None:
-    assert StudyChoices().engine_words() == ""
+def test_the_command_that_goes_on_says_how_and_a_gpu_may_be_elsewhere() -> None:
+    assert StudyChoices().running_words() == ""
     chosen = StudyChoices(engine="ray", address="10.0.0.1:6379", gpu_share=0.5, device="cuda")
-    assert chosen.engine_words() == " --engine ray --address 10.0.0.1:6379 --gpu-share 0.5"
+    assert chosen.running_words() == " --engine ray --address 10.0.0.1:6379 --gpu-share 0.5"
     assert chosen.device_of_runs() == "cuda"
+    chosen = StudyChoices(jobs=3, reuse=[Path("a b"), Path("c")])
+    assert chosen.running_words() == " --jobs 3 --reuse 'a b' --reuse c"
 
 
 def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, finished: Path) -> None:

@@ -94,13 +94,24 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (["--network", "equivariant", "--set", "network.relaxation=weights"], "network.relaxation"),
         (["--network", "equivariant", "--set", "network.relaxation=weights", "--set", "network.relax=1"], None),
         (["--consistency-coef", "0.2", "--transforms", "c4"], None),
+        (["--set", "prior.replay=stored"], "prior.replay"),
+        (["--set", "prior.trust=measured", "--set", 'prior.weights={"rot90":0.5}', "--transforms", "rot90"], None),
+        (["--prior", "auto", "--set", "prior.doubt=4", "--set", "prior.fade=0.2"], None),
     ],
 )
 def test_a_setting_that_changes_nothing_beside_the_others_is_named(tmp_path: Path, options, idle) -> None:
     told = esp("train", *TINY_OPTIONS, "--steps", 50, *options, "--out", tmp_path / "run").stderr
     assert ("without effect" in told) == (idle is not None)
     assert idle is None or f"without effect beside the other settings: {idle}\n" in told
-    assert "broken" not in told
+    assert ("broken" in told) == ("prior.trust=measured" in options)
+
+
+def test_a_setting_of_a_small_file_that_changes_nothing_is_named_and_of_a_whole_one_is_not(tmp_path: Path) -> None:
+    small = tmp_path / "small.json"
+    small.write_text(json.dumps({"prior": {"kind": "none", "transforms": "c4"}}))
+    told = esp("train", *TINY_OPTIONS, "--steps", 50, "--config", small, "--out", tmp_path / "a").stderr
+    assert "without effect beside the other settings: prior.transforms\n" in told
+    assert "without effect" not in esp("train", "--config", tmp_path / "a", "--out", tmp_path / "b").stderr
 
 
 def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

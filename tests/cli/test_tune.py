@@ -27,6 +27,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
     assert "on one core at most" in told.stdout
     assert "3 runs side by side" in told.stdout
     assert not (tmp_path / "t").exists()
+    assert "no such folder" in refused(*command, "--steps", 300, "--dry-run", "--reuse", tmp_path / "nowhere")
     planned = json.loads(esp(*command, "--prior", "esp,none", "--steps", 300, "--dry-run", "--json", "-").stdout)
     assert [(one["prior"], one["trials"]) for one in planned["searches"]] == [("esp", 30), ("none", 30)]
     assert 0 < planned["likely_s"] < planned["at_most_s"]
@@ -37,11 +38,14 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
     [
         (["--task", "formation"], "esp tune takes one --task, not 2; run it once for each"),
         (["--algo", "mappo,qmix"], "esp tune takes one --algo, not 2"),
-        (["--prior", "magic"], "--prior names each kind once; they are none, esp, augment, consistency"),
+        (["--prior", "magic"], "--prior names each kind once; they are none, esp, auto, augment, consistency"),
         (["--for", "steps"], "--for steps needs --reach RETURN"),
         (["--for", "steps", "--reach", "nan"], "--reach"),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
+        (["--algo", "mapo"], "unknown algorithm 'mapo'; the algorithms are mappo"),
+        (["--set", "prior.kind=none"], "takes the kinds of prior by --prior"),
+        (["--gpu-share", "0.5"], "--gpu-share is for GPUs of a Ray cluster; add --engine ray"),
         (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
         (["--steps", "formation=500k"], "--steps formation=500000 concerns no run of this tuning"),
     ],
@@ -74,8 +78,12 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
     assert all(study.is_finished(cell) for cell in study.study.cells)
     assert {cell.config.seeds for cell in study.study.cells} == {(0, 1)}
     assert [cell.variant.split(" (")[0] for cell in study.study.cells][:1] == ["ESP, default"]
-    esp("train", "--config", out / "preset-esp.json", "--print-config")
+    tuned = json.loads(esp("train", "--config", out / "preset-esp.json", "--print-config").stdout)
+    assert (tuned["steps"], tuned["prior"]["kind"]) == (200, "esp")
     assert (out / "report" / "tuning.md").is_file()
+    grown = [*words, "--budget", 9, "--episodes", 8]
+    assert f"{out / 'fresh'} holds another study; go on with it by 'esp tune" in refused(*grown)
+    assert len(list((out / "trials").iterdir())) == 2, "nothing is trained for a study that is refused"
     again = esp(*words)
     assert "2 runs, 2 of them finished" in again.stderr
     assert f"next: esp report {out / 'fresh'}" in again.stderr
@@ -85,3 +93,20 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
     json.loads(esp(*words, "--json", "-").stdout)
     esp("report", out / "fresh")
     assert (out / "fresh" / "report" / "report.html").is_file()
+
+
+@pytest.mark.usefixtures("forked_jobs")
+def test_a_setting_of_the_task_is_searched_by_its_name_and_auto_is_a_prior_as_any(
+    command: list[object], tmp_path: Path
+) -> None:
+    (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.kind": ["none"]}))
+    assert "takes the kinds of prior by --prior" in refused(*command, "--steps", 100)
+    (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.doubt": [4.0, 8.0]}))
+    once = ["--budget", 1, "--steps", 100, "--trial-seeds", 1, "--seeds", 1, "--episodes", 4, "--jobs", 1]
+    esp(*command, *once, "--prior", "auto,none")
+    outcomes = json.loads((tmp_path / "t" / "report" / "tuning.json").read_text())["outcomes"]
+    assert [set(one["settings"]) for one in outcomes] == [{"task.wind", "prior.doubt"}, {"task.wind"}]
+    study = StudyFolder.open(tmp_path / "t" / "fresh").study
+    assert [cell.variant for cell in study.cells] == ["plain, default", "auto, default"]
+    tuned = json.loads(esp("train", "--config", tmp_path / "t" / "preset-auto.json", "--print-config").stdout)
+    assert "rot90" in tuned["prior"]["weights"]
