@@ -31,6 +31,10 @@ BREAKING = {
     "breaking-formation": ("", "-others", "-measured", "-relaxed"),
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
+TUNED = {
+    "tuned-navigation": ("maddpg",),
+}
+"""Figures in docs/measured -> the ends of the names of the results that are drawn together."""
 Row = dict[str, str]
 
 
@@ -130,6 +134,15 @@ def draw_results() -> None:
             learner = cells[0].name.split("-")[1]
             _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
             svg.unlink()  # the pages show PNGs
+    for picture, learners in TUNED.items():
+        whole = join([read_results(MEASURED / f"{picture}-{learner}.json") for learner in learners])
+        groups = [
+            Group(f"{cell.panel.split(', ', 1)[1]}: {cell.variant}", floats(cell.returns[whole.mode]))
+            for cell in whole.cells
+        ]
+        title = f"{picture.removeprefix('tuned-').capitalize()}, tuned and default settings"
+        _, svg = dots(groups, MEASURED / picture, title, f"{whole.mode} return")
+        svg.unlink()
     for picture, parts in BREAKING.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
         for _, svg in draw_over_strength(whole, MEASURED / picture):
