@@ -32,7 +32,7 @@ BREAKING = {
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 TUNED = {
-    "tuned-navigation": ("maddpg",),
+    "tuned-navigation": ("mappo", "maddpg"),
 }
 """Figures in docs/measured -> the ends of the names of the results that are drawn together."""
 Row = dict[str, str]
@@ -135,13 +135,14 @@ def draw_results() -> None:
             _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
             svg.unlink()  # the pages show PNGs
     for picture, learners in TUNED.items():
-        whole = join([read_results(MEASURED / f"{picture}-{learner}.json") for learner in learners])
+        searches = [read_results(MEASURED / f"{picture}-{learner}.json") for learner in learners]
         groups = [
-            Group(f"{cell.panel.split(', ', 1)[1]}: {cell.variant}", floats(cell.returns[whole.mode]))
-            for cell in whole.cells
+            Group(f"{cell.panel.split(', ', 1)[1]}: {cell.variant}", floats(cell.returns[search.mode]))
+            for search in searches
+            for cell in search.cells
         ]
         title = f"{picture.removeprefix('tuned-').capitalize()}, tuned and default settings"
-        _, svg = dots(groups, MEASURED / picture, title, f"{whole.mode} return")
+        _, svg = dots(groups, MEASURED / picture, title, f"{searches[0].mode} return")
         svg.unlink()
     for picture, parts in BREAKING.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
