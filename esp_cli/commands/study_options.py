@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
@@ -28,6 +29,7 @@ from esp_cli.commands.options import (
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
+    from esp_cli.studies.study import StudyFolder
 
 DEFAULT_SEEDS = tuple(range(10))
 DEFAULT_EPISODES = 320
@@ -133,6 +135,16 @@ class StudyChoices:
         """Return the study folder of a kind of study."""
         return self.out or Path("runs") / kind
 
+    def reused(self) -> list[StudyFolder]:
+        """Open the studies whose finished runs are taken over.
+
+        Raises:
+            ValueError: one is missing or damaged.
+        """
+        from esp_cli.studies.study import StudyFolder
+
+        return [StudyFolder.open(path) for path in self.reuse or ()]
+
     def running_words(self) -> str:
         """Return the options that say how the study is run and not what, as the end of a command line."""
         words = [] if self.jobs is None else ["--jobs", str(self.jobs)]
@@ -194,19 +206,23 @@ class StudyChoices:
         return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])
 
 
-def study_command(command: Callable[..., None] | None = None, **options: Any) -> Callable[..., Any]:
+def study_command(command: Callable[..., None] | None = None, **helps: str) -> Callable[..., Any]:
     """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them.
 
     Args:
         command: the command; without one, a decorator comes back.
-        options: by the name of a field, the annotation of an option that says something else in this command.
+        helps: by the name of a field, the help of an option that means something else in this command.
     """
     if command is None:
-        return functools.partial(study_command, **options)
+        return lambda given: study_command(given, **helps)
     own = dict(inspect.signature(command, eval_str=True).parameters)
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
-    shared |= {name: shared[name].replace(annotation=option) for name, option in options.items()}
+    for name, text in helps.items():
+        kind, option = get_args(shared[name].annotation)
+        option = copy.copy(option)
+        option.help = text
+        shared[name] = shared[name].replace(annotation=Annotated[kind, option])
     named = inspect.Parameter("seed_list", shared["seeds"].kind, default=None, annotation=SeedListOption)
     parameters = [*own.values(), *shared.values(), named]
     parameters.sort(key=lambda parameter: parameter.default is not parameter.empty)

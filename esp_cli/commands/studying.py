@@ -52,7 +52,7 @@ def run_study(
     from esp_cli.training.build import build_learner
 
     out, study = choices.folder(kind), plan(kind, request)
-    others = [StudyFolder.open(path) for path in choices.reuse or ()]
+    others = choices.reused()
     for cell in () if choices.dry_run else study.cells:  # refuses what does not go together before there is a folder
         build_learner(cell.config.of_one_seed())
     with open_engine(choices, out) as engine:

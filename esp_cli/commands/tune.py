@@ -29,25 +29,15 @@ EPILOG = """Examples:\n
     esp tune --task mine:Task --algo mappo --space space.toml --for steps --reach -120\n
     esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
 
-_TaskOption = Annotated[
-    list[str] | None,
-    typer.Option("--task", "--tasks", "-t", help="The task; by default navigation.", metavar="TASK"),
-]
-_AlgoOption = Annotated[
-    list[str] | None,
-    typer.Option("--algo", "--algos", "-a", help="The algorithm; by default mappo.", metavar="ALGO"),
-]
-_StepsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--steps", "-n", help="Environment steps per seed of a whole trial; by default 500k.", metavar="STEPS"
-    ),
-]
 FIRST_TRIAL_SEED = 1000
 """Trials have seeds from here on; what they choose is judged on others."""
 
 
-@study_command(tasks=_TaskOption, algos=_AlgoOption, steps=_StepsOption)
+@study_command(
+    tasks="The task; by default navigation.",
+    algos="The algorithm; by default mappo.",
+    steps="Environment steps per seed of a whole trial; by default 500k.",
+)
 def tune(
     choices: StudyChoices,
     budget: Annotated[int, typer.Option("--budget", min=1, help="Trials, for each prior.")] = 30,
@@ -73,8 +63,6 @@ def tune(
     trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
     """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
-    from esp_cli.studies.study import StudyFolder
-
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
     words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
@@ -85,7 +73,7 @@ def tune(
     out = choices.folder("tune")
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(tuning.device)
-        others = [StudyFolder.open(path) for path in choices.reuse or ()]
+        others = choices.reused()
         if choices.dry_run:
             _dry_run(tuning, request.seeds, request.episodes, jobs, choices.json)
             return
@@ -163,9 +151,10 @@ def _tune(
     from esp_cli.studies.tuning import TuningFolder, fresh_study
 
     out, fresh = choices.folder("tune"), None
+    judged = out / "fresh"
     with TuningFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
-        if StudyFolder.is_one(out / "fresh"):  # of a search that goes on: other seeds are refused before it does
-            StudyFolder.create(out / "fresh", fresh_study(tuning, {}, request.seeds, request.episodes))
+        if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
+            StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
         trials = Trials(TuningFolder.begin(out, tuning))
         complete, failed = follow(Tuner(trials, jobs, engine), trials.folder.study.title, requests)
         outcomes = [trials.outcome(prior) for prior in tuning.priors]
@@ -173,7 +162,7 @@ def _tune(
         _report(trials, outcomes, write_presets(trials.folder, outcomes), quiet=choices.json == "-")
         if complete and not failed and best:
             study = fresh_study(tuning, best, request.seeds, request.episodes)
-            fresh = StudyFolder.create(out / "fresh", study)
+            fresh = StudyFolder.create(judged, study)
             complete, failed = run_cells(fresh, study, others, jobs, engine, requests)
     if fresh is not None and complete:
         report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
