@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -178,22 +178,40 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
     console.note(f"next: {shlex.join(words)}")
 
 
-def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
-    """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
-    from esp_cli.studies.forecast import forecast
-
-    with console.TrainingProgress(len(folder.study.cells), description="measure") as progress:
+@contextmanager
+def measuring(total: int) -> Iterator[Callable[[int], object]]:
+    """Yield what is told how many of these measurements are done; say if the machine was too busy for them."""
+    with console.TrainingProgress(total, description="measure") as progress:
         busy = busy_with()  # before the measurement, which keeps a core busy itself
-        found = forecast(folder, others, jobs, progress.update)
-    if json is not None:
-        console.write_json(json, found)
-    if json != "-":
-        _print_forecast(found)
+        yield progress.update
     if busy > BUSY:
         console.note(
             f"this machine was busy (load {busy:.1f} per core) while this was measured, so the times are unreliable; "
             "ask again when it is idle"
         )
+
+
+def say_disk(done: int, peak: int, out: Path) -> None:
+    """Say what bytes a folder needs when all is done and on the way, and whether the disk has them."""
+    free = shutil.disk_usage(next(p for p in (out, *out.absolute().parents) if p.exists())).free
+    console.say(
+        f"disk: {done / _MEBIBYTE:.0f} MiB when done, at most {peak / _MEBIBYTE:.0f} MiB on the way; "
+        f"{free / _MEBIBYTE:.0f} MiB are free -> {out}"
+    )
+    if peak > free:
+        console.note("the disk is too small for that; choose another --out, or fewer --jobs")
+
+
+def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json: str | None) -> None:
+    """Print the runs of a study, how long each takes by a probe on this machine, and what they need on the disk."""
+    from esp_cli.studies.forecast import forecast
+
+    with measuring(len(folder.study.cells)) as listener:
+        found = forecast(folder, others, jobs, listener)
+    if json is not None:
+        console.write_json(json, found)
+    if json != "-":
+        _print_forecast(found)
 
 
 def _print_forecast(found: Forecast) -> None:
@@ -212,10 +230,4 @@ def _print_forecast(found: Forecast) -> None:
         f"{console.format_duration(found.core_seconds)} on one core, "
         f"{console.format_duration(found.seconds)} with {found.jobs} side by side, if nothing else runs here"
     )
-    free = shutil.disk_usage(next(p for p in (found.out, *found.out.absolute().parents) if p.exists())).free
-    console.say(
-        f"disk: {found.disk_bytes / _MEBIBYTE:.0f} MiB when done, at most {found.disk_peak_bytes / _MEBIBYTE:.0f} MiB "
-        f"on the way; {free / _MEBIBYTE:.0f} MiB are free -> {found.out}"
-    )
-    if found.disk_peak_bytes > free:
-        console.note("the disk is too small for that; choose another --out, or fewer --jobs")
+    say_disk(found.disk_bytes, found.disk_peak_bytes, found.out)

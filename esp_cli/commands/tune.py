@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,7 +14,7 @@ from esp_cli import console
 from esp_cli.commands.options import check_finite
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import follow, open_engine, report_study, run_cells
+from esp_cli.commands.studying import follow, measuring, open_engine, report_study, run_cells, say_disk
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def tune(
         jobs = choices.jobs or engine.places(tuning.device)
         others = choices.reused()
         if choices.dry_run:
-            _dry_run(tuning, request.seeds, request.episodes, jobs, choices.json)
+            _dry_run(tuning, request.seeds, request.episodes, jobs, out, choices.json)
             return
         _tune(tuning, request, choices, others, engine, jobs)
 
@@ -196,40 +197,35 @@ def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path]
         console.note(f"next: {shlex.join(['esp', 'train', *own, '--config', str(path)])}")
 
 
-def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, json: str | None) -> None:
-    """Print what the search costs at most, and what it costs where successive halving ends two of three trials."""
-    from esp_cli.studies.cost import probe
-    from esp_cli.studies.tuning import REDUCTION, RUNGS
+def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, out: Path, json: str | None) -> None:
+    """Print what the search costs at most, what it costs as others did, and what it needs on the disk."""
+    from esp_cli.studies.tuning_forecast import forecast_search
     from esp_cli.studies.tuning_space import space_of
 
-    searches: list[dict[str, Any]] = []
-    most = likely = 0.0
-    share = (1 + RUNGS * (1 - 1 / REDUCTION)) / REDUCTION**RUNGS
-    for prior in tuning.priors:
-        trial = probe(tuning.config(prior, {}), episodes)
-        final = probe(tuning.config(prior, {}, seeds), episodes)
-        judged = 2 * (final.training_s + final.evaluation_s)
-        whole = tuning.budget * trial.training_s
-        most, likely = most + whole + judged, likely + share * whole + judged
-        names = list(space_of(tuning.space, prior))
-        searches.append({"prior": prior, "trials": tuning.budget, "trial_s": trial.training_s, "settings": names})
+    with measuring(sum(len(space_of(tuning.space, prior)) for prior in tuning.priors)) as listener:
+        done = itertools.count(1)
+        searches = [
+            forecast_search(tuning, prior, seeds, episodes, lambda: listener(next(done))) for prior in tuning.priors
+        ]
+    found = {name: sum(getattr(one, name) for one in searches) for name in ("likely_s", "at_most_s", "disk_bytes")}
+    found["disk_peak_bytes"] = found["disk_bytes"] + jobs * max(one.peak_bytes for one in searches)
     if json is not None:
-        document = {
-            "command": tuning.command,
-            "searches": searches,
-            "at_most_s": most,
-            "likely_s": likely,
-            "jobs": jobs,
-        }
-        console.write_json(json, document)
+        console.write_json(json, {"command": tuning.command, "searches": searches, **found, "jobs": jobs})
     if json == "-":
         return
     rows = [
-        (one["prior"], str(one["trials"]), console.format_duration(one["trial_s"]), ", ".join(one["settings"]))
+        (
+            one.prior,
+            str(one.trials),
+            *(console.format_duration(seconds) for seconds in (one.default_s, one.mean_s, one.longest_s)),
+            ", ".join(one.settings),
+        )
         for one in searches
     ]
-    console.table(("prior", "trials>", "each at most>", "settings"), rows, title=tuning.command)
+    console.table(("prior", "trials>", "default>", "mean>", "longest>", "settings"), rows, title=tuning.command)
     console.say(
-        f"on one core at most {console.format_duration(most)}, and about {console.format_duration(likely)} with "
-        f"pruning, the evaluation of the best on fresh seeds included; {jobs} runs side by side"
+        f"on one core about {console.format_duration(found['likely_s'])} if pruning saves half of the steps, at most "
+        f"{console.format_duration(found['at_most_s'])}, the best settings on fresh seeds included; {jobs} runs side "
+        "by side"
     )
+    say_disk(found["disk_bytes"], found["disk_peak_bytes"], out)
