@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import JsonValue, model_validator
+from pydantic import JsonValue, field_validator, model_validator
 
 from esp_cli.files.documents import Strict, parse_value
 from esp_cli.files.tables import flat, read_table
@@ -30,6 +30,13 @@ class Dimension(Strict):
     high: int | float | None = None
     log: bool = False
     choices: tuple[JsonValue, ...] | None = None
+
+    @field_validator("low", "high", mode="before")
+    @classmethod
+    def _is_number(cls, value: object) -> object:
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise ValueError("it has to be a number")
+        return value
 
     @model_validator(mode="after")
     def _is_one(self) -> Dimension:

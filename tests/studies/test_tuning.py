@@ -71,6 +71,7 @@ def test_a_space_is_read_flat_or_nested_as_json_or_toml(tmp_path, suffix, text):
         ("{}", "names no setting"),
         ('{"mappo.gamma": {"low": 1, "high": 0}}', "the smaller one first"),
         ('{"mappo.gamma": {"low": 0, "high": 1, "log": true}}', "log needs a low above 0"),
+        ('{"mappo.gamma": {"low": "a", "high": 1}}', "bad value 'a' for 'mappo.gamma.low': it has to be a number"),
         ('{"mappo.gamma": []}', "write a list of values, or low and high"),
     ],
 )
