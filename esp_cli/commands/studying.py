@@ -69,10 +69,19 @@ def run_study(
         raise typer.Exit(130)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     report_study(folder, choices.json, mode, thresholds)
-    if failed:
+    refuse_failed(failed, out)
+
+
+def refuse_failed(names: Sequence[str], out: Path) -> None:
+    """End the command where runs of the study in a folder failed.
+
+    Raises:
+        ValueError: some did.
+    """
+    if names:
         raise ValueError(
-            f"{len(failed)} of {len(study.cells)} runs failed ({', '.join(failed)}); see log.txt in their folders "
-            f"below {folder.path / 'runs'}; the same command tries them again"
+            f"{len(names)} runs failed ({', '.join(names)}); see log.txt in their folders below {out}; the same "
+            "command tries them again"
         )
 
 

@@ -14,7 +14,7 @@ from esp_cli import console
 from esp_cli.commands.options import check_finite
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import follow, measuring, open_engine, report_study, run_cells, say_disk
+from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -170,11 +170,7 @@ def _tune(
     if not complete:
         console.note(f"stopped; go on with: {tuning.command}{choices.running_words()}")
         raise typer.Exit(130)
-    if failed:
-        raise ValueError(
-            f"{len(failed)} runs failed ({', '.join(failed)}); see log.txt in their folders below {out}; the same "
-            "command tries them again"
-        )
+    refuse_failed(failed, out)
     if not best:
         raise ValueError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 

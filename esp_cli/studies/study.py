@@ -132,7 +132,7 @@ class StudyFolder:
         A cell that it has keeps its run, and may be compared with another one than before.
 
         Raises:
-            StudyError: the folder holds another study, or something foreign.
+            StudyError: the folder holds another study, a run under other rules of its task, or something foreign.
         """
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
@@ -148,6 +148,8 @@ class StudyFolder:
                 f"{path} holds another study{f' ({changed[0]} differs)' if changed else ''}; go on with it by "
                 f"'{there.command.splitlines()[-1]}', or choose another --out"
             )
+        for cell, _ in again:
+            cls(path, there)._refuse_old_rules(cell)
         wanted = {cell.name for cell in study.cells}
         rest = tuple(cell for cell in there.cells if cell.name not in wanted)
         if not wanted - set(known) and all(new == old for new, old in again):
@@ -167,6 +169,15 @@ class StudyFolder:
             raise StudyError(f"{path} is no study: there is no such folder")
         study = STUDY_FORMAT.parse(path / _STUDY, Study)
         return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
+
+    def _refuse_old_rules(self, cell: Cell) -> None:
+        """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""
+        final = read_evaluation(self.run_path(cell))
+        if final is not None and final.task_version != (version := spec_of(cell.config).version):
+            raise StudyError(
+                f"{self.run_path(cell)} was evaluated on {final.task} version {final.task_version}, but this is "
+                f"version {version}; choose another --out"
+            )
 
     @classmethod
     def _written(cls, path: Path, study: Study) -> StudyFolder:

@@ -157,7 +157,7 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
     assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
 
 
-def test_a_run_of_another_version_of_the_task_is_no_twin(tmp_path):
+def test_a_run_of_another_version_of_the_task_is_no_twin_and_its_study_does_not_go_on(tmp_path):
     other = write_study(tmp_path / "other", small_study(), ENDS)
     plain = other.study.cells[0]
     file = other.evaluation_path(plain)
@@ -166,6 +166,8 @@ def test_a_run_of_another_version_of_the_task_is_no_twin(tmp_path):
     folder = StudyFolder.create(tmp_path / "s", small_study())
     assert other.is_finished(plain)
     assert folder.find_twin(folder.study.cells[0], [other]) is None
+    with pytest.raises(StudyError, match="was evaluated on navigation version 2, but this is version 1"):
+        StudyFolder.create(other.path, small_study())
 
 
 @pytest.mark.parametrize("choice", [{"seeds": (0, 1)}, {"steps": ((None, 300),)}, {"episodes": 8}])
