@@ -11,10 +11,10 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig, Pull
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, orthogonal
-from esp_cli.networks.perceptron import affine
+from esp_cli.networks.perceptron import Pass, Shape, affine, perceptron
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
 
@@ -185,10 +185,23 @@ class Equivariant(Memoryless):
             for a, b, gain in zip(blocks[:-1], blocks[1:], gains, strict=True)
         )
         self.activation = config.activation
+        self._shape = Shape(config.activation, activate_output=False, precision=torch.float32)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, B, in] to [S, B, out]."""
-        *hidden, last = self.layers
-        for layer in hidden:
-            x = torch.relu(layer(x)) if self.activation == "relu" else torch.tanh(layer(x))
-        return last(x)
+        return perceptron(self._shape, [x], self._plain())
+
+    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
+        """Return outputs and the way back; see `Network.traced`."""
+        plain = self._plain()
+        run = Pass(self._shape, [x.flatten(1, 2)], plain)
+
+        def pull(gradient: Tensor) -> list[Tensor]:
+            return [*torch.autograd.grad(plain, [*self.parameters()], run.backward(gradient.flatten(1, 2)))]
+
+        return run.outputs.unflatten(1, x.shape[1:3]), pull
+
+    def _plain(self) -> list[Tensor]:
+        """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""
+        layers: list[ConstrainedLinear] = [*self.layers]
+        return [made for layer in layers for made in (layer.weight(), layer.bias())]

@@ -13,7 +13,7 @@ field. P_N is a ridge regression on products of two numbers, a class of function
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -38,19 +38,15 @@ _WIDEST_OTHERS = 160
 _RIDGE = 1e-4
 _SIGNIFICANT = 4.0
 """Standard errors of a prediction below which a gap counts as none."""
+_CACHED_ROWS = 2048
+"""Rows of features that fit a processor's cache."""
 _STILL = 1e-5
 """Standard deviation below which a field does not change, so that it says nothing."""
 
 
 def own_inputs(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
     """Return 1, what each agent sees and does, and the products of two of these numbers: [..., N, features]."""
-    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
-    row = torch.cat([obs, acted], -1)
-    features = [torch.ones_like(row[..., :1]), row]
-    if row.shape[-1] <= _WIDEST_PAIRS:
-        first, second = torch.triu_indices(row.shape[-1], row.shape[-1])
-        features.append(row[..., first] * row[..., second])
-    return torch.cat(features, -1)
+    return _side_by_side(_columns(spaces, obs, action), [])
 
 
 def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
@@ -64,13 +60,33 @@ def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
     Returns:
         [M, T, N, features].
     """
-    inputs = own_inputs(spaces, obs, action)
-    agents, width = spaces.num_agents, spaces.observation.width
-    acted = spaces.action.count - 1 if isinstance(spaces.action, Discrete) else spaces.action.width
-    first = 1 if (agents - 1) * (width + acted) <= _WIDEST_OTHERS else 1 + width
-    others = [[j for j in range(agents) if j != i] for i in range(agents)]
-    beside = inputs[..., first : 1 + width + acted][:, :, others].flatten(3)
-    return torch.cat([inputs, beside], -1)
+    columns = _columns(spaces, obs, action)
+    agents = range(spaces.num_agents)
+    known = columns if (len(agents) - 1) * len(columns) <= _WIDEST_OTHERS else columns[spaces.observation.width :]
+    others = zip(*([j for j in agents if j != i] for i in agents), strict=True)
+    return _side_by_side(columns, [known[..., list(order)] for order in others])
+
+
+def _columns(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
+    """Return what each agent sees and does, one number after the other: [numbers, ..., N]."""
+    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
+    return torch.cat([obs, acted], -1).movedim(-1, 0).contiguous()
+
+
+def _side_by_side(columns: Tensor, others: Sequence[Tensor]) -> Tensor:
+    """Return 1, the columns [numbers, ..., N], their products, and others: [..., N, features], features outermost."""
+    count = len(columns)
+    paired = count if count <= _WIDEST_PAIRS else 0
+    sizes = [1, count, *range(paired, 0, -1), *map(len, others)]
+    features = columns.new_empty(sum(sizes), *columns.shape[1:])
+    one, own, *rest = features.split(sizes)
+    one.fill_(1)
+    own.copy_(columns)
+    for k in range(paired):
+        torch.mul(columns[k:], columns[k], out=rest[k])
+    for part, other in zip(rest[paired:], others, strict=True):
+        part.copy_(other)
+    return features.movedim(0, -1)
 
 
 @dataclass(frozen=True)
@@ -153,8 +169,10 @@ class Gate:
         return [element.is_identity or element.name in self.certain for element in transform.elements]
 
     def _predicted(self, obs: Tensor, action: Tensor) -> Tensor:
-        inputs = inputs_of(self.spaces, obs.flatten(0, 1), action.flatten(0, 1))
-        return _predicted(inputs, self.weights).unflatten(0, obs.shape[:2])
+        size = max(1, _CACHED_ROWS // obs.shape[2:4].numel())
+        pieces = zip(obs.flatten(0, 1).split(size), action.flatten(0, 1).split(size), strict=True)
+        predicted = [_predicted(inputs_of(self.spaces, *piece), self.weights) for piece in pieces]
+        return torch.cat(predicted).unflatten(0, obs.shape[:2])
 
 
 @torch.no_grad()
@@ -206,7 +224,9 @@ def _played(env: Environment) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _predicted(inputs: Tensor, weights: Tensor) -> Tensor:
-    return torch.einsum("mtnf,nfo->mtno", inputs, weights.expand(inputs.shape[2], -1, -1))
+    if len(weights) == 1:  # of all agents: one product, several times faster with its few outputs in front (MKL)
+        return (weights[0].mT @ inputs.flatten(0, 2).mT).mT.unflatten(0, inputs.shape[:3])
+    return torch.einsum("mtnf,nfo->mtno", inputs, weights)
 
 
 def _moments(inputs: Tensor, outputs: Tensor, alike: bool) -> tuple[Tensor, Tensor]:

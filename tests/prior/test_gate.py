@@ -61,6 +61,23 @@ def test_copies_are_kept_by_how_far_the_predictors_disagree() -> None:
         assert float(one_body(0.5).kept(g, still, torch.full((1, 1, 1, 1), RIGHT))) == 1, "there is no wind at x = 0"
 
 
+def test_what_predictors_read_by_hand() -> None:
+    """1, (x, y), two of the four moves, products of two; behind them what the others see and do, in agent order."""
+    spaces = Spaces(
+        num_agents=3, observation=layout(Field("velocity", Kind.VECTOR)), state=layout(), action=MOVES, symmetry="d4"
+    )
+    obs = torch.tensor([[2.0, 3.0], [5.0, 7.0], [11.0, 13.0]]).view(1, 1, 3, 2)
+    inputs = inputs_of(spaces, obs, torch.tensor([0, RIGHT, 1]).view(1, 1, 3))
+    rows = torch.tensor([[2.0, 3, 0, 0, 0, 0], [5, 7, 0, 1, 0, 0], [11, 13, 1, 0, 0, 0]])
+    others = ((1, 2), (0, 2), (0, 1))
+    for agent, (first, second) in enumerate(others):
+        own = rows[agent]
+        pairs = torch.cat([own[k:] * own[k] for k in range(6)])
+        expected = torch.cat([torch.ones(1), own, pairs, rows[first], rows[second]])
+        assert torch.equal(inputs[0, 0, agent], expected)
+    assert inputs[0, 0, 1, 7:13].tolist() == [25, 35, 0, 5, 0, 0], "the products of x = 5, with what moves to the right"
+
+
 def test_each_row_is_moved_or_stays_and_a_last_state_goes_with_the_last_step() -> None:
     (turn,) = transform_set("rot90", ONE).each()
     some = gated(turn, torch.tensor([[[True, False], [False, True]]]))
