@@ -197,7 +197,9 @@ class Equivariant(Memoryless):
         run = Pass(self._shape, [x.flatten(1, 2)], plain)
 
         def pull(gradient: Tensor) -> list[Tensor]:
-            return [*torch.autograd.grad(plain, [*self.parameters()], run.backward(gradient.flatten(1, 2)))]
+            made = zip(plain, run.backward(gradient.flatten(1, 2)), strict=True)
+            learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
+            return [*torch.autograd.grad(learned, [*self.parameters()], by_learned)]
 
         return run.outputs.unflatten(1, x.shape[1:3]), pull
 

@@ -349,12 +349,15 @@ def test_a_relaxed_network_begins_equivariant_and_can_give_it_up(relaxation: str
 
 @pytest.mark.parametrize(("relax", "relaxation"), [(0.0, "weights"), (0.5, "residual"), (0.5, "weights")])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
-def test_the_way_back_by_hand_is_that_of_autograd_through_the_layers(relax, relaxation, activation) -> None:
-    spec, obs, _ = scene("navigation")
+@pytest.mark.parametrize("settings", [{}, {"actions": "continuous"}], ids=["directions", "forces"])
+def test_the_way_back_by_hand_is_that_of_autograd_through_the_layers(relax, relaxation, activation, settings) -> None:
+    """Also where outputs are forces: vectors, whose bias is 0 and no parameter."""
+    spec, obs, _ = scene("navigation", **settings)
     config = NETWORKS["equivariant"](
         hidden=(16, 16), group="d4", relax=relax, relaxation=relaxation, activation=activation
     )
-    network = build_network(generators(0, 1), spec.observation.width, 5, config, 1.0, IoSpec(spec, "own"))
+    width = 2 if settings else 5
+    network = build_network(generators(0, 1), spec.observation.width, width, config, 1.0, IoSpec(spec, "own"))
     stir(network)
     x = torch.randn_like(obs).flatten(1, 2).unsqueeze(2)
     outputs, pull = network.traced(x)
