@@ -118,7 +118,7 @@ class Mappo(Learner):
             for minibatch in self._minibatches(batch):
                 self._gradient_step(minibatch, entropy_coef, sums if is_last else None)
         metrics |= {f"train/{name}": value / config.num_minibatches for name, value in sums.items()}
-        metrics["train/augmented_share"] = torch.full((batch.obs.shape[0],), self.prior.augmented_share)
+        metrics["train/augmented_share"] = self.prior.augmented_share(batch.obs.shape[0])
         probed = batch.first(max(1, PROBE_STEPS // batch.obs.shape[2]))
         errors = self.prior.errors(probed, self.answers)
         return metrics | {f"train/{name}": error for name, error in errors.items()}

@@ -47,6 +47,11 @@ class ValueNormaliser(nn.Module):
         mean, deviation = self._statistics(x)
         return (x - mean) / deviation
 
+    def scaled(self, x: Tensor) -> Tensor:
+        """Return x / root mean square: a sum of such numbers ranks as the sum of x does, however many there are."""
+        square = torch.where(self.weight > 0, self.square / self.weight.clamp_min(1e-8), 1.0)
+        return x / square.clamp_min(1e-4).sqrt().view(-1, *[1] * (x.dim() - 1))
+
     def denormalise(self, x: Tensor) -> Tensor:
         """Return x * deviation + mean."""
         mean, deviation = self._statistics(x)

@@ -114,7 +114,7 @@ class OffPolicyLearner(Learner):
                 self.updates += 1
                 learned += 1
         metrics = {"train/return": torch.stack(returns).mean(0), "train/epsilon": self.policy.head.epsilon.clone()}
-        metrics["train/augmented_share"] = torch.full_like(mean_return, self.prior.augmented_share)
+        metrics["train/augmented_share"] = self.prior.augmented_share(len(mean_return))
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
             errors = self.prior.errors(batch.first(PROBE_EPISODES), self.answers)
@@ -164,13 +164,16 @@ class OffPolicyLearner(Learner):
         """Return targets [S, B, T, C] from standardised rewards and the target network's values of what followed.
 
         Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
-        values, and with them S_Q and c, mean about the same in every task.
+        values, and with them S_Q and c, mean about the same in every task. Where an episode or an agent may end early,
+        their mean is not taken off: it would pay for each step that is still to come, or charge for it.
         """
         config = self.config
         ended = batch.terminated.clone()
         if not config.bootstrap_truncated:
             ended[:, :, -1] = True
-        reward = self.reward_scale.normalise(reward) * self.spec.horizon**-0.5
+        ends_early = self.spec.terminates or self.spec.agents_end
+        standardised = self.reward_scale.scaled if ends_early else self.reward_scale.normalise
+        reward = standardised(reward) * self.spec.horizon**-0.5
         over = ended.unsqueeze(-1)
         if batch.alive is not None and next_value.shape[-1] > 1:
             over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own

@@ -89,8 +89,9 @@ class Qmix(OffPolicyLearner):
         """Take one gradient step down L_TD + c S_Q."""
         copies = self.prior.copies(batch, self.generators["prior"])
         utilities = self._utilities(copies.rows)
-        values = self._total(utilities, copies.rows)
-        target = self._targets(batch, copies.original(utilities).detach())
+        seen = self._critic_rows(copies.rows)
+        values = self._total(utilities, copies.rows, seen)
+        target = self._targets(batch, copies.original(utilities).detach(), copies.original(seen))
         loss, metrics = self._td_loss(values, target, copies)
         (norm,) = self.optimiser.step(self.optimiser.gradient(loss))
         if (self.updates + 1) % self.config.target_every == 0:
@@ -100,22 +101,22 @@ class Qmix(OffPolicyLearner):
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return Q_tot of rows, for `SymmetryPrior.errors`."""
-        return {"value": self._total(self._utilities(rows), rows)}
+        return {"value": self._total(self._utilities(rows), rows, self._critic_rows(rows))}
 
     def _utilities(self, rows: EpisodeBatch) -> Tensor:
         return self.policy.unroll(rows.obs, rows.action, rows.action_mask)
 
-    def _total(self, utilities: Tensor, rows: EpisodeBatch) -> Tensor:
-        """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A]."""
+    def _total(self, utilities: Tensor, rows: EpisodeBatch, seen: Tensor) -> Tensor:
+        """Return Q_tot [S, B, T, 1] of what was done, from utilities [S, B, T + 1, N, A] and what the mixer sees."""
         chosen = utilities[:, :, :-1].gather(-1, rows.action.unsqueeze(-1)).squeeze(-1)
-        return self.mixer(rows.of_living(chosen), self._critic_rows(rows)[:, :, :-1]).unsqueeze(-1)
+        return self.mixer(rows.of_living(chosen), seen[:, :, :-1]).unsqueeze(-1)
 
     @torch.no_grad()
-    def _targets(self, batch: EpisodeBatch, utilities: Tensor) -> Tensor:
+    def _targets(self, batch: EpisodeBatch, utilities: Tensor, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q_tot^-(s', argmax_a Q(o', a)) for the originals: [S, B, T, 1]."""
         following = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
         chooser = utilities[:, :, 1:] if self.config.double_q else following
         chosen = following.gather(-1, best(chooser).unsqueeze(-1)).squeeze(-1)
         chosen = batch.of_living(chosen, after=True)
-        next_value = self.target_mixer(chosen, self._critic_rows(batch)[:, :, 1:]).unsqueeze(-1)
+        next_value = self.target_mixer(chosen, seen[:, :, 1:]).unsqueeze(-1)
         return self._td_targets(batch, batch.reward.mean(-1, keepdim=True), next_value)

@@ -30,10 +30,17 @@ def prepared(config: RunConfig) -> RunConfig:
     Where trust is "measured" or a "gate", each element gets its weight. That is the idea of PSE (Yu et al., 2024,
     arXiv:2401.00167), which quantifies the breaking during training; to measure it before, and how, is ours. What was
     measured stands in the configuration: nothing is measured twice.
+
+    Raises:
+        ValueError: there is a compass, which leaves nothing to be measured, or the task cannot carry the elements.
     """
     prior = config.prior
     if prior.kind == "none":
         return config
+    if prior.compass and prior.trust != "full" and not prior.weights:
+        raise ValueError(
+            f"with prior.compass nothing is false that prior.trust={prior.trust} could find; leave one of the two out"
+        )
     if prior.transforms == DISCOVERED.rstrip(":"):
         found = discover_in_task(_Maker(config)).transforms.removeprefix(DISCOVERED)
         if prior.copies == "all" or prior.trust != "full":

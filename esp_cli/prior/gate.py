@@ -13,7 +13,7 @@ field. P_N is a ridge regression on products of two numbers, a class of function
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -127,6 +127,14 @@ def gated(transform: Transform, rows: Tensor) -> GatedTransform:
     return GatedTransform(**{f.name: getattr(transform, f.name) for f in fields(Transform)}, open=rows)
 
 
+def moved_share(transform: Transform, num_seeds: int) -> Tensor:
+    """Return the share of the rows that a transform moves, [S]; the identity moves none."""
+    moves = torch.tensor([0.0 if element.is_identity else 1.0 for element in transform.elements]).expand(num_seeds)
+    if not isinstance(transform, GatedTransform):
+        return moves
+    return moves.to(transform.open.device, non_blocking=True) * transform.open.float().mean((1, 2))
+
+
 @dataclass(frozen=True)
 class Gate:
     """One-step predictors of a task, and how far to trust a copy by what they say.
@@ -138,6 +146,7 @@ class Gate:
         noise: [D + 1] gap in that unit that counts as none.
         doubt: a copy that is off by b standard deviations is kept with probability exp(-doubt b).
         certain: names of elements that are not gated.
+        to_environment: what the task is given for an action of the learner.
     """
 
     spaces: Spaces
@@ -146,6 +155,7 @@ class Gate:
     noise: Tensor
     doubt: float
     certain: Collection[str] = ()
+    to_environment: Callable[[Tensor], Tensor] = lambda action: action
 
     @torch.no_grad()
     def kept(self, transform: Transform, obs: Tensor, action: Tensor) -> Tensor:
@@ -154,9 +164,9 @@ class Gate:
         Args:
             transform: one element per seed, or one for all.
             obs: [S, B, T, N, D].
-            action: [S, B, T, N] int64, or [S, B, T, N, width] float32.
+            action: [S, B, T, N] int64, or [S, B, T, N, width] float32, as the learner has it.
         """
-        width, action = obs.shape[-1], self.spaces.action.admissible(action)
+        width, action = obs.shape[-1], self.spaces.action.admissible(self.to_environment(action))
         here = self._predicted(obs, action)
         there = self._predicted(transform.obs(obs), transform.action(action))
         pushed = torch.cat([transform.obs(here[..., :width]), transform.per_agent(here[..., width]).unsqueeze(-1)], -1)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.prior.copies import Copies, Divergent
-from esp_cli.prior.gate import Gate, gated
+from esp_cli.prior.gate import Gate, gated, moved_share
 from esp_cli.prior.seed_batch import Rows, SeedBatch
 from esp_cli.symmetry import Transform, carried_groups, transform_set
 from esp_envs.spec import Spaces
@@ -59,6 +59,7 @@ class SymmetryPrior:
         self._probe = _probe(spaces, device)
         self.strength = 1.0
         self.gate: Gate | None = None
+        self._copied: Tensor | None = None
         self._weights = self._weigh()
 
     def begin(self, progress: float) -> None:
@@ -96,12 +97,12 @@ class SymmetryPrior:
         """Copies of every episode that a replay stores."""
         return self.num_copies if self._stores else 0
 
-    @property
-    def augmented_share(self) -> float:
-        """Share of the rows in a learner's own loss that are copies."""
+    def augmented_share(self, num_seeds: int) -> Tensor:
+        """Return the share of the rows in a learner's own loss that are copies, [S]; a gate's as last drawn."""
         keep = self._keep()
         kept = max(keep, default=0.0) if self._draws_one else sum(keep) / max(1, len(keep))
-        return kept * self.num_copies / (1 + self.num_copies) if self.config.augments else 0.0
+        copied = torch.full((num_seeds,), kept) if self._copied is None else self._copied
+        return copied * self.num_copies / (1 + self.num_copies) * self.config.augments
 
     @property
     def recomputes(self) -> bool:
@@ -155,18 +156,27 @@ class SymmetryPrior:
             raise ValueError(
                 "prior.trust=gate needs predictors of its task, which esp train fits; here choose measured"
             )
-        return [self._gated(self.gate, g, batch, generators) for g in drawn]
+        chosen = [self._gated(self.gate, g, batch, generators) for g in drawn]
+        shares = [moved_share(g, len(generators)).to(batch.obs.device, non_blocking=True) for g in chosen]
+        self._copied = torch.stack(shares).mean(0) if shares else None
+        return chosen
 
     def _gated(
         self, gate: Gate, transform: Transform, batch: SeedBatch, generators: Sequence[torch.Generator]
     ) -> Transform:
+        """Return the transform of the rows that the gate lets through; a seed draws only where it is not certain."""
         certain = gate.is_certain(transform)
         if all(certain):
             return transform
         kept = gate.kept(transform, batch.obs[:, :, : batch.action.shape[2]], batch.action)
-        chance = torch.stack([torch.rand(kept.shape[1:], generator=g) for g in generators])
+        of_seeds = certain * (len(generators) // len(certain))
+        chances = [
+            torch.zeros(kept.shape[1:]) if sure else torch.rand(kept.shape[1:], generator=generator)
+            for sure, generator in zip(of_seeds, generators, strict=True)
+        ]
+        chance = torch.stack(chances).to(kept.device, non_blocking=True)
         sure = torch.tensor(certain).view(-1, 1, 1).to(kept.device, non_blocking=True)
-        return gated(transform, (chance.to(kept.device, non_blocking=True) < kept) | sure)
+        return gated(transform, (chance < kept) | sure)
 
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         """Return one transform per copy, each one element per seed."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.prior.gate import fitted
@@ -62,10 +64,11 @@ def _set_gate(learner: Learner, config: RunConfig) -> None:
         return
     if config.network.recurrent:
         raise ValueError("prior.trust=gate copies single steps, which a recurrent network cannot take; use mlp")
-    if prior.compass:
-        raise ValueError("with prior.compass nothing is false that a gate could keep out; leave prior.trust=gate out")
+    if learner.replays and prior.replay == "stored":
+        raise ValueError("prior.trust=gate copies single steps, and a replay stores episodes; use prior.replay=sampled")
     certain = {name for name, weight in prior.weights.items() if weight == 1}
     if certain != set(prior.weights):
         worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)
         exchanged = any("agents" in name for name in prior.weights)
-        learner.prior.gate = fitted(worlds, prior.doubt, certain, alike=not exchanged)
+        gate = fitted(worlds, prior.doubt, certain, alike=not exchanged)
+        learner.prior.gate = replace(gate, to_environment=learner.policy.head.to_environment)

@@ -25,3 +25,11 @@ def test_it_leaves_numbers_alone_before_the_first_update():
     normaliser = ValueNormaliser(1, decay=0.9)
     assert normaliser.normalise(torch.tensor([[5.0]])).item() == 5.0
     assert normaliser.denormalise(torch.tensor([[5.0]])).item() == 5.0
+
+
+def test_scaling_takes_no_mean_off():
+    """Of (1, 7) the mean square is 25, of a constant 3 it is 9."""
+    normaliser = ValueNormaliser(2, decay=0.9)
+    normaliser.update(torch.tensor([[1.0, 7.0], [3.0, 3.0]]))
+    torch.testing.assert_close(normaliser.scaled(torch.tensor([[10.0], [3.0]])), torch.tensor([[2.0], [1.0]]))
+    assert ValueNormaliser(1, decay=0.9).scaled(torch.tensor([[5.0]])).item() == 5.0

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.training.config import resolve_config
 from tests.algorithms.off_policy import after, equal, learner, networks, turn
 
@@ -211,3 +212,20 @@ def test_the_learning_rate_falls_linearly_where_asked(algorithm, anneal, share):
     expected = pytest.approx(trained.config.learning_rate * share)
     for optimiser in trained.optimisers.values():
         assert optimiser.learning_rate == expected
+
+
+@both
+@pytest.mark.parametrize(("task", "share"), [("navigation", 0.0), ("wildlife", 1.0)])
+def test_a_reward_for_every_step_counts_where_episodes_end_early_alone(algorithm, task, share):
+    """Paid 1 a step, a longer episode is worth more; of episodes of one length all are alike, and the mean is taken."""
+    trained = learner(algorithm, task)
+    batch, _ = trained.collector.collect()
+    ones = torch.ones_like(batch.reward[..., :1])
+    trained.reward_scale = ValueNormaliser(2, 0.9)
+    trained.reward_scale.update(ones)
+    batch.terminated = torch.zeros_like(batch.terminated)
+    following = torch.zeros(*batch.terminated.shape, 1)
+    targets = trained._td_targets(batch, ones, following)[..., 0]
+    steps, gamma = trained.spec.horizon, trained.config.gamma * trained.config.td_lambda
+    expected = share * steps**-0.5 * (1 - gamma**steps) / (1 - gamma)
+    torch.testing.assert_close(targets[:, :, 0], torch.full_like(targets[:, :, 0], expected))

@@ -18,7 +18,8 @@ from esp_cli.training.config import resolve_config
 from esp_cli.training.policy_file import read_policy
 from esp_envs import make
 from esp_envs.mpe.task import MOVES
-from esp_envs.spec import Field, Kind, Spaces, layout
+from esp_envs.spec import Continuous, Field, Kind, Spaces, layout
+from tests.cli.running import esp
 from tests.prior.test_copies import Squared
 from tests.prior.test_imperfect import SMALL, generators, train_small
 
@@ -184,6 +185,52 @@ def test_training_with_a_gate_is_esp_where_nothing_is_broken_and_differs_where_s
     assert weights["rot90"] < 0.7
 
 
+@pytest.mark.parametrize(
+    "choice", [(), ("--set", "prior.copies=all"), ("--set", "prior.fade=1")], ids=["drawn", "all", "fading"]
+)
+def test_a_seed_draws_the_same_alone_and_beside_others_whose_elements_are_certain(tmp_path: Path, choice) -> None:
+    gate = ("--set", "task.wind=0.3", "--set", "prior.trust=gate", "--set", "prior.transforms=d4", *choice)
+    for name, seeds in (("alone", "1"), ("among", "0,1,2")):
+        esp("train", *SMALL["mappo"].split(), *gate, "--seed-list", seeds, "--out", tmp_path / name)
+    alone, among = (read_policy(tmp_path / name / "policy.safetensors")[0] for name in ("alone", "among"))
+    for name, tensor in alone.items():
+        torch.testing.assert_close(tensor[0], among[name][1], rtol=1e-4, atol=1e-5)
+        assert not torch.allclose(tensor[0], among[name][2], rtol=1e-3) or tensor.std() == 0, "the control"
+
+
+def test_the_share_of_copies_is_that_of_the_rows_that_are_moved() -> None:
+    """Of four states at (2, 1) and (0, 0), seed 0 turns by a half: two moved; the mirror of seed 1 is certain: all."""
+    config = PriorConfig(transforms="rot180,flip-x", trust="gate", weights={"rot180": 0.0, "flip-x": 1.0})
+    prior = SymmetryPrior(config, ONE)
+    prior.gate = one_body(0.5, doubt=1000.0, certain=("flip-x",))
+    obs = torch.tensor([[2.0, 1.0], [0, 0], [2, 1], [0, 0]]).view(1, 4, 1, 1, 2).expand(2, -1, -1, -1, -1)
+    batch = SeedBatch(obs, obs[:, :, :, 0], torch.full((2, 4, 1, 1), UP))
+    assert prior.augmented_share(2).tolist() == [0.5, 0.5], "before anything is drawn: one copy of each row"
+    own, seen = generators(2), set()
+    for _ in range(20):
+        (g,) = prior.copies(batch, own).transforms
+        for element, share in zip(g.elements, prior.augmented_share(2).tolist(), strict=True):
+            seen.add((element.name, share))
+    assert seen == {("rot180", 0.25), ("flip-x", 0.5)}
+
+
+def test_a_gate_is_asked_about_what_the_task_was_given() -> None:
+    """A latent force of 3 along x acts as 0.5: turned it should push as much along y, where it does nothing."""
+    forces = Spaces(
+        num_agents=1,
+        observation=layout(Field("velocity", Kind.VECTOR)),
+        state=layout(),
+        action=Continuous(layout(Field("force", Kind.VECTOR))),
+        symmetry="d4",
+    )
+    weights = torch.zeros(1, inputs_of(forces, torch.zeros(1, 1, 1, 2), torch.zeros(1, 1, 1, 2)).shape[-1], 3)
+    weights[0, 3, 0] = 1.0  # pushed along x by the force's x, and not along y
+    gate = Gate(forces, weights, torch.ones(3), torch.zeros(3), 1.0, to_environment=lambda u: u / 6)
+    (turn,) = transform_set("rot90", forces).each()
+    kept = gate.kept(turn, torch.zeros(1, 1, 1, 1, 2), torch.tensor([3.0, 0.0]).view(1, 1, 1, 1, 2))
+    assert float(kept) == pytest.approx(math.exp(-0.5))
+
+
 def test_a_gate_that_keeps_nothing_trains_as_the_plain_learner_with_every_row_twice(tmp_path: Path) -> None:
     """The copies equal their originals, so a mean loss is the plain learner's up to rounding."""
     few = ("--set", "task.wind=3", "--set", "prior.transforms=rot180", "--set", "mappo.num_minibatches=1")
@@ -199,7 +246,8 @@ def test_a_gate_that_keeps_nothing_trains_as_the_plain_learner_with_every_row_tw
     ("settings", "message"),
     [
         ({"network.name": "gru"}, "a recurrent network cannot take"),
-        ({"prior.compass": 1.0}, "leave prior.trust=gate out"),
+        ({"prior.compass": 1.0}, "leave one of the two out"),
+        ({"prior.compass": 1.0, "prior.trust": "measured"}, "leave one of the two out"),
     ],
     ids=str,
 )
@@ -207,3 +255,9 @@ def test_a_gate_that_does_not_fit_is_refused(settings, message: str) -> None:
     overrides = {"prior.trust": "gate", "task.wind": 0.5, "prior.transforms": "rot90", **settings}
     with pytest.raises(ValueError, match=message):
         build_learner(prepared(resolve_config("navigation", overrides=overrides)))
+
+
+def test_a_replay_of_copied_episodes_is_refused_with_a_gate() -> None:
+    overrides = {"prior.trust": "gate", "task.wind": 0.5, "prior.transforms": "rot90", "prior.replay": "stored"}
+    with pytest.raises(ValueError, match=r"use prior\.replay=sampled"):
+        build_learner(prepared(resolve_config("navigation", "qmix", overrides=overrides)))

@@ -46,7 +46,7 @@ def generators(count: int = 2) -> list[torch.Generator]:
 def test_the_strength_falls_linearly_to_0(progress: float, strength: float) -> None:
     assert faded(progress).strength == pytest.approx(strength)
     assert faded(progress, fade=0.0).strength == 1
-    assert faded(progress).augmented_share == pytest.approx(strength / 2)
+    assert float(faded(progress).augmented_share(1)) == pytest.approx(strength / 2)
 
 
 @pytest.mark.parametrize("choice", [{}, {"copies": "all"}, {"transforms": "rot90"}, {"transforms": "o2"}], ids=str)
@@ -83,7 +83,7 @@ def test_elements_are_drawn_by_their_weights_and_those_of_weight_1_do_not_fade(
     for name, chance in expected.items():
         error = (chance * (1 - chance) / 1500) ** 0.5
         assert names.count(name) / 1500 == pytest.approx(chance, abs=4 * error)
-    assert prior.augmented_share == pytest.approx(share)
+    assert float(prior.augmented_share(1)) == pytest.approx(share)
 
 
 def test_auto_is_short_for_measured_weights_that_fade_and_what_a_user_chooses_wins() -> None:
