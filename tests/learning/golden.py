@@ -3,8 +3,8 @@
     python tests/learning/golden.py             # write golden_weights.json anew
     python tests/learning/golden.py CASE ...    # print the hashes of some cases
 
-The hashes on file began as those of commit 1b792e9. Write them anew only for a change that is meant to change results. To
-take them from another commit, put its checkout first on the path:
+The hashes on file began as those of commit 1b792e9. Write them anew only for a change that is meant to change results.
+To take them from another commit, put its checkout first on the path:
 
     PYTHONPATH=OTHER:OTHER/environments python tests/learning/golden.py
 
