@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch import distributions as td
 
+from esp_cli.loop.shapes import check_alike
 from esp_cli.prior.losses import policy_consistency_loss
 from esp_cli.symmetry import Transform
 
@@ -40,18 +41,19 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
         [..., N], or [...] without an agent axis.
 
     Raises:
-        ValueError: another kind of distribution, or another number of actions.
+        ValueError: another kind of distribution, another number of actions, or different shapes.
     """
     there, here = _bare(there), _bare(here)
     if transform.action_index is not None:
         if all(isinstance(p, Tensor | td.Categorical | td.OneHotCategorical) for p in (there, here)):
-            return policy_consistency_loss(_choices_apart, _pulled(transform, _logits(there)), _logits(here))
+            return policy_consistency_loss(_choices_apart, *_both(transform, _logits(there), _logits(here)))
     elif isinstance(there, Tensor) and isinstance(here, Tensor):
-        return policy_consistency_loss(_half_squared_distance, _pulled(transform, there), here)
+        return policy_consistency_loss(_half_squared_distance, *_both(transform, there, here))
     elif isinstance(there, td.Normal) and isinstance(here, td.Normal):
         return _normals_apart(transform, there, here)
     elif _is_squashed(there) and _is_squashed(here):
         inner, own = _bare(there.base_dist), _bare(here.base_dist)
+        check_alike("policy", [inner.loc], own.loc)
         if _commutes(transform, own.loc, here.transforms):
             return _normals_apart(transform, inner, own)
         return _samples_apart(transform, there, here, samples)
@@ -102,6 +104,13 @@ def _pulled(transform: Transform, outputs: Tensor) -> Tensor:
     return transform.pull_back(outputs)
 
 
+def _both(transform: Transform, there: Tensor, here: Tensor) -> tuple[Tensor, Tensor]:
+    """Return what a policy says at L_g s, pulled back, and what it says at s, after checking both shapes."""
+    pulled = _pulled(transform, there)
+    check_alike("policy", [pulled], here)
+    return pulled, here
+
+
 def _logits(policy: Policy) -> Tensor:
     return policy if isinstance(policy, Tensor) else policy.logits
 
@@ -122,8 +131,8 @@ def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> T
     It is sum((c + (m - K^-1 m')^2) / v - 1 + log v - log v') / 2 with c the diagonal of K^-1 diag(v') K, since the
     determinant of a turned covariance is that of diag(v').
     """
-    mean, variance = _pulled(transform, there.loc), transform.pull_back_variance(there.variance)
-    ratio = (variance + (here.loc - mean).square()) / here.variance
+    (mean, own), variance = _both(transform, there.loc, here.loc), transform.pull_back_variance(there.variance)
+    ratio = (variance + (own - mean).square()) / here.variance
     volume = transform.values(there.variance.log().sum(-1))
     return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
 

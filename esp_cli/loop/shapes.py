@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -69,6 +69,20 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
         return move(x.reshape(agents)).reshape(x.shape)
     reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
     raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
+
+
+def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
+    """Refuse to compare what was said of moved and of original data in different shapes, such as [B, 1] and [B].
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    for x in moved:
+        if x.shape != here.shape:
+            raise ValueError(
+                f"{name} has shape {list(x.shape)} for the moved data, but {list(here.shape)} for the originals "
+                "(here); give both in one shape"
+            )
 
 
 def _check_rows(

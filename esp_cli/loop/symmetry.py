@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import act, carry, check_state, lead_of
+from esp_cli.loop.shapes import act, carry, check_alike, check_state, lead_of
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
@@ -163,7 +163,7 @@ class Symmetry:
             policy: obs [..., N, D] to a distribution of actions, or to a tensor, as `policy_divergence` knows them.
             obs: [..., N, D]; of a recurrent policy, whole histories.
             here: what the policy says of `obs`, where it is known already; detached, it stays fixed.
-            mask: [...] which rows count.
+            mask: [...] which rows count; the loss is 0 where none does.
 
         Returns:
             A scalar, 0 if and only if the policy turns with the scene.
@@ -190,8 +190,8 @@ class Symmetry:
             value: the state, or the observations, to values [...], [..., 1], [..., N] or [..., N, 1].
             state: [..., Ds], for a critic that takes the state.
             obs: [..., N, D], for one that takes the observations; give one of the two.
-            here: the values of the originals, where they are known already.
-            mask: [...] which rows count.
+            here: the values of the originals, where they are known already, in the shape that `value` gives.
+            mask: [...] which rows count; the loss is 0 where none does.
 
         Raises:
             ValueError: a shape that does not fit.
@@ -206,9 +206,9 @@ class Symmetry:
             moved = [(g, value(g.obs(obs))) for g in self.transforms(obs)]
         else:
             raise ValueError("value_loss takes either state or obs; give the one that the critic sees")
-        return _mean(
-            [value_consistency_loss(carry(self.spaces, g.values, x, lead, "value"), here) for g, x in moved], mask
-        )
+        carried = [carry(self.spaces, g.values, x, lead, "value") for g, x in moved]
+        check_alike("value", carried, here)
+        return _mean([value_consistency_loss(x, here) for x in carried], mask)
 
     def action_value_loss(
         self, value: Callable[[Tensor], Tensor], obs: Tensor, here: Tensor | None = None, mask: Tensor | None = None
@@ -218,8 +218,8 @@ class Symmetry:
         Args:
             value: obs [..., N, D] to one value per action [..., N, A].
             obs: [..., N, D].
-            here: the values of the originals, where they are known already.
-            mask: [...] which rows count.
+            here: the values of the originals, where they are known already, in the shape that `value` gives.
+            mask: [...] which rows count; the loss is 0 where none does.
 
         Raises:
             ValueError: a shape that does not fit, or continuous actions.
@@ -228,8 +228,9 @@ class Symmetry:
             raise ValueError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
         lead_of(self.spaces, obs)
         here = value(obs) if here is None else here
-        gaps = [value_consistency_loss(g.pull_back(value(g.obs(obs))), here) for g in self.transforms(obs)]
-        return _mean(gaps, mask)
+        pulled = [g.pull_back(value(g.obs(obs))) for g in self.transforms(obs)]
+        check_alike("value", pulled, here)
+        return _mean([value_consistency_loss(x, here) for x in pulled], mask)
 
     def check(self, source: Environment | Transitions, transforms: str | None = None) -> list[ElementVerdict]:
         """Judge for each element and field whether a task is as symmetric as you say: holds, broken, or not covered.
@@ -262,6 +263,7 @@ class Symmetry:
 
 
 def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
-    """Return the mean over elements, rows and agents, of the rows that count."""
+    """Return the mean over elements, rows and agents, of the rows that count; 0 where none does."""
     gap = torch.stack(gaps)
-    return gap.mean() if mask is None else gap[:, mask].mean()
+    counted = gap if mask is None else gap[:, mask]
+    return counted.mean() if counted.numel() else counted.sum()

@@ -131,3 +131,20 @@ def test_agents_that_change_places_are_compared_with_themselves(action: ActionSp
 def test_what_is_not_known_is_refused(action: ActionSpace, policy: object, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         policy_divergence(element("rot90", action), policy, policy)
+
+
+@pytest.mark.parametrize(
+    ("action", "policy"),
+    [
+        (MOVES, lambda logits: td.Categorical(logits=logits)),
+        (MOVES, lambda logits: logits),
+        (FORCE, lambda mean: mean[..., :2]),
+        (FORCE, lambda mean: normal(mean[..., :2], torch.ones(2))),
+        (FORCE, lambda mean: squashed(mean[..., :2], torch.ones(2))),
+    ],
+)
+def test_policies_of_different_shapes_are_refused_instead_of_broadcast(action: ActionSpace, policy) -> None:
+    g, outputs = element("rot90", action), random(3, 4)
+    assert policy_divergence(g, policy(outputs), policy(outputs)).shape == (3,)
+    with pytest.raises(ValueError, match=r"policy has shape \[3, .\] for the moved data, but \[1, 3, .\] for"):
+        policy_divergence(g, policy(outputs), policy(outputs[None]))

@@ -173,6 +173,39 @@ def test_a_masked_row_does_not_count_and_a_known_answer_is_not_asked_again() -> 
     assert len(asked) == 3
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda s, obs, none: s.value_loss(lambda o: o[..., 0], obs=obs, mask=none),
+        lambda s, obs, none: s.action_value_loss(lambda o: o[..., [0, 0, 0, 0]], obs, mask=none),
+        lambda s, obs, none: s.policy_loss(lambda o: o[..., [0, 0, 1, 1]], obs, mask=none),
+    ],
+)
+def test_where_no_row_counts_the_loss_and_its_gradient_are_zero(call) -> None:
+    obs = random(6, 3).requires_grad_()
+    loss = call(quarter(), obs, torch.zeros(6, dtype=torch.bool))
+    loss.backward()
+    assert loss.item() == 0
+    assert obs.grad is not None
+    assert obs.grad.abs().max().item() == 0
+    assert call(quarter(), obs, torch.ones(6, dtype=torch.bool)).item() > 0.1
+
+
+def test_known_answers_in_another_shape_are_refused_instead_of_broadcast() -> None:
+    """|v|^2 is invariant: 0 in one shape, but [B, 1] beside [B] would compare each row with all the others."""
+    obs, symmetry = random(6, 3), quarter()
+
+    def value(o: Tensor) -> Tensor:
+        return o[..., :2].square().sum(-1, keepdim=True)
+
+    assert symmetry.value_loss(value, obs=obs, here=value(obs)).item() == pytest.approx(0, abs=1e-6)
+    message = r"value has shape \[6, 1\] for the moved data, but \[6\] for the originals \(here\); give both"
+    with pytest.raises(ValueError, match=message):
+        symmetry.value_loss(value, obs=obs, here=value(obs).squeeze(-1))
+    with pytest.raises(ValueError, match=r"value has shape \[6, 4\] for the moved data, but \[6, 1\]"):
+        symmetry.action_value_loss(lambda o: o[..., [0, 0, 1, 1]], obs, here=value(obs))
+
+
 def test_gradients_reach_the_data_and_the_networks() -> None:
     net, obs = nn.Linear(3, 4), random(5, 3).requires_grad_()
     quarter().policy_loss(net, obs).backward()
