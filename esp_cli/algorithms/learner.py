@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -37,6 +37,15 @@ class LearnerConfig(Strict):
     """What the hyperparameters of every algorithm have in common."""
 
     num_envs: int
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others.
+
+        Args:
+            network: shape of the networks.
+            spec: makes the contract of the task, which takes worlds; called only where a setting depends on it.
+        """
+        return frozenset()
 
 
 class Worlds(Protocol):

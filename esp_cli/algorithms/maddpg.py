@@ -7,7 +7,7 @@ actions, and the actor follows its gradient. Supplement eq. 19 is added to the c
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -27,7 +27,7 @@ from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Discrete, TaskSpec
 
 
 class MaddpgConfig(OffPolicyConfig):
@@ -47,6 +47,10 @@ class MaddpgConfig(OffPolicyConfig):
         description="discrete actions: straight-through of a draw, or that of the expected value over all of them",
     )
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        """Return "actor_gradient" where actions are continuous: the actor's output is the action, nothing is drawn."""
+        return frozenset() if isinstance(spec().action, Discrete) else frozenset({"actor_gradient"})
 
 
 class Maddpg(OffPolicyLearner):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 from pydantic import Field
 
 from esp_cli.algorithms.learner import LearnerConfig
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.io_spec import Reads
+from esp_envs.spec import TaskSpec
 
 
 class MappoConfig(LearnerConfig):
@@ -38,3 +41,10 @@ class MappoConfig(LearnerConfig):
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
     chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        """Return what serves memory or a choice of activation that the network does not have."""
+        idle = set() if network.recurrent else {"truncation"}
+        if network.with_activation("relu") == network.with_activation("tanh"):
+            idle.add("critic_activation")
+        return frozenset(idle)

@@ -37,6 +37,10 @@ class PlainConfig(NetworkConfig):
             raise ValueError("separate_parts and symmetrise exclude each other; leave one of them off")
         return self
 
+    def without_effect(self) -> frozenset[str]:
+        """Return "precision" where layers are normalised: those products are of float32."""
+        return frozenset({"precision"}) if self.layer_norm else frozenset()
+
     def least_parameters(self, inputs: int) -> int:
         """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
         return sum(a * b for a, b in pairwise((inputs, *self.hidden)))

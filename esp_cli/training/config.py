@@ -17,7 +17,8 @@ from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
-from esp_envs.registry import task_class
+from esp_envs.registry import make, task_class
+from esp_envs.spec import TaskSpec
 
 SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
 """The sections that settings of every run have, and where its configuration holds them."""
@@ -66,10 +67,20 @@ class RunConfig(Strict):
         return self.model_copy(update={"seeds": self.seeds[:1], "device": "cpu"})
 
     def without_effect(self) -> frozenset[str]:
-        """Return settings of prior and network that change nothing beside the others, as "prior.weights"."""
-        of_others = "old_log_prob" if ALGORITHMS[self.algorithm].replays else "replay"
-        idle = {"prior": self.prior.without_effect() | {of_others}, "network": self.network.without_effect()}
+        """Return settings of prior, network and learner that change nothing beside the others, as "prior.weights"."""
+        learner = ALGORITHMS[self.algorithm]
+        of_others = "old_log_prob" if learner.replays else "replay"
+        settings = learner.config_class(**self.algorithm_settings)
+        idle = {
+            "prior": self.prior.without_effect() | {of_others},
+            "network": self.network.without_effect(),
+            self.algorithm: settings.without_effect(self.network, self._spec),
+        }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
+
+    def _spec(self) -> TaskSpec:
+        """Return the contract of the task; for that it makes one world."""
+        return make(self.task, 1, (0,), self.task_settings).spec
 
     def own_words(self) -> list[str]:
         """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""

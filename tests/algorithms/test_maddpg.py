@@ -8,7 +8,7 @@ import torch
 
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.plain import MLP
-from tests.algorithms.off_policy import learner
+from tests.algorithms.off_policy import after, equal, learner
 
 
 def prepared(**choice):
@@ -167,3 +167,11 @@ def test_the_policy_consistency_vanishes_for_a_policy_that_turns_with_the_world_
     assert gap.min() > 0.1
     if actions == "continuous":  # (1/2, 0) pulled back is (0, -1/2): |(1/2, 1/2)|^2 / 2
         torch.testing.assert_close(gap, torch.full((2,), 0.25))
+
+
+@pytest.mark.parametrize(("actions", "same"), [("continuous", True), ("discrete", False)])
+def test_the_expected_gradient_is_the_sampled_one_where_actions_are_continuous(actions, same):
+    sampled, expected = (
+        after("maddpg", task__actions=actions, algo__actor_gradient=kind)[0] for kind in ("sampled", "expected")
+    )
+    assert equal(sampled, expected) is same

@@ -123,6 +123,16 @@ def test_a_seed_neither_sees_nor_moves_another(name):
     assert gradient[1].abs().max() == 0
 
 
+@pytest.mark.parametrize("name", ["mlp", "gru"])
+@pytest.mark.parametrize("norm", [True, False])
+def test_precision_changes_nothing_where_layers_are_normalised(name, norm):
+    choices = [NETWORKS[name](hidden=(8,), layer_norm=norm, precision=p) for p in ("float32", "bfloat16")]
+    x = torch.randn(2, 4, 5, 6)
+    exact, rounded = (build_network(generators(0, 1), 6, 3, config, 1.0).unroll(x) for config in choices)
+    assert torch.equal(exact, rounded) is norm
+    assert all(config.without_effect() == ({"precision"} if norm else set()) for config in choices)
+
+
 def test_gru_by_hand():
     gru = SeedGRU(generators(0), 1, 1)
     with torch.no_grad():

@@ -53,6 +53,25 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
     assert config.network == EmpnConfig(hidden=(64, 64)), "without the layer_norm of the preset's recurrent network"
 
 
+@pytest.mark.parametrize(
+    ("task", "algorithm", "choice", "idle"),
+    [
+        ("navigation", "mappo", {}, {"mappo.truncation"}),
+        ("navigation", "mappo", {"network.name": "gru"}, set()),
+        ("wildlife", "mappo", {}, {"mappo.truncation", "mappo.critic_activation"}),
+        ("wildlife", "mappo", {"network.name": "mlp"}, {"mappo.truncation"}),
+        ("navigation", "maddpg", {}, set()),
+        ("navigation", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
+        ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
+        ("navigation", "qmix", {"network.layer_norm": True}, {"network.precision"}),
+        ("navigation", "maddpg", {"network.name": "gru", "network.layer_norm": True}, {"network.precision"}),
+    ],
+)
+def test_a_learner_and_its_network_name_the_settings_that_do_nothing_beside_the_others(task, algorithm, choice, idle):
+    config = resolve_config(task, algorithm, overrides=choice)
+    assert {name for name in config.without_effect() if not name.startswith("prior.")} == idle
+
+
 FLAT = {
     "hidden": [32],
     "activation": "relu",
