@@ -52,6 +52,7 @@ class Qmix(OffPolicyLearner):
     """
 
     config_class = QmixConfig
+    has_policy_term = False
     watched = ("td_loss", "grad_norm")
     config: QmixConfig
     task_settings = MappingProxyType({"actions": "discrete"})

@@ -69,10 +69,11 @@ class RunConfig(Strict):
     def without_effect(self) -> frozenset[str]:
         """Return settings of prior, network and learner that change nothing beside the others, as "prior.weights"."""
         learner = ALGORITHMS[self.algorithm]
-        of_others = "old_log_prob" if learner.replays else "replay"
+        of_others = {"old_log_prob" if learner.replays else "replay"}
+        of_others |= set() if learner.has_policy_term else {"terms"}
         settings = learner.config_class(**self.algorithm_settings)
         idle = {
-            "prior": self.prior.without_effect() | {of_others},
+            "prior": self.prior.without_effect() | of_others,
             "network": self.network.without_effect(),
             self.algorithm: settings.without_effect(self.network, self._spec),
         }
@@ -175,7 +176,17 @@ def resolve_config(
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
     }
+    _refuse_loss_without_terms(algorithm, values["prior"])
     return validated(RunConfig, values, "run")
+
+
+def _refuse_loss_without_terms(algorithm: str, prior: PriorConfig) -> None:
+    """Refuse a consistency loss of the policy alone for a learner that has no policy to compare."""
+    if prior.terms == "policy" and prior.coefficient > 0 and not ALGORITHMS[algorithm].has_policy_term:
+        raise ValueError(
+            f"prior.terms=policy leaves {algorithm} without a consistency loss, since it learns values and has no "
+            "policy to compare; use prior.terms=value, or both"
+        )
 
 
 def _no_section(dotted: str, task: str, algorithm: str) -> str:

@@ -72,6 +72,23 @@ def test_a_learner_and_its_network_name_the_settings_that_do_nothing_beside_the_
     assert {name for name in config.without_effect() if not name.startswith("prior.")} == idle
 
 
+@pytest.mark.parametrize("kind", ["esp", "consistency"])
+def test_a_consistency_loss_of_the_policy_alone_is_refused_where_there_is_no_policy_to_compare(kind):
+    asked = {"prior.terms": "policy", "prior.kind": kind}
+    with pytest.raises(ValueError, match="terms=policy leaves qmix without a consistency loss"):
+        resolve_config("navigation", "qmix", overrides=asked)
+    assert resolve_config("navigation", "maddpg", overrides=asked).prior.terms == "policy"
+    for without_loss in ({"prior.consistency_coef": 0}, {"prior.kind": "augment"}):
+        resolve_config("navigation", "qmix", overrides=asked | without_loss)
+    assert resolve_config("navigation", "qmix", overrides=asked | {"prior.terms": "value"}).prior.terms == "value"
+
+
+@pytest.mark.parametrize(("algorithm", "idle"), [("qmix", True), ("maddpg", False), ("mappo", False)])
+def test_the_choice_of_terms_is_named_for_a_learner_that_has_one_of_them_alone(algorithm, idle):
+    config = resolve_config("navigation", algorithm, overrides={"prior.terms": "value"})
+    assert ("prior.terms" in config.without_effect()) is idle
+
+
 FLAT = {
     "hidden": [32],
     "activation": "relu",
