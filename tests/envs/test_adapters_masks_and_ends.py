@@ -95,6 +95,28 @@ def test_who_leaves_is_paid_once_and_the_other_goes_on():
     assert bool(step.final.alive[..., 1].all())
 
 
+def last_step(env, walking: int):
+    """Play one episode in which this many of the walkers arrive with the last step, and the others stay."""
+    seen = env.reset()
+    for t in range(STEPS):
+        must_walk = seen.obs[..., 0] + STEPS - t <= 4  # the end is at 4
+        step = env.step((must_walk & (torch.arange(2) < walking)).long())
+        seen = step.next
+    return step
+
+
+def test_at_the_horizon_only_who_arrives_with_that_very_step_has_ended():
+    """The other is cut, so a value lies beyond: the episode is truncated unless all end."""
+    step = last_step(worlds(Walkers, 20, (0,), workers=0), walking=1)
+    assert bool(step.truncated.all())
+    assert not bool(step.terminated.any())
+    assert step.final.alive[0].tolist() == [[False, True]] * 20
+    both = last_step(worlds(Walkers, 20, (0,), workers=0), walking=2)
+    assert bool(both.terminated.all()), "the control"
+    together = worlds(type("Together", (Walkers,), {"agents_end": False}), 20, (0,), workers=0)
+    assert bool(last_step(together, walking=1).terminated.all()), "where nothing says who has ended, one ends all"
+
+
 def test_masks_come_from_observations():
     env = worlds(Walkers, 20, (0,), workers=0)
     seen = env.reset()

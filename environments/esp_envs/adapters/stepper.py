@@ -185,7 +185,9 @@ class CopyStepper:
             raise ValueError(
                 f"{over[0]} of {type(task).__name__} ends before the others; set 'agents_end = True' in the class"
             )
-        board.ended[k] = self._how(k, len(over) == len(acting), any(ended.values()))
+        # who goes on up to the horizon is cut there, whoever else ends in this step: `alive` says who that is
+        terminates = all if task.agents_end and board.cut[k] else any
+        board.ended[k] = self._how(k, len(over) == len(acting), terminates(ended.values()))
         gone.update(name for name in over if ended[name] or not board.cut[k])
         self._write(k, board.final_obs, board.final_state, board.final_mask, board.final_alive)
         if board.ended[k]:
