@@ -40,7 +40,8 @@ class Mappo(Learner):
     """The learner: policy, centralised critic, optimiser and prior of S seeds; arguments as of `Learner`.
 
     Raises:
-        ValueError: a recurrent network whose rollouts are not whole episodes, or more minibatches than rows.
+        ValueError: a recurrent network whose rollouts are not whole episodes, more minibatches than rows, or a critic
+            of each agent's own observation where agents end one by one and share a reward.
     """
 
     config_class = MappoConfig
@@ -55,6 +56,11 @@ class Mappo(Learner):
         critic_network = network.with_activation(config.critic_activation)
         self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)
         self.num_values = self.critic.num_values
+        if spec.agents_end and spec.shared_reward and self.num_values > 1:
+            raise ValueError(
+                f"mappo.critic_input=own values each agent up to its own end, but agents of {spec.name} share a reward "
+                "that goes on behind it; set mappo.critic_input to observations or state"
+            )
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
         self.recurrent = self.policy.actor.memory_width > 0
         if self.recurrent and spec.terminates:

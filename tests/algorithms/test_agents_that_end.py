@@ -90,6 +90,17 @@ def test_a_rollout_says_who_has_ended():
     assert not bool(rollout.reward[~rollout.alive].any())
 
 
+def test_a_critic_of_each_agents_own_observation_is_refused_where_a_reward_is_shared_beyond_its_end():
+    with pytest.raises(ValueError, match="critic_input=own") as caught:
+        learner("mappo", task__shared=True, mappo__critic_input="own")
+    assert str(caught.value) == (
+        "mappo.critic_input=own values each agent up to its own end, but agents of leaving share a reward that goes on "
+        "behind it; set mappo.critic_input to observations or state"
+    )
+    assert learner("mappo", task__shared=True).num_values == 1, "the control: one value for all"
+    assert learner("mappo", mappo__critic_input="own").num_values == 3, "the control: rewards of their own"
+
+
 def test_what_an_ended_agent_did_and_was_worth_moves_no_weight():
     """Other actions and log-probabilities of ended agents give the same update bit for bit; of living ones not."""
     results = {}
