@@ -77,13 +77,22 @@ def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = 
         valid: which numbers count, of the shape of x; all where it is None. The others become 0.
     """
     if valid is not None:
-        per_seed = (-1, *[1] * (x.dim() - 1))
-        centred = torch.where(valid, x - mean_per_seed(x, valid).view(per_seed), 0.0)
-        variance = mean_per_seed(centred.square(), valid).view(per_seed)
-        return centred / (variance.sqrt() + epsilon)
+        centred = _centred(x, valid)
+        deviation = mean_per_seed(centred.square(), valid).sqrt()
+        return centred / (_beside(deviation, x) + epsilon)
     axes = tuple(range(1, x.dim()))
     deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)
     return (x - mean) / (deviation + epsilon)
+
+
+def _centred(x: Tensor, valid: Tensor) -> Tensor:
+    """Return x less the mean of each seed over what counts; 0 where nothing counts."""
+    return torch.where(valid, x - _beside(mean_per_seed(x, valid), x), 0.0)
+
+
+def _beside(per_seed: Tensor, x: Tensor) -> Tensor:
+    """Return numbers per seed [S] shaped to stand beside x [S, ...]."""
+    return per_seed.view(-1, *[1] * (x.dim() - 1))
 
 
 def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
@@ -113,7 +122,20 @@ def value_loss(
     return torch.maximum(loss, huber(clipped - target, huber_delta))
 
 
-def explained_variance(value: Tensor, target: Tensor) -> Tensor:
-    """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S]."""
-    residual = (target - value).flatten(1).var(1, correction=0)
-    return 1 - residual / target.flatten(1).var(1, correction=0).clamp_min(1e-8)
+def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S].
+
+    Args:
+        value: [S, ...].
+        target: likewise.
+        valid: which numbers count, of the shape of the others; all where it is None.
+    """
+    residual, whole = _variance(target - value, valid), _variance(target, valid)
+    return 1 - residual / whole.clamp_min(1e-8)
+
+
+def _variance(x: Tensor, valid: Tensor | None) -> Tensor:
+    """Return the variance [S] of each seed over what counts."""
+    if valid is None:
+        return x.flatten(1).var(1, correction=0)
+    return mean_per_seed(_centred(x, valid).square(), valid)

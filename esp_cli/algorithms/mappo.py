@@ -159,9 +159,7 @@ class Mappo(Learner):
         flags = {"action_mask": rollout.action_mask, "alive": rollout.alive}
         known = {name: self._as_sequences(flag) for name, flag in flags.items() if flag is not None}
         batch = Batch(*(self._as_sequences(x) for x in fields), **known)
-        if valid is not None:
-            value, target = torch.where(valid, value, 0.0), torch.where(valid, target, 0.0)
-        return batch, {"train/explained_variance": explained_variance(value, target)}
+        return batch, {"train/explained_variance": explained_variance(value, target, valid)}
 
     def _as_sequences(self, x: Tensor) -> Tensor:
         """Shape [S, E, T, ...] into [S, E * T, 1, ...], or into whole episodes [S, E * k, horizon, ...]."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
 import torch
 
-from esp_cli.algorithms.losses import gae, normalise_per_seed, td_targets
+from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed, td_targets
 from esp_cli.checking import check_symmetry
 from esp_cli.prior import mean_per_seed
 from esp_cli.symmetry import transform_set
@@ -55,6 +56,31 @@ def test_standardised_advantages_of_the_living_by_hand():
     torch.testing.assert_close(normalise_per_seed(x, 0.0, alive), torch.tensor([[-1.0, 1.0, 0.0]]))
     both = torch.ones_like(alive)
     torch.testing.assert_close(normalise_per_seed(x, 1e-5, both), normalise_per_seed(x))
+
+
+def test_the_explained_variance_of_the_living_by_hand():
+    """A constant explains nothing of the living's targets (4, 6), and half an offset 1 - (1/4) / 1 = 3/4 of (5, 6).
+
+    With the ended agent as a zero of both, the constant 5 would seem to explain 1 - (2/3) / (56/9) = 25/28.
+    """
+    target = torch.tensor([[4.0, 6.0, 90.0], [4.0, 6.0, 90.0]])
+    value = torch.tensor([[5.0, 5.0, -7.0], [4.5, 5.5, -7.0]])
+    alive = torch.tensor([[True, True, False]]).expand(2, 3)
+    assert explained_variance(value, target, alive).tolist() == [0.0, 0.75]
+    zeros = explained_variance(torch.where(alive, value, 0.0), torch.where(alive, target, 0.0))
+    assert zeros[0].item() == pytest.approx(25 / 28), "the control"
+    torch.testing.assert_close(explained_variance(value, target, alive | True), explained_variance(value, target))
+
+
+def test_mappo_logs_the_explained_variance_of_the_living():
+    trained, rollout = collected()
+    before = copy.deepcopy(trained.normaliser)
+    batch, metrics = trained.prepare(rollout)
+    value, target = before.denormalise(batch.value), trained.normaliser.denormalise(batch.target)
+    alive = rollout.alive.flatten(1, 2).unsqueeze(2)
+    living = [explained_variance(v[m][None], t[m][None]) for v, t, m in zip(value, target, alive, strict=True)]
+    torch.testing.assert_close(metrics["train/explained_variance"], torch.cat(living))
+    assert not torch.allclose(metrics["train/explained_variance"], explained_variance(value, target)), "the control"
 
 
 def test_advantages_end_with_the_agent_by_hand():
