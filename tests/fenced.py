@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -68,3 +70,23 @@ class Nothing(Fenced):
 
     def _allow(self, world: dict[str, Tensor]) -> Tensor:
         return super()._allow(world) & (world["position"][..., :1] < 0)
+
+
+class GatedSettings(FencedSettings):
+    fenced: bool = True
+
+
+class Gated(Fenced):
+    """Its fence is a setting; without one all may be done."""
+
+    Settings = GatedSettings
+
+    def _describe(self) -> TaskSpec:
+        return replace(super()._describe(), masks=self.settings.fenced)
+
+    def _allow(self, world: dict[str, Tensor]) -> Tensor | None:
+        return super()._allow(world) if self.settings.fenced else None
+
+    def _advance(self, world: dict[str, Tensor], action: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        reward = -world["position"].norm(dim=-1).mean(-1)
+        return reward, {"spread": world["position"].norm(dim=-1).amax(-1)}

@@ -122,7 +122,7 @@ def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedP
     changed = resolve_task_settings(trained.config.task, {**trained.config.task_settings, **settings})
     config = trained.config.model_copy(update={"task_settings": changed})
     spec = spec_of(config)
-    for part in ("num_agents", "observation", "action"):
+    for part in ("num_agents", "observation", "action", "masks"):
         if getattr(spec, part) != getattr(trained.spec, part):
             names = ", ".join(f"task.{name}" for name in settings)
             raise ValueError(

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli import load_policy
+from esp_cli import load_policy, train
 from esp_cli.checking import check_symmetry
 from esp_cli.networks.exploration import EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import Categorical, masked
 from esp_cli.symmetry import transform_set
+from esp_cli.training import loading
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import Discrete, Kind, make, register
@@ -21,7 +22,7 @@ from esp_envs.conformance import Subject, check
 from esp_envs.registry import TASKS
 from tests.algorithms.off_policy import SMALL
 from tests.cli.running import esp
-from tests.fenced import Fenced, Nothing, OneSided
+from tests.fenced import Fenced, Gated, Nothing, OneSided
 
 TASK = "tests.fenced:Fenced"
 THREE = Discrete(Kind.SCALAR, ((0.0,), (1.0,), (2.0,)), ("a", "b", "c"))
@@ -232,3 +233,17 @@ def test_masks_need_discrete_actions():
     fields = {name: getattr(spec, name) for name in spec.__dataclass_fields__}
     with pytest.raises(ValueError, match="masks are for discrete actions"):
         type(spec)(**fields | {"masks": True})
+
+
+@pytest.mark.parametrize("fenced", [True, False])
+def test_a_policy_is_not_evaluated_where_other_masks_bind_it(tmp_path, fenced):
+    settings = {"task.fenced": fenced, "qmix.num_envs": 4, "network.hidden": [8], "evaluation.episodes": 2}
+    train(Gated, "qmix", steps=48, settings=settings, out=tmp_path / "run")
+    trained = loading.load_policy(tmp_path / "run")
+    with pytest.raises(ValueError, match="masks") as caught:
+        loading.transfer(trained, {"fenced": not fenced})
+    assert str(caught.value) == (
+        f"{tmp_path / 'run'} was trained with other masks than the task has with task.fenced changed; change only what "
+        "a policy neither sees nor does"
+    )
+    assert loading.transfer(trained, {"horizon": 3}).spec.masks == fenced, "the control"
