@@ -212,8 +212,8 @@ class Discrete:
 class Continuous:
     """A bounded real action vector per agent.
 
-    Each VECTOR item lives in the unit disc (longer ones are scaled back to length 1, so that every rotation
-    maps the action set to itself); each number of any other kind lives in [-1, 1] (and is clipped).
+    Each item of a kind that is a vector lives in the unit disc or ball (longer ones are scaled back to length 1, so
+    that every rotation maps the action set to itself); each number of any other kind lives in [-1, 1] (and is clipped).
     """
 
     layout: Layout
@@ -227,8 +227,8 @@ class Continuous:
         """Return actions [..., width] as the task takes them: vectors of length 1 at most, other numbers clipped."""
         within = action.clamp(-1.0, 1.0)
         for part, where in zip(self.layout.fields, self.layout.slices().values(), strict=True):
-            if part.kind is Kind.VECTOR:
-                vectors = action[..., where].unflatten(-1, (-1, 2))
+            if part.kind.is_vector:
+                vectors = action[..., where].unflatten(-1, (-1, part.kind.width))
                 within[..., where] = (vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1.0)).flatten(-2)
         return within
 

@@ -93,6 +93,14 @@ def test_actions_beyond_the_bounds_are_taken_as_the_nearest_within() -> None:
     assert torch.allclose(many.admissible(row), torch.tensor([1.0, -1.0, 0.0, 1.0, 0.6, 0.8]))
 
 
+def test_vectors_of_a_kind_of_ones_own_are_bounded_by_their_length() -> None:
+    row = torch.tensor([2.0, -3.0, 6.0, 0.2, 0.3, 0.6])  # lengths 7 and 0.7
+    velocities = Continuous(layout(Field("velocities", Kind("velocity", 3, is_vector=True), 2)))
+    assert torch.allclose(velocities.admissible(row), torch.tensor([2 / 7, -3 / 7, 6 / 7, 0.2, 0.3, 0.6]))
+    numbers = Continuous(layout(Field("numbers", Kind("triple", 3), 2)))
+    assert numbers.admissible(row).tolist() == row.clamp(-1, 1).tolist(), "the control"
+
+
 @pytest.mark.parametrize("method", ["heuristic", "scene", "set_state"])
 def test_what_a_task_lacks_is_said_in_one_sentence(method: str) -> None:
     class Bare(Plain):
