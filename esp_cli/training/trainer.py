@@ -145,6 +145,7 @@ class Trainer:
         Raises:
             ValueError: every seed stopped on a number that is not finite.
         """
+        self._require_a_seed_that_goes_on()
         started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
         tracked = TrackedRun(self.folder.path, self.config.seeds, self.folder.config, self.step)
         sinks = open_trackers(self.track, tracked, self.notes.append)
@@ -161,13 +162,16 @@ class Trainer:
                 if self.is_complete or not going or self.all_stopped or tick > due:
                     cost = self._checkpoint()
                     due = time.monotonic() + max(CHECKPOINT_SECONDS, CHECKPOINT_SPACING * cost)
-                if self.all_stopped:
-                    raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
+                self._require_a_seed_that_goes_on()
                 if not going and not self.is_complete:
                     return False
             # before the trackers are closed: what another program does there must not keep a run from its policy
             self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
         return True
+
+    def _require_a_seed_that_goes_on(self) -> None:
+        if self.all_stopped:
+            raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
 
     def _iterate(self) -> tuple[dict[str, Any], float]:
         """Collect, learn, freeze broken seeds, evaluate where it is time; return metrics and seconds of learning."""

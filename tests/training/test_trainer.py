@@ -133,6 +133,22 @@ def test_a_run_whose_every_seed_breaks_ends_with_a_sentence_and_a_good_checkpoin
     assert all(t.isfinite().all() for name, t in tensors.items() if name.startswith(("policy.", "critic.")))
 
 
+def test_a_run_whose_every_seed_stopped_trains_no_further_when_it_is_resumed(tmp_path):
+    folder = tiny_folder(tmp_path / "run", mappo__learning_rate=1e30, mappo__max_grad_norm=1e30)
+    with pytest.raises(ValueError, match="every seed stopped"):
+        trainer(folder).run(lambda news: True)
+    rows, (tensors, iteration) = read_metrics(folder.metrics_path), final_state(folder)
+    for _ in range(2):
+        resumed = trainer(folder)
+        resumed.learner.iterate = lambda progress: pytest.fail("it trains")
+        with pytest.raises(ValueError, match="every seed stopped"):
+            resumed.run(lambda news: True)
+    assert read_metrics(folder.metrics_path) == rows
+    again, then = final_state(folder)
+    assert then == iteration
+    assert all(same_bits(again[name], tensors[name]) for name in tensors)
+
+
 def test_another_configuration_cannot_continue_a_checkpoint(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(stop_after(2))
