@@ -35,7 +35,9 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
     """One world of a registered task as a `pettingzoo.ParallelEnv`.
 
     Agents are named `agent_0`, `agent_1`, ...; observations are float32 vectors laid out as the task's card says,
-    actions are integers or float32 vectors, `state()` is the global state. Every agent's info holds the task's metrics.
+    actions are integers or float32 vectors, `state()` is the global state. Every agent's info holds the task's metrics,
+    and where the task has masks `action_mask`, its allowed actions [A] int8. An agent that ends before its episode is
+    terminated in that step and is then no more among `agents`.
 
     Args:
         task_name: registered name.
@@ -88,9 +90,9 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         """
         if seed is not None:
             self._env.generators[0].manual_seed(int(seed))
-        self.agents = list(self.possible_agents)
-        observation = self._take(self._env.reset())
-        return observation, {agent: {} for agent in self.agents}
+        seen = self._env.reset()
+        self.agents = self._living(seen, self.possible_agents)
+        return self._take(seen), self._infos(seen, {})
 
     def step(
         self, actions: dict[str, Any]
@@ -100,19 +102,18 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
             return {}, {}, {}, {}, {}
         step = self._env.step(self._joint(actions))
         terminated, truncated = bool(step.terminated[0, 0]), bool(step.truncated[0, 0])
-        ended = terminated or truncated
-        observation = self._take(step.final if ended and step.final is not None else step.next)
-        reward = step.reward[0, 0].tolist()
-        info = {name: float(value[0, 0]) for name, value in step.metrics.items()}
-        agents = self.agents
-        if ended:
-            self.agents = []
+        seen, agents = step.reached, self.agents
+        living = self._living(seen, agents)
+        reward = dict(zip(self.possible_agents, step.reward[0, 0].tolist(), strict=True))
+        observation = self._take(seen)
+        infos = self._infos(seen, {name: float(value[0, 0]) for name, value in step.metrics.items()})
+        self.agents = [] if terminated or truncated else living
         return (
             observation,
-            dict(zip(agents, reward, strict=True)),
-            dict.fromkeys(agents, terminated),
-            dict.fromkeys(agents, truncated),
-            {agent: dict(info) for agent in agents},
+            {agent: reward[agent] for agent in agents},
+            {agent: terminated or agent not in living for agent in agents},
+            {agent: truncated and agent in living for agent in agents},
+            infos,
         )
 
     def state(self) -> _Array:
@@ -137,7 +138,10 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             raise ValueError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
-        joint = np.stack([self._checked(agent, actions[agent]) for agent in self.agents])
+        space = self._env.spec.action
+        idle = np.zeros(space.width, np.float32) if isinstance(space, Continuous) else np.zeros((), np.int64)
+        checked = {agent: self._checked(agent, actions[agent]) for agent in self.agents}
+        joint = np.stack([checked.get(agent, idle) for agent in self.possible_agents])
         return torch.as_tensor(joint).unsqueeze(0).unsqueeze(0)
 
     def _checked(self, agent: str, action: object) -> _Array:
@@ -160,7 +164,25 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         return array.reshape(()).astype(np.int64)
 
     def _take(self, observation: Observation) -> dict[str, _Array]:
-        """Keep the global state and return each agent's observation."""
+        """Keep the global state and return the observation of each agent that acted."""
         self._state = observation.state[0, 0].numpy().copy()
-        rows = observation.obs[0, 0].numpy()
-        return {agent: rows[i].copy() for i, agent in enumerate(self.possible_agents)}
+        return self._by_agent(observation.obs)
+
+    def _infos(self, observation: Observation, metrics: dict[str, float]) -> dict[str, dict[str, Any]]:
+        """Return each agent's metrics and, where there are masks, its allowed actions."""
+        if observation.action_mask is None:
+            return {agent: dict(metrics) for agent in self.agents}
+        masks = self._by_agent(observation.action_mask.to(torch.int8))
+        return {agent: {**metrics, "action_mask": mask} for agent, mask in masks.items()}
+
+    def _by_agent(self, x: torch.Tensor) -> dict[str, _Array]:
+        """Return the row of each agent that acts, of [1, 1, N, ...]."""
+        rows = dict(zip(self.possible_agents, x[0, 0].numpy(), strict=True))
+        return {agent: rows[agent].copy() for agent in self.agents}
+
+    def _living(self, observation: Observation, agents: list[str]) -> list[str]:
+        """Return those of some agents that have not ended."""
+        if observation.alive is None:
+            return list(agents)
+        alive = dict(zip(self.possible_agents, observation.alive[0, 0].tolist(), strict=True))
+        return [agent for agent in agents if alive[agent]]

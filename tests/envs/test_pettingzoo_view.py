@@ -7,11 +7,15 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 pettingzoo_test = pytest.importorskip("pettingzoo.test")
 
-from esp_envs import make, task_class, task_names  # noqa: E402 - the view needs PettingZoo
+from esp_envs import make, register, task_class, task_names  # noqa: E402 - the view needs PettingZoo
 from esp_envs.pettingzoo_view import ParallelView  # noqa: E402
+from esp_envs.registry import TASKS  # noqa: E402
+from tests.fenced import Fenced, Nothing  # noqa: E402
+from tests.leaving import Leaving  # noqa: E402
 
 ACTIONS = [task for task in task_names() if "actions" in task_class(task).Settings.model_fields]
 CASES = [*((task, {}) for task in task_names()), *((task, {"actions": "continuous"}) for task in ACTIONS)]
@@ -49,6 +53,74 @@ def test_the_view_is_the_environment(task: str, settings: dict[str, object]) -> 
     assert view.agents == []
     np.testing.assert_array_equal(view.state(), observation.state[0, 0].numpy())
     assert view.step({}) == ({}, {}, {}, {}, {})
+
+
+@pytest.fixture
+def own(monkeypatch):
+    """Register tasks for one test alone."""
+    monkeypatch.setattr(TASKS, "_registered", {})
+    return register
+
+
+class Away(Leaving):
+    """Agents begin on the left, at the places that a test names, and arrive at x = 1."""
+
+    starts = (0.75, 0.25, -9.0)
+
+    def _start(self, generator):
+        return {"position": torch.tensor([[x, 0.0] for x in self.starts]).expand(self.num_envs, 3, 2)}
+
+
+@pytest.mark.parametrize("task", [Fenced, Nothing, Leaving, Away], ids=lambda task: task.__name__)
+def test_pettingzoos_own_tests_pass_with_masks_and_with_agents_that_end(own, task) -> None:
+    name = own(task)
+    pettingzoo_test.parallel_seed_test(lambda: ParallelView(name, 0), num_cycles=20)
+    if task is Leaving or task is Away:  # the other test takes actions without asking for masks
+        pettingzoo_test.parallel_api_test(ParallelView(name, 0), num_cycles=20)
+
+
+def test_an_agent_that_ends_is_terminated_once_and_then_left_out(own) -> None:
+    """By hand: steps of 0.5 take the first agent to 1 in the first step, the second in the second, the third never."""
+    view = ParallelView(own(Away))
+    view.reset()
+    lives = []
+    while view.agents:
+        acting = list(view.agents)
+        seen, rewards, terminated, truncated, infos = view.step(dict.fromkeys(acting, 1))
+        assert [*seen] == [*rewards] == [*terminated] == [*truncated] == [*infos] == acting
+        lives.append([(rewards[agent], terminated[agent], truncated[agent]) for agent in acting])
+    on, arrives, cut = (-0.1, False, False), (0.9, True, False), (-0.1, False, True)
+    assert lives[0] == [pytest.approx(row) for row in (arrives, on, on)]
+    assert lives[1] == [pytest.approx(row) for row in (arrives, on)]
+    assert lives[2:] == [[pytest.approx(row)] for row in (on, on, on, cut)]
+    assert set(view.reset()[0]) == set(view.possible_agents), "all are back in the next episode"
+
+
+def test_an_agent_that_arrives_with_the_last_step_has_ended_and_the_others_are_cut(own) -> None:
+    view = ParallelView(own(type("Late", (Away,), {"starts": (0.75, -9.0, -9.0)})), horizon=1)
+    view.reset()
+    _, _, terminated, truncated, _ = view.step(dict.fromkeys(view.agents, 1))
+    assert [*terminated.values()] == [True, False, False]
+    assert [*truncated.values()] == [False, True, True]
+    assert view.agents == []
+
+
+def test_infos_hold_the_allowed_actions(own) -> None:
+    name = own(Fenced)
+    view, env = ParallelView(name, 3), make(name, 1, [3])
+    _, infos = view.reset()
+    observation = env.reset()
+    for _ in range(env.spec.horizon):
+        for i, agent in enumerate(view.agents):
+            mask = infos[agent]["action_mask"]
+            assert mask.dtype == np.int8
+            np.testing.assert_array_equal(mask, observation.action_mask[0, 0, i].numpy())
+        joint = {agent: view.action_space(agent).sample(infos[agent]["action_mask"]) for agent in view.agents}
+        *_, infos = view.step(joint)  # the task raises where an action is forbidden
+        step = env.step(torch.tensor([[list(joint.values())]]))
+        observation = step.reached
+    assert "spread" in infos["agent_0"]
+    assert not bool(observation.action_mask.all()), "some are forbidden"
 
 
 def test_resetting_with_a_seed_repeats_the_episode() -> None:
