@@ -10,7 +10,7 @@ import numpy as np
 from esp_cli.symmetry.elements import Element, item_places
 from esp_cli.symmetry.groups import MOST_ITEMS, Group
 from esp_cli.symmetry.parse import Factors, is_item_name, parse_elements
-from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_matrix
+from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_sources
 from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
 DISCOVERED = "discovered:"
@@ -146,8 +146,10 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     if not spaces.is_joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
-        joint_sources(spaces.observation, np.array([moving[0].permutation]))
-        state_matrix(spaces, moving[:1])
+        places = np.array([moving[0].permutation])
+        joint_sources(spaces.observation, places)
+        if not spaces.is_joint:
+            state_sources(spaces.state, places)
     except ValueError as error:
         return str(error)
     return None

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry.elements import Element, Floats, Indices
-from esp_cli.symmetry.representation import rows_matrix, rows_permutation
-from esp_envs.spec import Layout
+from esp_cli.symmetry.representation import rows_matrix, rows_permutation, state_matrix, state_permutation
+from esp_envs.spec import Layout, Spaces
 
 
 @dataclass(frozen=True)
@@ -123,6 +123,27 @@ def rows_map(
     Raises:
         ValueError: the layout cannot be transformed.
     """
-    if any(field.pixels is not None for field in layout.fields):
+    if _holds_pictures(layout):
         return gather(*rows_permutation(layout, elements, num_agents), device)
     return dense(rows_matrix(layout, elements, num_agents), device, dtype)
+
+
+def state_map(
+    spaces: Spaces,
+    elements: tuple[Element, ...],
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+) -> Map:
+    """Return L_g on the global state.
+
+    Raises:
+        ValueError: the state cannot be transformed.
+    """
+    if _holds_pictures(spaces.state):
+        return gather(*state_permutation(spaces, elements), device)
+    return dense(state_matrix(spaces, elements), device, dtype)
+
+
+def _holds_pictures(layout: Layout) -> bool:
+    """Return whether a matrix of a layout's numbers would grow with the square of its pixels."""
+    return any(field.pixels is not None for field in layout.fields)

@@ -73,6 +73,19 @@ def rows_matrix(layout: Layout, elements: Sequence[Element], num_agents: int) ->
     return layout_matrix(layout, elements) if places is None else joint_matrix(layout, elements, places)
 
 
+def layout_permutation(layout: Layout, elements: Sequence[Element]) -> tuple[Indices, Floats]:
+    """Return `layout_matrix` as a signed permutation: source and sign, [G, D] each; see `rows_permutation`."""
+    sources, signs, start = [], [], 0
+    for field in layout.fields:
+        source, sign = _signed_permutations(field, elements)
+        runs = field.width // source.shape[1]
+        first = start + source.shape[1] * np.arange(runs)[:, None]
+        sources.append((source[:, None, :] + first).reshape(len(elements), -1))
+        signs.append(np.tile(sign, (1, runs)))
+        start += field.width
+    return np.concatenate(sources, 1), np.concatenate(signs, 1)
+
+
 def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: int) -> tuple[Indices, Floats]:
     """Return L_g as a signed permutation: the new number k is sign[k] times the old number source[k].
 
@@ -84,28 +97,23 @@ def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: in
     Raises:
         ValueError: an item mixes its numbers, as a vector does under other turns than quarters.
     """
-    sources, signs, start = [], [], 0
-    for field in layout.fields:
-        source, sign = _signed_permutations(field, elements)
-        runs = field.width // source.shape[1]
-        first = start + source.shape[1] * np.arange(runs)[:, None]
-        sources.append((source[:, None, :] + first).reshape(len(elements), -1))
-        signs.append(np.tile(sign, (1, runs)))
-        start += field.width
-    within, sign = np.concatenate(sources, 1), np.concatenate(signs, 1)
+    within, sign = layout_permutation(layout, elements)
     places = places_of(elements, num_agents)
     if places is None:
         return within, sign
     joint = (within[:, None, :] + layout.width * np.arange(num_agents)[:, None]).reshape(len(elements), -1)
-    order = joint_sources(layout, places)
-    joint_sign = np.tile(sign, (1, num_agents))
-    return np.take_along_axis(joint, order, 1), np.take_along_axis(joint_sign, order, 1)
+    return _reordered(joint, np.tile(sign, (1, num_agents)), joint_sources(layout, places))
+
+
+def _reordered(source: Indices, sign: Floats, order: Indices) -> tuple[Indices, Floats]:
+    """Return a signed permutation [G, D] followed by another order of its results."""
+    return np.take_along_axis(source, order, 1), np.take_along_axis(sign, order, 1)
 
 
 def _signed_permutations(field: Field, elements: Sequence[Element]) -> tuple[Indices, Floats]:
     """Return source and sign of each run of d numbers of a field, [G, d] each; see `block_matrix`."""
     if field.parts:
-        source, sign = rows_permutation(Layout(field.parts), [element.in_place for element in elements], 1)
+        source, sign = layout_permutation(Layout(field.parts), [element.in_place for element in elements])
     else:
         gathered = zip(*(element.gather(field) for element in elements), strict=True)
         source, sign = (np.stack(part) for part in gathered)
@@ -133,10 +141,33 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
         return layout_matrix(spaces.state, elements)
     if spaces.is_joint:
         return joint_matrix(spaces.observation, elements, places)
+    order = state_sources(spaces.state, places)
+    return np.take_along_axis(layout_matrix(spaces.state, elements), order[:, :, None], axis=1)
+
+
+def state_permutation(spaces: Spaces, elements: Sequence[Element]) -> tuple[Indices, Floats]:
+    """Return `state_matrix` as a signed permutation: source and sign, [G, Ds] each; see `rows_permutation`."""
+    places = places_of(elements, spaces.num_agents)
+    if places is not None and spaces.is_joint:
+        return rows_permutation(spaces.observation, elements, spaces.num_agents)
+    source, sign = layout_permutation(spaces.state, elements)
+    return (source, sign) if places is None else _reordered(source, sign, state_sources(spaces.state, places))
+
+
+def state_sources(layout: Layout, places: Indices) -> Indices:
+    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents.
+
+    Args:
+        layout: of the state.
+        places: [G, N], places[g, i] = sigma_g(i).
+
+    Raises:
+        ValueError: a field's items cannot follow the agents.
+    """
     came_from = np.argsort(places, axis=1)
     group, num_agents = places.shape
     sources, start = [], 0
-    for field in spaces.state.fields:
+    for field in layout.fields:
         slots = np.broadcast_to(np.arange(field.count), (group, field.count))
         if field.items is Items.AGENTS:
             _require_count(field, num_agents)
@@ -145,8 +176,7 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
             raise ValueError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
         sources.append(start + _numbers(slots, field.item_width))
         start += field.width
-    whole = layout_matrix(spaces.state, elements)
-    return np.take_along_axis(whole, np.concatenate(sources, axis=1)[:, :, None], axis=1)
+    return np.concatenate(sources, axis=1)
 
 
 def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry.elements import Element, places_of
-from esp_cli.symmetry.maps import Gather, Map, dense, gather, rows_map
-from esp_cli.symmetry.representation import action_map, state_matrix
+from esp_cli.symmetry.maps import Gather, Map, gather, rows_map, state_map
+from esp_cli.symmetry.representation import action_map
 from esp_envs.spec import Discrete, Spaces
 
 
@@ -185,7 +185,7 @@ def build_transform(
         elements=chosen,
         agents=None if places is None else gather(places, device=device).inverse(),
         obs_map=rows_map(spaces.observation, chosen, num_agents, device, dtype),
-        state_map=dense(state_matrix(spaces, chosen), device, dtype),
+        state_map=state_map(spaces, chosen, device, dtype),
         output_map=output_map,
         action_index=index,
     )

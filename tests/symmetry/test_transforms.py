@@ -14,7 +14,10 @@ from esp_cli.symmetry import (
     rotation,
     transform_set,
 )
-from tests.symmetry.toy_actions import EVERYTHING, FORCE, WHEELS
+from esp_cli.symmetry.maps import Gather, dense
+from esp_cli.symmetry.representation import state_matrix
+from esp_envs.spec import Field, Items, Kind, Spaces, joint_layout, layout
+from tests.symmetry.toy_actions import EVERYTHING, FORCE, FOUR_DIRECTIONS, WHEELS
 
 ELEMENTS = [rotation(90), mirror(0), rotation(270)]
 MOVING = [
@@ -45,6 +48,47 @@ def test_rows_by_hand(make_spec) -> None:
     turned, mirrored = transform.obs(row)[:, 0, 0]
     assert turned.tolist() == [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0, -5, 4, 8, 9]
     assert mirrored.tolist() == [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1, 4, -5, 8, 9]
+
+
+def seeing(side: int, joint: bool) -> Spaces:
+    """Return spaces of three agents that see a picture; the state holds all that they see, or pictures of its own."""
+    picture = Field("picture", Kind.PICTURE, pixels=(side, side))
+    observation = layout(picture, Field("others", Kind.VECTOR, 2, items=Items.OTHERS))
+    own = layout(
+        Field("positions", Kind.VECTOR, 3, items=Items.AGENTS),
+        Field("map", Kind.PICTURE, pixels=(side, side)),
+        Field("views", Kind.PICTURE, 3, pixels=(side, side), items=Items.AGENTS),
+        Field("rate", Kind.PSEUDOSCALAR),
+    )
+    return Spaces(
+        num_agents=3,
+        observation=observation,
+        state=joint_layout(observation, 3) if joint else own,
+        action=FOUR_DIRECTIONS,
+        symmetry="d4*agents",
+    )
+
+
+@pytest.mark.parametrize("joint", [True, False], ids=["joint", "own"])
+@pytest.mark.parametrize("elements", [ELEMENTS, [*MOVING, rotation(180)]], ids=["plane", "agents"])
+def test_states_with_pictures_are_gathered_and_equal_the_matrix(elements, joint) -> None:
+    spaces = seeing(3, joint)
+    transform = build_transform(elements, spaces)
+    matrix = dense(state_matrix(spaces, elements))
+    state = batch(len(elements), 5, spaces.state.width)
+    assert isinstance(transform.state_map, Gather)
+    assert torch.equal(transform.state(state), matrix.push(state))
+    assert torch.equal(transform.state_map.pull(state), matrix.pull(state))
+    assert not torch.equal(transform.state(state), state), "the control"
+
+
+@pytest.mark.parametrize("joint", [True, False], ids=["joint", "own"])
+def test_states_with_pictures_of_84_by_84_pixels_are_no_matrix_of_their_square(joint) -> None:
+    """The matrices of the 48 elements would take some 86 GB in the joint state, more in the own one."""
+    spaces = seeing(84, joint)
+    *_, last = transform_set("d4*agents", spaces).each()
+    state = batch(1, 1, spaces.state.width)
+    assert torch.equal(last.state_map.pull(last.state(state)), state)
 
 
 @pytest.mark.parametrize("lead", BATCHES, ids=str)
