@@ -213,8 +213,8 @@ class Trainer:
                     f"seed {seed} stopped at step {self.step}: a loss is not finite; its last good policy is kept"
                 )
         if self.stopped_seeds:
-            # Not strict: before the first iteration the optimiser has no moments; weights come first.
-            for tensor, good in zip(self.learner.seed_tensors(), self._good, strict=False):
+            # weights, statistics and moments: the optimiser has these from the start, so there are always as many
+            for tensor, good in zip(self.learner.seed_tensors(), self._good, strict=True):
                 for index in self.stopped_seeds:
                     tensor[index] = good[index]
         self._good = self._snapshot()

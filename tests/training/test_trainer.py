@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -123,6 +124,21 @@ def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path)
     theirs = final_state(whole)[0]["policy.actor.layers.0.weight"]
     assert torch.equal(tensors["policy.actor.layers.0.weight"][0], theirs[0]), "seed 0 never noticed"
     assert not torch.equal(tensors["policy.actor.layers.0.weight"][1], theirs[1])
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_a_seed_that_breaks_in_the_first_iteration_keeps_all_that_it_began_with(tmp_path, algorithm):
+    """Its weights, and the optimiser's moments, which are zeros before the first step."""
+    config = small_config(algorithm)
+    broken = trainer(RunFolder.create(tmp_path / "run", config.model_dump(mode="json")))
+    began = [tensor.clone() for tensor in broken.learner.seed_tensors()]
+    iterate = broken.learner.iterate
+    broken.learner.iterate = lambda progress: replace(iterate(progress), finite=torch.tensor([True, False]))
+    broken.run(stop_after(2))
+    now = broken.learner.seed_tensors()
+    assert len(now) == len(began)
+    assert all(torch.equal(tensor[1], first[1]) for tensor, first in zip(now, began, strict=True))
+    assert not all(torch.equal(tensor[0], first[0]) for tensor, first in zip(now, began, strict=True)), "the control"
 
 
 def test_a_run_whose_every_seed_breaks_ends_with_a_sentence_and_a_good_checkpoint(tmp_path):
