@@ -258,7 +258,11 @@ class Environment(ABC):
         return None
 
     def random_action(self) -> Tensor:
-        """Return a uniformly random joint action among the allowed ones, drawn from each seed's own generator."""
+        """Return a random joint action, drawn from each seed's own generator.
+
+        Allowed discrete actions are equally likely. Numbers of a continuous action are uniform in [-1, 1]. So a vector
+        is uniform in a square, not in the disc: it prefers diagonals, and the task scales back what is longer than 1.
+        """
         shape = self.action_shape[1:]
         mask = self.action_mask()
         if mask is not None:

@@ -34,6 +34,9 @@ _RIDGE = 1e-3
 class Transitions:
     """Steps of a policy that prefers no direction, such as the uniformly random one.
 
+    A vector whose numbers are uniform in [-1, 1] prefers the diagonals. Only quarter turns, and mirrors in the axes or
+    diagonals, keep that preference as it is.
+
     Shape:
         obs, next_obs: [M, T, N, D], M episodes from their starts, T steps of each.
         action: [M, T, N] int64, or [M, T, N, width] float32.

@@ -49,7 +49,7 @@ class PolicyController:
 
 
 class RandomController:
-    """The uniformly random policy: the lower anchor."""
+    """The random policy of `Environment.random_action`: the lower anchor."""
 
     def begin(self, env: Environment, observation: Observation) -> None:
         """Nothing to prepare."""
