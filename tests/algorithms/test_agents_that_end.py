@@ -172,7 +172,7 @@ def test_an_ended_agents_value_enters_qmixs_mixer_as_0():
     trained._total(utilities, batch)
     assert torch.equal(seen[0] == 0, ~batch.alive[:, :, :-1])
     trained.target_policy.unroll = lambda *rows: utilities
-    trained._targets(batch, utilities)
+    trained._targets(batch, utilities, trained._critic_rows(batch))
     assert torch.equal(seen[1] == 0, ~batch.alive[:, :, 1:])
 
 
