@@ -168,11 +168,11 @@ def test_an_ended_agents_value_enters_qmixs_mixer_as_0():
     seen = []
     trained.mixer.forward = lambda chosen, state: seen.append(chosen) or chosen.sum(-1)
     trained.target_mixer.forward = trained.mixer.forward
-    utilities = torch.full((2, 2, 7, 3, 2), 5.0)
-    trained._total(utilities, batch)
+    utilities, rows = torch.full((2, 2, 7, 3, 2), 5.0), trained._critic_rows(batch)
+    trained._total(utilities, batch, rows)
     assert torch.equal(seen[0] == 0, ~batch.alive[:, :, :-1])
     trained.target_policy.unroll = lambda *rows: utilities
-    trained._targets(batch, utilities, trained._critic_rows(batch))
+    trained._targets(batch, utilities, rows)
     assert torch.equal(seen[1] == 0, ~batch.alive[:, :, 1:])
 
 
