@@ -44,7 +44,7 @@ class Outcome:
         seconds: of training, all trials added up.
         best: number of the best trial; None where no trial has a score.
         best_score: of its curve, on the seeds of the trials.
-        default_score: of the default settings, which are trial 0; None where they have no score.
+        default_score: of the default settings, where trial 0 had them; None where the space does not hold them all.
         settings: of the best trial.
     """
 
@@ -107,6 +107,10 @@ class Trials:
                 found[name] = value
         return found
 
+    def _has_defaults(self, prior: str, trial: Any) -> bool:
+        """Return whether a trial has the default settings: where the space lacks one, another value was proposed."""
+        return self.tuning.config(prior, self.settings(prior, trial)) == self.tuning.config(prior, {})
+
     def trial(self, prior: str, number: int) -> Any:
         """Return a trial that was begun, or begin it."""
         study = self.studies[prior]
@@ -156,7 +160,7 @@ class Trials:
             seconds=sum(float(row.get("time/elapsed_s") or 0.0) for row in rows),
             best=None if best is None else best.number,
             best_score=None if best is None else best.value,
-            default_score=next((t.value for t in done if t.number == 0), None),
+            default_score=next((t.value for t in done if t.number == 0 and self._has_defaults(prior, t)), None),
             settings={} if best is None else self.settings(prior, best),
         )
 

@@ -50,6 +50,10 @@ class Dimension(Strict):
             raise ValueError("log needs a low above 0")
         return self
 
+    @property
+    def _is_whole(self) -> bool:
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
     def corners(self) -> tuple[JsonValue, ...]:
         """Return the values that show whether the setting takes all of them: all choices, or both ends.
 
@@ -59,8 +63,8 @@ class Dimension(Strict):
             return self.choices
         assert self.low is not None
         assert self.high is not None
-        whole = isinstance(self.low, int) and isinstance(self.high, int)
-        return (self.low, self.high) if whole else (self.low, self.low + (self.high - self.low) / math.e, self.high)
+        between = () if self._is_whole else (self.low + (self.high - self.low) / math.e,)
+        return (self.low, *between, self.high)
 
     def suggest(self, trial: Any, name: str) -> JsonValue:
         """Return the value that a trial of Optuna tries."""
@@ -74,8 +78,10 @@ class Dimension(Strict):
         """Return a value as a trial of Optuna holds it; None where it is outside of the space."""
         if self.choices is not None:
             return next((json.dumps(choice) for choice in self.choices if choice == value), None)
-        inside = isinstance(value, int | float) and self.low is not None and self.high is not None
-        return value if inside and self.low <= value <= self.high else None  # type: ignore[operator] # inside
+        if not isinstance(value, int | float) or self.low is None or self.high is None:
+            return None
+        fits = value % 1 == 0 or not self._is_whole
+        return value if fits and self.low <= value <= self.high else None
 
 
 Space = Mapping[str, Dimension]

@@ -19,7 +19,7 @@ from esp_cli.studies.tuning import Tuning, TuningFolder
 from esp_cli.studies.tuning_space import Dimension
 from esp_cli.training.config import resolve_config
 from esp_cli.training.config_file import read_config_file
-from tests.studies.test_tuning import tuning
+from tests.studies.test_tuning import SPACE, tuning
 
 
 class CurveEngine:
@@ -250,6 +250,26 @@ def test_the_first_trial_has_the_default_settings_however_a_number_is_written(tm
     assert default in choices
     tuner = search(tmp_path / "t", plan)
     assert tuner.trials.outcome("none").settings == {name: default}
+
+
+@pytest.mark.parametrize(
+    ("tried", "holds"),
+    [
+        (Dimension(choices=(0.5, 0.5)), False),
+        (Dimension(choices=(0.5, 0.95)), True),
+        (Dimension(low=0.9, high=0.99), True),
+        (Dimension(low=0.5, high=0.6), False),
+        (Dimension(low=0, high=1), False),  # whole numbers alone
+    ],
+)
+def test_a_score_is_called_that_of_the_default_settings_only_where_trial_0_had_them(tmp_path, tried, holds):
+    plan = tuning(priors=("none",), budget=2, space=SPACE | {"mappo.gae_lambda": tried})
+    assert plan.config("none", {}).algorithm_settings["gae_lambda"] == 0.95
+    found = search(tmp_path / "t", plan).trials.outcome("none")
+    assert (found.default_score is not None) == holds
+    headings, rows = budget_table([found])
+    assert (rows[0][headings.index("default>")] == "-") != holds
+    assert found.best_score is not None, "the trial has a score all the same"
 
 
 def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budgets(tmp_path):
