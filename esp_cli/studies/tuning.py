@@ -27,6 +27,8 @@ RUNGS = 2
 REDUCTION = 3
 """One of so many trials goes on at each rung, and trains so many times as long."""
 _TRIALS = "trials"
+_GIVEN = ("task", "evaluation")
+"""Sections that no search varies: it would choose the easiest task, or the evaluation that scores highest."""
 NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
 
 
@@ -83,8 +85,8 @@ class Tuning(Strict):
             seeds: of the runs that judge the best settings.
 
         Raises:
-            ValueError: a trial has one of the seeds, a setting of the space is unknown or refuses a value, or the goal
-                lacks its return.
+            ValueError: a trial has one of the seeds, a setting of the space is unknown, refuses a value or is not the
+                learner's, or the goal lacks its return.
         """
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
@@ -94,6 +96,12 @@ class Tuning(Strict):
             raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise ValueError("a tuning takes the kinds of prior by --prior, not by --set or --space")
+        for name in self.space:
+            if name.partition(".")[0] in _GIVEN:
+                raise ValueError(
+                    f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
+                    f"--set {name}=VALUE"
+                )
         for prior in self.priors:
             for name, dimension in space_of(self.space, prior).items():
                 if name in self.overrides:

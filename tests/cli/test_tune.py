@@ -99,16 +99,20 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
 
 
 @pytest.mark.usefixtures("forked_jobs")
-def test_a_setting_of_the_task_is_searched_by_its_name_and_auto_is_a_prior_as_any(
+def test_a_setting_of_the_task_is_refused_by_its_name_and_auto_is_a_prior_as_any(
     command: list[object], tmp_path: Path
 ) -> None:
-    (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.kind": ["none"]}))
+    (tmp_path / "space.json").write_text(json.dumps({"mappo.gamma": [0.9, 0.99], "prior.kind": ["none"]}))
     assert "takes the kinds of prior by --prior" in refused(*command, "--steps", 100)
     (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.doubt": [4.0, 8.0]}))
+    assert "the space varies 'task.wind'" in refused(*command, "--steps", 100)
+    assert not (tmp_path / "t").exists()
+    (tmp_path / "space.json").write_text(json.dumps({"mappo.gamma": [0.9, 0.99], "prior.doubt": [4.0, 8.0]}))
+    command += ["--set", "navigation.wind=0.3"]
     once = ["--budget", 1, "--steps", 100, "--trial-seeds", 1, "--seeds", 1, "--episodes", 4, "--jobs", 1]
     esp(*command, *once, "--prior", "auto,none")
     outcomes = json.loads((tmp_path / "t" / "report" / "tuning.json").read_text())["outcomes"]
-    assert [set(one["settings"]) for one in outcomes] == [{"task.wind", "prior.doubt"}, {"task.wind"}]
+    assert [set(one["settings"]) for one in outcomes] == [{"mappo.gamma", "prior.doubt"}, {"mappo.gamma"}]
     study = StudyFolder.open(tmp_path / "t" / "fresh").study
     assert [cell.variant for cell in study.cells] == ["plain, default", "auto, default"]
     tuned = json.loads(esp("train", "--config", tmp_path / "t" / "preset-auto.json", "--print-config").stdout)

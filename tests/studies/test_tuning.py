@@ -86,6 +86,11 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
     [
         ({"space": {"mappo.colour": Dimension(choices=(1, 2))}}, "mappo.colour"),
         ({"space": {"mappo.gamma": Dimension(low=0.5, high=2.0)}}, "mappo.gamma"),
+        (
+            {"space": {"task.num_agents": Dimension(choices=(2, 3))}},
+            "varies 'task.num_agents', and then trials are not",
+        ),
+        ({"space": {"evaluation.episodes": Dimension(low=1, high=9)}}, "fix it by --set evaluation.episodes=VALUE"),
         ({"overrides": {"mappo.gamma": 0.9}}, "--set mappo.gamma fixes what the space varies"),
         ({"goal": "steps"}, "--for steps needs --reach RETURN"),
         ({"reach": -100.0}, "--for return takes no --reach"),
@@ -94,6 +99,10 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
 def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         tuning(**changes).check((0, 1))
+
+
+def test_a_setting_of_the_task_may_be_fixed_though_none_is_searched():
+    tuning(overrides={"task.num_agents": 2, "evaluation.episodes": 2}).check((0, 1))
 
 
 def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
