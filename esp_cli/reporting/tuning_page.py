@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -90,6 +91,7 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     lines = [f"# {trials.folder.study.title}", "", budget_sentence(tuning), "", f"`{tuning.command}`", ""]
     lines += ["## Budgets and scores", "", *markdown_rows(*budget_table(outcomes))]
     lines += ["", "## Best settings", "", *markdown_rows(*settings_table(outcomes))]
+    lines += _refused_lines(outcomes)
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` judges them on others."]
     for prior, study in trials.studies.items():
         for name, title in _draw(study, out, prior):
@@ -97,6 +99,16 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     page = out / "tuning.md"
     replace_file(page, ("\n".join(lines) + "\n").encode())
     return page
+
+
+def _refused_lines(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield how many of the pruned trials were refused, and why, the most frequent reason first."""
+    for found in outcomes:
+        if found.refused:
+            count = len(found.refused)
+            trials = "1 of the pruned trials was" if count == 1 else f"{count} of the pruned trials were"
+            yield from ("", f"{NAMES[found.prior]}: {trials} refused, as the settings do not go together:", "")
+            yield from (f"- {times} x {reason}" for reason, times in Counter(found.refused).most_common())
 
 
 def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
 from esp_cli.studies.tuning_space import Dimension, space_of
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import MetricsError, column, read_metrics
@@ -86,7 +88,7 @@ class Tuning(Strict):
 
         Raises:
             ValueError: a trial has one of the seeds, a setting of the space is unknown, refuses a value or is not the
-                learner's, or the goal lacks its return.
+                learner's, a choice cannot be trained, or the goal lacks its return.
         """
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
@@ -108,6 +110,37 @@ class Tuning(Strict):
                     raise ValueError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
                 for value in dimension.corners():
                     self.config(prior, {name: value})
+        for prior in self.priors:
+            self._check_choices(prior)
+
+    def _check_choices(self, prior: str) -> None:
+        """Refuse a choice with which nothing can be trained, before trials are spent on it.
+
+        All else is at its default. A choice may need another value of one other setting of the space, such as 64
+        minibatches with 64 worlds; then it is left to the search.
+
+        Raises:
+            ValueError: there is such a choice.
+        """
+        space = space_of(self.space, prior)
+        for name, dimension in space.items():
+            for value in dimension.choices or ():
+                reason = self._refusal(prior, {name: value})
+                others = (
+                    {other: corner} for other, tried in space.items() if other != name for corner in tried.corners()
+                )
+                if reason and all(self._refusal(prior, {name: value, **other}) for other in others):
+                    raise ValueError(
+                        f"the space tries {json.dumps(value)} for '{name}', which cannot be trained: {reason}"
+                    )
+
+    def _refusal(self, prior: str, settings: Mapping[str, object]) -> str:
+        """Return why no learner can be built with these settings, or nothing where it can."""
+        try:
+            build_learner(self.config(prior, settings).of_one_seed())
+        except ValueError as error:
+            return str(error)
+        return ""
 
 
 TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyError)

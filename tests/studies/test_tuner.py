@@ -213,6 +213,12 @@ def test_settings_that_only_building_the_learner_refuses_end_their_trial(tmp_pat
     assert all("num_minibatches" in reason for reason in found.refused)
     assert 0 < len(found.refused) == 6 - len(engine.started)
     assert found.completed + found.pruned == 6
+    page = write_page(tuner.trials, [found], tmp_path / "t" / "report").read_text()
+    assert f"plain: {len(found.refused)} of the pruned trials were refused, as the settings do not go" in page
+    assert f"- {len(found.refused)} x {found.refused[0]}" in page
+    whole = search(tmp_path / "u", tuning(priors=("none",), budget=1))
+    outcome = whole.trials.outcome("none")
+    assert "refused" not in write_page(whole.trials, [outcome], tmp_path / "u" / "report").read_text()
 
 
 def test_a_trial_that_has_all_its_steps_is_complete_whenever_it_is_looked_at(tmp_path):

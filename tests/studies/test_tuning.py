@@ -16,6 +16,7 @@ from esp_cli.studies.tuning_space import Dimension, default_space, read_space, s
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
+UNFIXED = {name: value for name, value in TINY.items() if name not in ("mappo.num_envs", "mappo.num_minibatches")}
 
 
 def tuning(**changes) -> Tuning:
@@ -99,6 +100,31 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
 def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
         tuning(**changes).check((0, 1))
+
+
+@pytest.mark.parametrize(
+    ("space", "sentence"),
+    [
+        ({"prior.transforms": Dimension(choices=("c4", "zz"))}, "tries \"zz\" for 'prior.transforms', which cannot be"),
+        ({"mappo.num_minibatches": Dimension(choices=(1, 9999))}, "tries 9999 for 'mappo.num_minibatches'"),
+    ],
+)
+def test_a_choice_that_cannot_be_trained_is_refused_before_trials_are_spent_on_it(space, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        tuning(overrides=UNFIXED, space=SPACE | space).check((0, 1))
+    name, wrong = next(iter(space.items()))
+    tuning(overrides=UNFIXED, space=SPACE | {name: Dimension(choices=wrong.choices[:1])}).check((0, 1))
+
+
+def test_a_choice_that_goes_with_another_setting_of_the_space_is_left_to_the_search():
+    many = {"mappo.num_minibatches": Dimension(choices=(1, 64))}
+    with pytest.raises(ValueError, match=r"tries 64 for 'mappo\.num_minibatches'"):
+        tuning(overrides=UNFIXED | {"mappo.num_envs": 2}, space=many).check((0, 1))
+    tuning(overrides=UNFIXED, space=many | {"mappo.num_envs": Dimension(choices=(2, 64))}).check((0, 1))
+
+
+def test_a_choice_of_the_prior_is_not_asked_of_the_plain_learner():
+    tuning(priors=("none",), space=SPACE | {"prior.transforms": Dimension(choices=("c4", "zz"))}).check((0, 1))
 
 
 def test_a_setting_of_the_task_may_be_fixed_though_none_is_searched():
