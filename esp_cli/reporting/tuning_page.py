@@ -24,8 +24,8 @@ from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
 Rows = list[tuple[str, ...]]
 _MEANING = {
     "return": "mean of the last three greedy evaluations",
-    "steps": "environment steps to the return, as a negative number",
-    "seconds": "seconds of training to the return, as a negative number",
+    "steps": "environment steps to the return {reach:g}, as a negative number",
+    "seconds": "seconds of training to the return {reach:g}, as a negative number",
 }
 
 
@@ -61,7 +61,6 @@ def budget_sentence(tuning: Tuning) -> str:
     """Say what budget each prior has, and what a score is."""
     each = " each" if len(tuning.priors) > 1 else ""
     seeds = f"{len(tuning.trial_seeds)} seed{'s' if len(tuning.trial_seeds) > 1 else ''}"
-    reach = "" if tuning.reach is None else f" {tuning.reach:g}"
     looks = f"looks {RUNGS} times before the end"
     if tuning.goal == "seconds":
         looks = "compares trials after equal seconds, once the first has come to its end"
@@ -69,7 +68,7 @@ def budget_sentence(tuning: Tuning) -> str:
         f"Budget: {tuning.budget} trials{each} of {seeds} and at most "
         f"{format_count(tuning.steps)} steps per seed; successive halving {looks}, and "
         f"one of {REDUCTION} trials goes on. Trial 0 has the default settings, as far as the space holds "
-        f"them. Score: {_MEANING[tuning.goal]}{reach}."
+        f"them. Score: {_MEANING[tuning.goal].format(reach=tuning.reach)}."
     )
 
 

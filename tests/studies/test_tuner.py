@@ -173,6 +173,13 @@ def test_a_trial_ends_when_it_reaches_the_return(tmp_path):
     assert search(tmp_path / "u", plan.model_copy(update={"reach": 1e6})).trials.outcome("none").best is None
 
 
+def test_the_return_to_come_to_stands_beside_the_word_and_a_score_at_the_end_names_none():
+    steps = budget_sentence(tuning(goal="steps", reach=-250.0))
+    assert steps.endswith("Score: environment steps to the return -250, as a negative number.")
+    assert "seconds of training to the return -40.5, as a" in budget_sentence(tuning(goal="seconds", reach=-40.5))
+    assert budget_sentence(tuning()).endswith("Score: mean of the last three greedy evaluations.")
+
+
 def test_a_broken_trial_is_never_the_best_and_a_failed_one_is_tried_again_with_its_settings(tmp_path):
     plan = tuning(priors=("none",), budget=3)
     tuner = search(tmp_path / "t", plan, CurveEngine(fails="none-001", breaks="none-002"))
