@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import JsonValue, field_validator, model_validator
 
 from esp_cli.files.documents import Strict, parse_value
+from esp_cli.files.suggesting import did_you_mean
 from esp_cli.files.tables import flat, read_table
 from esp_cli.prior.config import of_no_use_to
 from esp_cli.training.config import validated
@@ -151,8 +152,12 @@ def read_space(path: Path) -> Space:
         ValueError: it is damaged, or says nothing.
     """
     fields: dict[str, dict[str, object]] = {}
-    for dotted, value in flat(read_table(path)):
+    found = dict(flat(read_table(path)))
+    for dotted, value in found.items():
         name, _, last = dotted.rpartition(".")
+        if last not in Dimension.model_fields and found.keys() & {f"{name}.low", f"{name}.high"}:
+            hint = did_you_mean(last, Dimension.model_fields) or "; write low, high and log"
+            raise ValueError(f"{path} says '{last}' of the range '{name}'{hint}")
         if last in Dimension.model_fields and name:
             fields.setdefault(name, {})[last] = value
         elif isinstance(value, list):
