@@ -9,7 +9,7 @@ from torch import Tensor
 
 from esp_cli.networks.policy import Policy
 from esp_cli.training.checkpoint import CheckpointError
-from esp_cli.training.config import InitialPolicy
+from esp_cli.training.config import InitialPolicy, RunConfig
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.policy_file import read_policy
 from esp_envs.policy_format import digest
@@ -27,21 +27,29 @@ def fitted(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:
     Raises:
         ValueError: numbers of seeds, names or shapes differ.
     """
-    seeds, others = policy.num_seeds, len(trained.config.seeds)
+    return _fitted(policy, trained.policy.state_dict(), trained.config, trained.source)
+
+
+def _fitted(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, source: Path) -> dict[str, Tensor]:
+    """Return weights [S', ...] of the policy of a configuration for the S seeds of a new one; see `fitted`."""
+    seeds, others = policy.num_seeds, len(next(iter(theirs.values())))
     if others not in (1, seeds):
         raise ValueError(
-            f"cannot start {seeds} seed(s) from {trained.source}, which holds {others}; "
+            f"cannot start {seeds} seed(s) from {source}, which holds {others}; "
             f"train {others} seeds, or start from a policy of one seed"
         )
-    own, theirs = policy.state_dict(), trained.policy.state_dict()
-    for name in sorted(own.keys() | theirs.keys()):
-        shapes = [tuple(found[name].shape[1:]) if name in found else None for found in (own, theirs)]
-        if shapes[0] != shapes[1]:
-            here, there = ("no such weights" if shape is None else f"{list(shape)}" for shape in shapes)
+    own = policy.state_dict()
+    # names before shapes: those that differ are of another algorithm or network
+    for name in sorted(own.keys() | theirs.keys(), key=lambda name: (name in own and name in theirs, name)):
+        here, there = (list(found[name].shape[1:]) if name in found else None for found in (own, theirs))
+        if here != there:
+            of_it = f"'{name}' is {'missing' if there is None else there} there"
+            of_this = "missing" if here is None else here
+            algorithm = "the algorithm, " if here is None or there is None else ""
             raise ValueError(
-                f"cannot start from {trained.source}: its policy is of {trained.config.task} with the network "
-                f"{trained.config.network.name}, and '{name}' is {there} in it but {here} in this run; "
-                "choose the task settings and the network of that policy"
+                f"cannot start from {source}: it is a policy of {config.algorithm} on {config.task} with the network "
+                f"{config.network.name}, and {of_it} but {of_this} in this run; "
+                f"choose {algorithm}the task settings and the network of that policy"
             )
     return {name: tensor.cpu().expand(seeds, *tensor.shape[1:]).contiguous() for name, tensor in theirs.items()}
 
