@@ -117,6 +117,7 @@ def train(
     from esp_cli.library.run import Run, begin, plan
     from esp_cli.trackers import require
     from esp_cli.training.config import resolve_config
+    from esp_cli.training.initial import OwnCopy
     from esp_cli.training.run_folder import RUN_FORMAT
 
     if tensorboard:
@@ -151,8 +152,12 @@ def train(
     if config is not None:
         choices, overrides, said = with_file(context, config, choices, overrides)
     init_from = choices.pop("init_from")
+    kept = init_from if isinstance(init_from, OwnCopy) else None
     idle = sorted(said & resolve_config(**choices | {"device": "cpu"}, overrides=overrides).without_effect())
+    init_from = None if kept else init_from
     resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
+    if kept is not None:
+        resolved, weights = kept.start(resolved)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return

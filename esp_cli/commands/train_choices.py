@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 from esp_cli.commands.options import Device, was_given
+
+if TYPE_CHECKING:
+    from esp_cli.training.config import RunConfig
+    from esp_cli.training.initial import OwnCopy
 
 _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""
@@ -31,7 +35,6 @@ def with_file(
     Raises:
         ValueError: the file cannot be read, or does not go with what was given.
     """
-    from esp_cli.deploy.bundled import open_policy
     from esp_cli.prior.config import SAID_BY_AUTO
     from esp_cli.training.config_file import read_config_file
 
@@ -47,18 +50,35 @@ def with_file(
                     "or name a file with only what differs"
                 )
     filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in said}
-    if file.is_complete and (source := filled.get("init_from")) is not None:
-        try:
-            open_policy(Path(source))
-        except ValueError:
-            raise ValueError(
-                f"the run of {path} started from the policy {source}, which cannot be read here; add --init-from POLICY"
-            ) from None
+    if file.config is not None and "init_from" in filled:
+        filled["init_from"] = _start_of(path, file.config, filled["init_from"])
     kept = file.settings
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
     chosen = set(settings) if file.is_complete else {*kept, *settings}
     return given | filled, kept | settings, chosen
+
+
+def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
+    """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same.
+
+    Raises:
+        ValueError: there is neither.
+    """
+    from esp_cli.deploy.bundled import open_policy
+    from esp_cli.training.initial import OwnCopy, is_start_of
+
+    if path.is_dir() and (own := OwnCopy.find(path, config)) is not None:
+        return own
+    started = f"the run of {path} started from the policy {source}"
+    try:
+        trained = open_policy(Path(source))
+    except ValueError:
+        raise ValueError(f"{started}, which cannot be read here; add --init-from POLICY") from None
+    if not is_start_of(trained, config):
+        folder = "" if path.is_dir() else ", or name the folder of the run, which holds a copy"
+        raise ValueError(f"{started}, which holds other weights now; add --init-from POLICY{folder}")
+    return source
 
 
 def _read(path: Path, name: str, value: Any) -> Any:

@@ -24,13 +24,18 @@ class ConfigFile:
         path: of the file.
         choices: of `CHOICES`, those that it names; numbers of steps and seeds may be text, as 500k.
         settings: dotted names to values, as `--set` takes them.
-        is_complete: whether it is the configuration of a run, and so says everything.
+        config: of the run, where it is one, and so says everything.
     """
 
     path: Path
     choices: dict[str, Any]
     settings: dict[str, Any]
-    is_complete: bool
+    config: RunConfig | None = None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether it is the configuration of a run, and so says everything."""
+        return self.config is not None
 
 
 def read_config_file(path: Path) -> ConfigFile:
@@ -60,7 +65,7 @@ def read_config_file(path: Path) -> ConfigFile:
         else:
             hint = did_you_mean(name, CHOICES) or f"; write one of {', '.join(CHOICES)}, or a setting as SECTION.NAME"
             raise ValueError(f"{path} sets '{name}', which is not a choice of a run{hint}")
-    return ConfigFile(path, choices, settings, is_complete=False)
+    return ConfigFile(path, choices, settings)
 
 
 def _of_run(path: Path, config: RunConfig) -> ConfigFile:
@@ -71,4 +76,4 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
         choices["init_from"] = config.init_from.source
     sections = {config.algorithm: "algorithm_settings"} | SECTIONS
     settings = {f"{section}.{name}": value for section, key in sections.items() for name, value in stored[key].items()}
-    return ConfigFile(path, choices, settings, is_complete=True)
+    return ConfigFile(path, choices, settings, config)

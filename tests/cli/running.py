@@ -49,6 +49,17 @@ def train_tiny(out: Path, *options: object, steps: object = 150) -> Path:
     return out
 
 
+def printed(*options: object) -> dict[str, Any]:
+    """Return the configuration that a command line resolves to."""
+    return json.loads(esp("train", "--print-config", *options).stdout)
+
+
+def written(path: Path, content: object) -> Path:
+    """Write a file, content that is no text as JSON, and return its path."""
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
 def edit_config(run: Path, **changes: Any) -> Path:
     """Change a run's configuration by hand and return its folder."""
     file = run / "config.json"

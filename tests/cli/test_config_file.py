@@ -1,32 +1,16 @@
-"""`esp train` with `--config`, `--print-config` and `--init-from`: what files say, and what wins."""
+"""`esp train` with `--config` and `--print-config`: what files say, and what wins."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
 
-from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import RunConfig
-from esp_cli.training.config_file import read_config_file
 from esp_cli.training.loading import parse_config
-from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
-from esp_envs.policy_format import POLICY_FORMAT
-from tests.cli.running import STEPS, TINY_OPTIONS, esp, refused, train_tiny
-
-
-def printed(*options: object) -> dict[str, Any]:
-    """Return the configuration that a command line resolves to."""
-    return json.loads(esp("train", "--print-config", *options).stdout)
-
-
-def written(path: Path, content: object) -> Path:
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return path
+from esp_cli.training.run_folder import RUN_FORMAT
+from tests.cli.running import printed, refused, written
 
 
 def test_a_run_is_configured_again_from_its_folder_and_from_its_file(finished: Path) -> None:
@@ -174,72 +158,6 @@ def test_a_name_that_is_near_to_nothing_gets_the_list() -> None:
     sentence = refused("train", "--print-config", "--set", "prior.colour=1")
     assert "did you mean" not in sentence
     assert "prior has kind, transforms" in sentence
-
-
-def policy_of(run: Path) -> dict[str, torch.Tensor]:
-    return load_checkpoint(run / "policy.safetensors", format_name=POLICY_FORMAT)[0]
-
-
-@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
-def test_a_run_starts_from_another_policy(tmp_path: Path, algorithm: str) -> None:
-    small = ["--algo", algorithm, "--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", "200"]
-    esp("train", *small, "--out", tmp_path / "first", "--set", f"{algorithm}.num_envs=2")
-    rest = ["--seed-list", "3,7", "--set", f"{algorithm}.learning_rate=1e-9", "--set", f"{algorithm}.num_envs=2"]
-    rest += ["--set", f"{algorithm}.actor_learning_rate=1e-9"] if algorithm == "maddpg" else []
-    esp("train", *small, *rest, "--out", tmp_path / "second", "--init-from", tmp_path / "first")
-    first, second = policy_of(tmp_path / "first"), policy_of(tmp_path / "second")
-    for name, tensor in second.items():
-        assert torch.allclose(tensor, first[name].expand_as(tensor), atol=1e-6), "it hardly learned since"
-    esp("train", *small, *rest, "--out", tmp_path / "third")
-    assert any(not torch.allclose(t, second[n], atol=1e-3) for n, t in policy_of(tmp_path / "third").items())
-    config = parse_config(RunFolder.open(tmp_path / "second").config, tmp_path)
-    assert config.init_from is not None
-    assert config.init_from.source == str(tmp_path / "first")
-    assert f"--init-from {tmp_path / 'first'}" in config.command()
-
-
-def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, copied: Path, tmp_path: Path) -> None:
-    options = [*TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--init-from"]
-    esp("train", *options, finished, "--out", tmp_path / "whole")
-    esp("train", *options, copied / "policy.safetensors", "--out", tmp_path / "cut")
-    for file in [*(tmp_path / "cut" / "checkpoints").iterdir(), copied / "policy.safetensors"]:
-        file.unlink()  # as if killed before the first checkpoint, and the other policy is gone
-    (tmp_path / "cut" / "policy.safetensors").unlink()
-    esp("train", "--resume", tmp_path / "cut")
-    weights = [policy_of(tmp_path / name) for name in ("whole", "cut")]
-    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
-    initial = tmp_path / "cut" / "initial-policy.safetensors"
-    initial.write_bytes((tmp_path / "whole" / "policy.safetensors").read_bytes())
-    for file in (tmp_path / "cut" / "checkpoints").iterdir():
-        file.unlink()
-    assert "does not hold the policy that the run started from" in refused("train", "--resume", tmp_path / "cut")
-
-
-def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finished: Path, tmp_path: Path) -> None:
-    out = ["--out", tmp_path / "run", "--init-from"]
-    wider = refused("train", "--seeds", 2, "--set", "network.hidden=[9]", *out, finished)
-    assert "is [1, 8] there but [1, 9] in this run; choose the task settings and the network" in wider
-    other = refused("train", "--algo", "qmix", "--set", "network.hidden=[9]", "--seeds", 2, *out, finished)
-    assert "it is a policy of mappo on navigation with the network mlp, and 'head.epsilon' is missing there" in other
-    assert other.endswith("choose the algorithm, the task settings and the network of that policy")
-    seeds = refused("train", *TINY_OPTIONS, "--seeds", 3, *out, finished)
-    assert seeds.endswith("which holds 2; train 2 seeds, or start from a policy of one seed")
-    assert "does not exist" in refused("train", *TINY_OPTIONS, *out, tmp_path / "nothing")
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp_path: Path) -> None:
-    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", finished, steps=50)
-    assert read_config_file(run).choices["init_from"] == str(finished)
-    assert printed("--config", run) == json.loads((run / "config.json").read_text())
-
-
-def test_a_configuration_names_the_policy_that_it_started_from_where_that_is_gone(copied: Path, tmp_path: Path) -> None:
-    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
-    shutil.rmtree(copied)
-    assert refused("train", "--config", run, "--print-config") == (
-        f"the run of {run} started from the policy {copied}, which cannot be read here; add --init-from POLICY"
-    )
 
 
 def test_a_configuration_without_the_new_key_is_read_as_before(finished: Path) -> None:

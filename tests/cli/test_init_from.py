@@ -1,0 +1,136 @@
+"""`esp train --init-from`, and `--config` of runs that started from a policy: which weights, and what does not fit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.config_file import read_config_file
+from esp_cli.training.loading import parse_config
+from esp_cli.training.run_folder import RunFolder
+from esp_envs.policy_format import POLICY_FORMAT
+from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, train_tiny, written
+
+
+def initial_of(run: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(run / "initial-policy.safetensors", format_name=POLICY_FORMAT)[0]
+
+
+def policy_of(run: Path) -> dict[str, torch.Tensor]:
+    return load_checkpoint(run / "policy.safetensors", format_name=POLICY_FORMAT)[0]
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_a_run_starts_from_another_policy(tmp_path: Path, algorithm: str) -> None:
+    small = ["--algo", algorithm, "--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", "200"]
+    esp("train", *small, "--out", tmp_path / "first", "--set", f"{algorithm}.num_envs=2")
+    rest = ["--seed-list", "3,7", "--set", f"{algorithm}.learning_rate=1e-9", "--set", f"{algorithm}.num_envs=2"]
+    rest += ["--set", f"{algorithm}.actor_learning_rate=1e-9"] if algorithm == "maddpg" else []
+    esp("train", *small, *rest, "--out", tmp_path / "second", "--init-from", tmp_path / "first")
+    first, second = policy_of(tmp_path / "first"), policy_of(tmp_path / "second")
+    for name, tensor in second.items():
+        assert torch.allclose(tensor, first[name].expand_as(tensor), atol=1e-6), "it hardly learned since"
+    esp("train", *small, *rest, "--out", tmp_path / "third")
+    assert any(not torch.allclose(t, second[n], atol=1e-3) for n, t in policy_of(tmp_path / "third").items())
+    config = parse_config(RunFolder.open(tmp_path / "second").config, tmp_path)
+    assert config.init_from is not None
+    assert config.init_from.source == str(tmp_path / "first")
+    assert f"--init-from {tmp_path / 'first'}" in config.command()
+
+
+def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, copied: Path, tmp_path: Path) -> None:
+    options = [*TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--init-from"]
+    esp("train", *options, finished, "--out", tmp_path / "whole")
+    esp("train", *options, copied / "policy.safetensors", "--out", tmp_path / "cut")
+    for file in [*(tmp_path / "cut" / "checkpoints").iterdir(), copied / "policy.safetensors"]:
+        file.unlink()  # as if killed before the first checkpoint, and the other policy is gone
+    (tmp_path / "cut" / "policy.safetensors").unlink()
+    esp("train", "--resume", tmp_path / "cut")
+    weights = [policy_of(tmp_path / name) for name in ("whole", "cut")]
+    assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
+    initial = tmp_path / "cut" / "initial-policy.safetensors"
+    initial.write_bytes((tmp_path / "whole" / "policy.safetensors").read_bytes())
+    for file in (tmp_path / "cut" / "checkpoints").iterdir():
+        file.unlink()
+    assert "does not hold the policy that the run started from" in refused("train", "--resume", tmp_path / "cut")
+
+
+def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finished: Path, tmp_path: Path) -> None:
+    out = ["--out", tmp_path / "run", "--init-from"]
+    wider = refused("train", "--seeds", 2, "--set", "network.hidden=[9]", *out, finished)
+    assert "is [1, 8] there but [1, 9] in this run; choose the task settings and the network" in wider
+    other = refused("train", "--algo", "qmix", "--set", "network.hidden=[9]", "--seeds", 2, *out, finished)
+    assert "it is a policy of mappo on navigation with the network mlp, and 'head.epsilon' is missing there" in other
+    assert other.endswith("choose the algorithm, the task settings and the network of that policy")
+    seeds = refused("train", *TINY_OPTIONS, "--seeds", 3, *out, finished)
+    assert seeds.endswith("which holds 2; train 2 seeds, or start from a policy of one seed")
+    assert "does not exist" in refused("train", *TINY_OPTIONS, *out, tmp_path / "nothing")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp_path: Path) -> None:
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", finished, steps=50)
+    assert read_config_file(run).choices["init_from"] == str(finished)
+    assert printed("--config", run) == json.loads((run / "config.json").read_text())
+
+
+def other_than(run: Path) -> None:
+    """Train another policy into the folder of a run."""
+    shutil.rmtree(run)
+    train_tiny(run, "--seed-list", "3,7", "--set", "mappo.learning_rate=0.05")
+
+
+def test_a_run_is_started_again_from_its_own_copy_whatever_became_of_the_policy(copied: Path, tmp_path: Path) -> None:
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
+    stored, weights = json.loads((run / "config.json").read_text()), initial_of(run)
+    for change in (other_than, shutil.rmtree):
+        change(copied)
+        assert printed("--config", run) == stored
+        again = tmp_path / change.__name__
+        esp("train", "--config", run, "--out", again)
+        assert all(torch.equal(tensor, weights[name]) for name, tensor in initial_of(again).items())
+        assert json.loads((again / "config.json").read_text()) == stored
+    assert "cannot start 3 seed(s)" in refused("train", "--config", run, "--seeds", 3, "--out", tmp_path / "more")
+    assert "is [1, 8] there but [1, 9] in" in refused("train", "--config", run, "--set", "network.hidden=[9]")
+
+
+def test_the_copy_of_one_policy_starts_any_number_of_seeds(tmp_path: Path) -> None:
+    one = train_tiny(tmp_path / "one", steps=50)
+    run = train_tiny(tmp_path / "run", "--seeds", 2, "--init-from", one, steps=50)
+    shutil.rmtree(one)
+    esp("train", "--config", run, "--seeds", 3, "--out", tmp_path / "more")
+    weights, more = initial_of(run), initial_of(tmp_path / "more")
+    assert all(torch.equal(tensor, weights[name][:1].expand(3, *tensor.shape[1:])) for name, tensor in more.items())
+
+
+def test_without_a_copy_the_policy_has_to_be_the_one_that_the_run_started_from(copied: Path, tmp_path: Path) -> None:
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
+    bare = written(tmp_path / "bare.json", (run / "config.json").read_text())
+    (run / "initial-policy.safetensors").unlink()
+    for where in (bare, run):
+        assert printed("--config", where) == json.loads(bare.read_text())
+    other_than(copied)
+    started = f"started from the policy {copied}, which"
+    sentence = refused("train", "--config", bare, "--print-config")
+    assert sentence.startswith(f"the run of {bare} {started} holds other weights now; add --init-from POLICY, or name")
+    assert refused("train", "--config", run, "--print-config").endswith("other weights now; add --init-from POLICY")
+    own = printed("--config", bare, "--init-from", copied)["init_from"]
+    assert own["source"] == str(copied)
+    assert own["sha256"] != json.loads(bare.read_text())["init_from"]["sha256"]
+    shutil.rmtree(copied)
+    for where in (bare, run):
+        assert refused("train", "--config", where, "--print-config") == (
+            f"the run of {where} {started} cannot be read here; add --init-from POLICY"
+        )
+
+
+def test_a_policy_of_another_algorithm_starts_a_run_where_it_fits(tmp_path: Path) -> None:
+    small = ["--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", 100]
+    esp("train", "--algo", "maddpg", *small, "--set", "maddpg.num_envs=2", "--out", tmp_path / "first")
+    found = printed("--algo", "qmix", *small, "--init-from", tmp_path / "first")
+    assert found["init_from"]["source"] == str(tmp_path / "first")
