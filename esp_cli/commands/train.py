@@ -131,6 +131,7 @@ def train(
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
         _train(Run(resume), trackers)
         return
+    require(trackers)
     short = {
         "prior.kind": prior,
         "prior.transforms": transforms,
@@ -163,7 +164,6 @@ def train(
         return
     if idle:
         console.note(f"without effect beside the other settings: {', '.join(idle)}")
-    require(trackers)
     _train(begin(resolved, weights, out), trackers)
 
 

@@ -52,6 +52,11 @@ def test_printing_makes_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_tracker_that_is_not_there_is_told_before_anything_is_printed() -> None:
+    assert "there is no tracker 'nope'" in refused("train", "--print-config", "--track", "nope")
+    assert printed()["task"] == "navigation"
+
+
 FLAT = {
     "task": "predator-prey",
     "steps": "20k",
