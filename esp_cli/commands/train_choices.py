@@ -44,7 +44,7 @@ def with_file(
     if file.is_complete:
         for name in ("task", "algorithm", "preset"):
             if name in said and given[name] != file.choices[name]:
-                flag = f"--{_PARAMETERS.get(name, name)}"
+                flag = _flag(name)
                 raise ValueError(
                     f"{path} holds every setting of a run with {flag} {file.choices[name]}; leave {flag} out, "
                     "or name a file with only what differs"
@@ -94,5 +94,10 @@ def _read(path: Path, name: str, value: Any) -> Any:
         raise ValueError(f"{path}: {error}") from None
     known = get_args(Device) if name == "device" else (value,)
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{path} sets '{name}' to {value!r}; write it as esp train --{name} takes it")
+        raise ValueError(f"{path} sets '{name}' to {value!r}; write it as esp train {_flag(name)} takes it")
     return value
+
+
+def _flag(name: str) -> str:
+    """Return the option of a choice of a file: "algorithm" -> "--algo", "init_from" -> "--init-from"."""
+    return f"--{_PARAMETERS.get(name, name).replace('_', '-')}"
