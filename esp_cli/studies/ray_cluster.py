@@ -79,7 +79,10 @@ def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Seque
         return
     memory = f"{needed['memory'] / 1e9:.1f} GB of memory"
     asked = ", ".join(["a core", *(["a GPU"] if needed["GPU"] else []), memory])
-    raise ClusterError(f"no node of the cluster offers what {name} needs ({asked}); add one, or use fewer seeds")
+    # a run of fewer seeds needs less memory, and nothing else
+    fewer = any(all(node.get(kind, 0.0) >= needed[kind] for kind in ("CPU", "GPU")) for node in nodes)
+    advice = "add one, or use fewer seeds" if fewer else "add one"
+    raise ClusterError(f"no node of the cluster offers what {name} needs ({asked}); {advice}")
 
 
 def _knock(address: str) -> None:

@@ -25,7 +25,7 @@ from esp_cli.studies.engine import Engine
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.engine_ray import RayEngine
 from esp_cli.studies.mirror import Mirror
-from esp_cli.studies.ray_cluster import ClusterError
+from esp_cli.studies.ray_cluster import ClusterError, refuse_what_no_node_has
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import Cell, Study, StudyFolder
 from esp_cli.studies.tuning import TuningFolder
@@ -218,6 +218,24 @@ def test_a_run_that_no_node_has_room_for_fails_at_once(
     assert [run.status for run in runs] == ["failed"] * 2
     sentence = f"no node of the cluster offers what {runs[0].cell.name} needs (a core, 1000000.0 GB of memory)"
     assert runs[0].message.startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("node", "advice"),
+    [
+        ({"CPU": 4, "GPU": 1, "memory": 1e9}, "add one, or use fewer seeds"),
+        ({"CPU": 4, "memory": 9e9}, "add one"),
+        ({"CPU": 4, "memory": 1e9}, "add one"),
+    ],
+)
+def test_fewer_seeds_are_advised_only_where_memory_is_what_is_missing(node: dict[str, float], advice: str) -> None:
+    needed = {"CPU": 1, "GPU": 1, "memory": 2e9}
+    with pytest.raises(ClusterError) as told:
+        refuse_what_no_node_has(needed, "esp", [node])
+    assert str(told.value) == (
+        f"no node of the cluster offers what esp needs (a core, a GPU, 2.0 GB of memory); {advice}"
+    )
+    refuse_what_no_node_has(needed, "esp", [node, {"CPU": 1, "GPU": 1, "memory": 2e9}])
 
 
 def test_a_cluster_of_another_version_or_none_is_refused_in_one_sentence(
