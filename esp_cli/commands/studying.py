@@ -17,6 +17,7 @@ from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.machine import busy_with
+from esp_cli.training.folder_names import LOG
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -78,11 +79,13 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
     Raises:
         ValueError: some did.
     """
-    if names:
-        raise ValueError(
-            f"{len(names)} runs failed ({', '.join(names)}); see log.txt in their folders below {out}; the same "
-            "command tries them again"
-        )
+    if not names:
+        return
+    with_log = {path.parent.name for path in out.rglob(LOG)}  # a run that no machine could take has none
+    logged = [name for name in names if name in with_log]
+    whose = "their folders" if len(logged) == len(names) else f"the folders of {', '.join(logged)}"
+    see = f" see {LOG} in {whose} below {out};" if logged else ""
+    raise ValueError(f"{len(names)} runs failed ({', '.join(names)});{see} the same command tries them again")
 
 
 @contextmanager

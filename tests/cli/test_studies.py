@@ -270,3 +270,23 @@ def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_p
         steps = [row["step"] for row in read_metrics(run / "metrics.jsonl")]
         assert steps == [row["step"] for row in read_metrics(alone / "metrics.jsonl")]
         assert (run / "policy.safetensors").read_bytes() == (alone / "policy.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("logged", "sentence"),
+    [
+        (("esp", "plain"), "2 runs failed (esp, plain); see log.txt in their folders below {out}; the same command"),
+        (("plain",), "2 runs failed (esp, plain); see log.txt in the folders of plain below {out}; the same command"),
+        ((), "2 runs failed (esp, plain); the same command tries them again"),
+    ],
+)
+def test_a_log_is_named_only_for_failed_runs_that_have_one(
+    tmp_path: Path, logged: tuple[str, ...], sentence: str
+) -> None:
+    for name in (*logged, "another"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "log.txt").touch()
+    with pytest.raises(ValueError, match="failed") as told:
+        studying.refuse_failed(["esp", "plain"], tmp_path)
+    assert str(told.value).startswith(sentence.format(out=tmp_path))
+    studying.refuse_failed([], tmp_path)
