@@ -7,6 +7,7 @@ command.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -125,6 +126,32 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     return parser
 
 
+def not_over_a_run(path: T) -> T:
+    """Return the path of an option that writes a table or results, unless it is what a run or a study needs.
+
+    Raises:
+        ValueError: the path is that of a document or weights in the folder of a run, a study or a tuning.
+    """
+    from esp_cli.training.folder_names import CONFIG, INITIAL, LOCK, METRICS, POLICY
+
+    if path is None or str(path) == "-":
+        return path
+    real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
+    documents = (CONFIG, "study.json", "tuning.json")
+    owned = real.name in (*documents, METRICS, POLICY, INITIAL, LOCK, "journal.jsonl", "study.lock")
+    if owned and real.is_file() and any(map(_is_document, (real.parent / name for name in documents))):
+        raise ValueError(f"{path} belongs to the run or study in {real.parent}; write to another file")
+    return path
+
+
+def _is_document(path: Path) -> bool:
+    """Return whether a file is a document of esp, which begins with its format."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return b'"format": "esp-' in file.read(100)
+
+
 TaskOption = Annotated[
     str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")
 ]
@@ -197,6 +224,7 @@ JsonOption = Annotated[
         "--json",
         help="Also write the result as JSON to this file; - writes it to standard output instead.",
         metavar="FILE",
+        callback=not_over_a_run,
     ),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]

@@ -19,6 +19,7 @@ from esp_cli.commands.options import (
     OwnNetworkOption,
     OwnTaskOption,
     check_finite,
+    not_over_a_run,
     register_learners,
     register_tasks,
 )
@@ -44,7 +45,12 @@ OutOption = Annotated[
 ]
 ResultsOption = Annotated[
     Path | None,
-    typer.Option("--results", help="Also write every seed's numbers and the configurations as JSON.", metavar="FILE"),
+    typer.Option(
+        "--results",
+        help="Also write every seed's numbers and the configurations as JSON.",
+        metavar="FILE",
+        callback=not_over_a_run,
+    ),
 ]
 FillOption = Annotated[
     Path | None,
@@ -70,7 +76,13 @@ LimitsOption = Annotated[
 ]
 OldViewOption = Annotated[tuple[float, float] | None, typer.Option("--view", help="Old for --y-limits.", hidden=True)]
 CsvOption = Annotated[
-    Path | None, typer.Option("--csv", help="Write every logged number of every seed as a table.", metavar="FILE")
+    Path | None,
+    typer.Option(
+        "--csv",
+        help="Write every logged number of every seed as a table.",
+        metavar="FILE",
+        callback=not_over_a_run,
+    ),
 ]
 PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")]
 

@@ -12,6 +12,8 @@ from PIL import Image
 
 from esp_cli.evaluation.statistics import mean_and_sem
 from esp_cli.formatting import format_mean
+from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
+from esp_cli.studies.tuning import TUNING_FORMAT, TuningFolder
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
@@ -190,3 +192,25 @@ def test_what_is_no_run_is_told_in_one_sentence(finished: Path, copied: Path, ki
 def test_damaged_metrics_are_told_in_one_sentence(copied: Path, content: str, sentence: str) -> None:
     (copied / "metrics.jsonl").write_text(content)
     assert sentence in refused("report", copied)
+
+
+@pytest.mark.parametrize("option", ["--csv", "--json", "--results"])
+def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path, tmp_path: Path, option: str) -> None:
+    study = tmp_path / "study"
+    study.mkdir()
+    STUDY_FORMAT.write(study / StudyFolder.document, {})
+    (tmp_path / "link.csv").symlink_to(copied / "metrics.jsonl")
+    needed = [copied / "config.json", copied / "metrics.jsonl", copied / "policy.safetensors"]
+    for file in (*needed, study / StudyFolder.document, tmp_path / "link.csv"):
+        before = file.read_bytes()
+        assert f"{file} belongs to the run or study in" in refused("report", copied, option, file)
+        assert file.read_bytes() == before
+    for file in (copied / "all.csv", tmp_path / "config.json"):
+        file.touch()
+        esp("report", copied, option, file)
+        assert file.stat().st_size > 0, "a name of the user's own, and a name that is taken in no such folder"
+
+
+def test_the_document_of_a_tuning_is_not_overwritten_either(tmp_path: Path) -> None:
+    TUNING_FORMAT.write(tmp_path / TuningFolder.document, {})
+    assert "belongs to the run or study" in refused("settings", "--json", tmp_path / TuningFolder.document)
