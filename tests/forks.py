@@ -78,7 +78,7 @@ def said(path: Path) -> str:
 
 def forget_own_code(folder: Path) -> None:
     """Let this process be as one that has imported nothing from a folder."""
-    for name, module in list(sys.modules.items()):
+    for name, module in sys.modules.copy().items():  # a copy: collecting garbage can remove modules
         if Path(getattr(module, "__file__", None) or "/").parent == folder:
             del sys.modules[name]
     sys.path[:] = [entry for entry in sys.path if entry != str(folder)]
