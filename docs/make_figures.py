@@ -33,7 +33,7 @@ BREAKING = {
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 TUNED = {
     "tuned-navigation": ("mappo", "maddpg", "qmix"),
-    "tuned-predator-prey": ("mappo", "maddpg"),
+    "tuned-predator-prey": ("mappo", "maddpg", "qmix"),
 }
 """Figures in docs/measured -> the ends of the names of the results that are drawn together."""
 Row = dict[str, str]

@@ -87,9 +87,9 @@ def test_copies_and_their_share():
         return SymmetryPrior(PriorConfig(**choice), SPEC)
 
     assert prior(transforms="d4", copies="all").num_copies == 7
-    assert prior(transforms="d4", copies="all").augmented_share == 7 / 8
-    assert prior(transforms="d4").augmented_share == 1 / 2
-    assert prior(transforms="d4", kind="consistency").augmented_share == 0
+    assert float(prior(transforms="d4", copies="all").augmented_share(1)) == 7 / 8
+    assert float(prior(transforms="d4").augmented_share(1)) == 1 / 2
+    assert float(prior(transforms="d4", kind="consistency").augmented_share(1)) == 0
     assert prior(kind="none").num_copies == 0
 
 
