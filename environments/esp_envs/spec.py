@@ -212,8 +212,8 @@ class Discrete:
 class Continuous:
     """A bounded real action vector per agent.
 
-    Each item of a kind that is a vector lives in the unit disc or ball (longer ones are scaled back to length 1, so
-    that every rotation maps the action set to itself); each number of any other kind lives in [-1, 1] (and is clipped).
+    Each item of a kind that is a vector lives in the unit disc or ball. A longer one is scaled back to length 1, so
+    that every rotation maps the action set to itself. Each number of any other kind is clipped to [-1, 1].
     """
 
     layout: Layout

@@ -132,13 +132,13 @@ def not_over_a_run(path: T) -> T:
     Raises:
         ValueError: the path is that of a document or weights in the folder of a run, a study or a tuning.
     """
-    from esp_cli.training.folder_names import CONFIG, INITIAL, LOCK, METRICS, POLICY
+    from esp_cli.training import folder_names as of
 
     if path is None or str(path) == "-":
         return path
     real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
-    documents = (CONFIG, "study.json", "tuning.json")
-    owned = real.name in (*documents, METRICS, POLICY, INITIAL, LOCK, "journal.jsonl", "study.lock")
+    documents = (of.CONFIG, of.STUDY, of.TUNING)
+    owned = real.name in (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
     if owned and real.is_file() and any(map(_is_document, (real.parent / name for name in documents))):
         raise ValueError(f"{path} belongs to the run or study in {real.parent}; write to another file")
     return path

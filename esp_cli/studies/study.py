@@ -29,12 +29,12 @@ from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
-from esp_cli.training.folder_names import CONFIG, FINAL, LOG, POLICY
+from esp_cli.training.folder_names import CONFIG, FINAL, LOG, POLICY, STUDY, STUDY_LOCK
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
-_STUDY, _RUNS, _LOCK = "study.json", "runs", "study.lock"
+_RUNS = "runs"
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _OLD_FINAL = "judgement.json"
 
@@ -109,7 +109,7 @@ class StudyFolder:
         noun: what messages call what it holds.
     """
 
-    document: ClassVar[str] = _STUDY
+    document: ClassVar[str] = STUDY
     noun: ClassVar[str] = "study"
 
     def __init__(self, path: Path, study: Study) -> None:
@@ -117,7 +117,7 @@ class StudyFolder:
         for name in names:
             # A name is that of a folder inside the study: nothing is written outside it.
             if not _FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
-                raise StudyError(f"{path / _STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
+                raise StudyError(f"{path / STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
         self.path, self.study = path, study
 
     @classmethod
@@ -167,7 +167,7 @@ class StudyFolder:
         """
         if not path.is_dir():
             raise StudyError(f"{path} is no study: there is no such folder")
-        study = STUDY_FORMAT.parse(path / _STUDY, Study)
+        study = STUDY_FORMAT.parse(path / STUDY, Study)
         return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
 
     def _refuse_old_rules(self, cell: Cell) -> None:
@@ -183,7 +183,7 @@ class StudyFolder:
     def _written(cls, path: Path, study: Study) -> StudyFolder:
         folder = cls(path, study)
         reach("study")
-        STUDY_FORMAT.write(path / _STUDY, study.model_dump(mode="json"))
+        STUDY_FORMAT.write(path / STUDY, study.model_dump(mode="json"))
         return folder
 
     @classmethod
@@ -196,7 +196,7 @@ class StudyFolder:
         if path.is_file():
             raise StudyError(f"{path} is a file; choose another --out")
         if not cls.is_one(path) and path.is_dir():
-            foreign = [entry.name for entry in path.iterdir() if entry.name != _LOCK]
+            foreign = [entry.name for entry in path.iterdir() if entry.name != STUDY_LOCK]
             if foreign:
                 raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
         path.mkdir(parents=True, exist_ok=True)
@@ -211,7 +211,7 @@ class StudyFolder:
             LockError: another process holds it.
         """
         cls.make(path)
-        descriptor = acquire(path / _LOCK)
+        descriptor = acquire(path / STUDY_LOCK)
         try:
             yield
         finally:

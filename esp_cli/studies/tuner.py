@@ -22,11 +22,11 @@ from esp_cli.studies.study import StudyError
 from esp_cli.studies.tuning import REDUCTION, RUNGS, Point, TuningFolder, score
 from esp_cli.studies.tuning_space import space_of
 from esp_cli.training.build import build_learner
-from esp_cli.training.folder_names import METRICS
+from esp_cli.training.folder_names import JOURNAL, METRICS
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
-_JOURNAL, _REFUSED = "journal.jsonl", "refused"
+_REFUSED = "refused"
 _SEED = 0
 
 
@@ -71,7 +71,7 @@ class Trials:
     def __init__(self, folder: TuningFolder) -> None:
         self.folder, self.tuning = folder, folder.tuning
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        path = folder.path / _JOURNAL
+        path = folder.path / JOURNAL
         _cut_torn_line(path)
         try:
             storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock()))

@@ -18,7 +18,7 @@ from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.folder_names import METRICS
+from esp_cli.training.folder_names import METRICS, TUNING
 from esp_cli.training.metrics import MetricsError, column, read_metrics
 
 Goal = Literal["return", "steps", "seconds"]
@@ -160,7 +160,7 @@ class TuningFolder(StudyFolder):
         study.lock          held by the process that works on it
     """
 
-    document = "tuning.json"
+    document = TUNING
     noun = "tuning"
 
     def __init__(self, path: Path, tuning: Tuning) -> None:

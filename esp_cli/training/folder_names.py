@@ -10,6 +10,8 @@ CONFIG, METRICS, CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
 POLICY, INITIAL, LOCK = "policy.safetensors", "initial-policy.safetensors", "run.lock"
 LOG, FINAL = "log.txt", "final-evaluation.json"
 """Of the run of a study."""
+STUDY, TUNING, STUDY_LOCK, JOURNAL = "study.json", "tuning.json", "study.lock", "journal.jsonl"
+"""Of the folder of a study or a tuning."""
 
 
 def is_leftover(entry: Path) -> bool:

@@ -185,7 +185,7 @@ class CopyStepper:
             raise ValueError(
                 f"{over[0]} of {type(task).__name__} ends before the others; set 'agents_end = True' in the class"
             )
-        # who goes on up to the horizon is cut there, whoever else ends in this step: `alive` says who that is
+        # the horizon cuts agents that go on up to it, even if another ends in the same step; `alive` says which one
         terminates = all if task.agents_end and board.cut[k] else any
         board.ended[k] = self._how(k, len(over) == len(acting), terminates(ended.values()))
         gone.update(name for name in over if ended[name] or not board.cut[k])
