@@ -7,6 +7,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := runs/demo
+# Images of containers often forbid Python to keep what it compiled; every start of `esp` then takes twice as long.
+export PYTHONDONTWRITEBYTECODE :=
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope --max-worker-restart 0
 
 .DEFAULT_GOAL := help
@@ -61,7 +63,7 @@ clean: ## remove the demo run, builds and caches (runs and .venv stay)
 # --- the environment ---------------------------------------------------------------------------------------------
 
 # torch comes first and alone, in the exact version that is pinned: a looser request could fetch another build.
-# Python compiles what is imported; compiling all of it here would take half a minute.
+# Python compiles what is imported, once; compiling all of it here would take half a minute.
 define install
 	@.ci/make-venv "$(PYTHON)" $(VENV)
 	@echo "Installing $(1) into $(VENV) ..."

@@ -128,8 +128,8 @@ def steps_per_second(rows: Iterable[Mapping[str, Any]]) -> float:
 
 
 def paths(tree: Path) -> dict[str, str]:
-    """Return an environment in which Python finds the code of `tree`."""
-    return os.environ | {"PYTHONPATH": f"{tree}{os.pathsep}{tree / 'environments'}"}
+    """Return an environment in which Python finds the code of `tree`, and keeps what it compiles as it usually does."""
+    return os.environ | {"PYTHONPATH": f"{tree}{os.pathsep}{tree / 'environments'}", "PYTHONDONTWRITEBYTECODE": ""}
 
 
 def python(tree: Path, folder: Path, *arguments: str) -> str:
