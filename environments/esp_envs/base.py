@@ -137,6 +137,10 @@ class TaskSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset()
+
 
 class Environment(ABC):
     """A batch of worlds of one task.

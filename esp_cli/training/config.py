@@ -67,12 +67,14 @@ class RunConfig(Strict):
         return self.model_copy(update={"seeds": self.seeds[:1], "device": "cpu"})
 
     def without_effect(self) -> frozenset[str]:
-        """Return settings of prior, network and learner that change nothing beside the others, as "prior.weights"."""
+        """Return settings that change nothing beside the others, as "prior.weights"."""
         learner = ALGORITHMS[self.algorithm]
         of_others = {"old_log_prob" if learner.replays else "replay"}
         of_others |= set() if learner.has_policy_term else {"terms"}
         settings = learner.config_class(**self.algorithm_settings)
+        task = task_class(self.task).Settings(**self.task_settings)
         idle = {
+            "task": task.without_effect(),
             "prior": self.prior.without_effect() | of_others,
             "network": self.network.without_effect(),
             self.algorithm: settings.without_effect(self.network, self._spec),

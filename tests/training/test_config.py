@@ -56,18 +56,21 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
 @pytest.mark.parametrize(
     ("task", "algorithm", "choice", "idle"),
     [
-        ("navigation", "mappo", {}, {"mappo.truncation"}),
-        ("navigation", "mappo", {"network.name": "gru"}, set()),
+        ("navigation", "mappo", {}, {"mappo.truncation", "task.local_ratio"}),
+        ("navigation", "mappo", {"task.convention": "pettingzoo"}, {"mappo.truncation"}),
+        ("predator-prey", "mappo", {}, {"mappo.truncation"}),
+        ("predator-prey", "mappo", {"network.name": "gru"}, set()),
         ("wildlife", "mappo", {}, {"mappo.truncation", "mappo.critic_activation"}),
         ("wildlife", "mappo", {"network.name": "mlp"}, {"mappo.truncation"}),
-        ("navigation", "maddpg", {}, set()),
-        ("navigation", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
+        ("predator-prey", "maddpg", {}, set()),
+        ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
-        ("navigation", "qmix", {"network.layer_norm": True}, {"network.precision"}),
-        ("navigation", "maddpg", {"network.name": "gru", "network.layer_norm": True}, {"network.precision"}),
+        ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
+        ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision"}),
+        ("predator-prey", "maddpg", {"network.name": "gru", "network.layer_norm": True}, {"network.precision"}),
     ],
 )
-def test_a_learner_and_its_network_name_the_settings_that_do_nothing_beside_the_others(task, algorithm, choice, idle):
+def test_task_learner_and_network_name_the_settings_that_do_nothing_beside_the_others(task, algorithm, choice, idle):
     config = resolve_config(task, algorithm, overrides=choice)
     assert {name for name in config.without_effect() if not name.startswith("prior.")} == idle
 

@@ -101,6 +101,10 @@ class FormationSettings(TaskSettings):
             Breaking("blind_sector_rad", self.blind_sector_rad, "flip-x"),
         )
 
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset({"obstacle_radius_m"} if self.num_obstacles == 0 else ())
+
     @property
     def penalty(self) -> float:
         """c_collision with its default filled in."""

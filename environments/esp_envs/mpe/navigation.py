@@ -56,6 +56,10 @@ class NavigationSettings(ParticleSettings):
         """The landmark extent with its default filled in."""
         return self.landmark_extent or LANDMARK_EXTENT[self.convention]
 
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset({"local_ratio"} if self.convention == "esp" else ())
+
 
 class Navigation(ParticleTask):
     """Cooperative navigation, MPE's `simple_spread`.
