@@ -152,8 +152,8 @@ class Environment(ABC):
 
     Settings: ClassVar[type[TaskSettings]] = TaskSettings
     spec: TaskSpec
-    heuristics: ClassVar[tuple[str, ...]] = ()
-    """Names that `heuristic` accepts, the main anchor first."""
+    heuristics: tuple[str, ...] = ()
+    """Names that `heuristic` accepts, the main anchor first; an environment may have fewer than its class."""
     robot: ClassVar[Mapping[str, float]] = {}
     """Dimensions of the e-puck that a policy of this task can drive, by name with unit; empty for other tasks."""
 
@@ -193,6 +193,8 @@ class Environment(ABC):
     def set_state(self, state: Tensor) -> Observation:
         """Put every world into a global state (as laid out by `spec.state`) at the start of an episode.
 
+        What chance decides in the episode is what the last `reset` drew, so there has to be one before.
+
         Args:
             state: [S, E, state width]; it fixes the physics completely, up to the task's own noise.
 
@@ -231,10 +233,9 @@ class Environment(ABC):
         """
         raise ValueError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
 
-    @classmethod
-    def has(cls, method: str) -> bool:
-        """Return whether a task class offers one of the optional methods `set_state`, `heuristic` and `scene`."""
-        return getattr(cls, method) is not getattr(Environment, method)
+    def has(self, method: str) -> bool:
+        """Return whether the task offers one of the optional methods `set_state`, `heuristic` and `scene`."""
+        return getattr(type(self), method) is not getattr(Environment, method)
 
     def painter(self, size: int) -> AbstractContextManager[Painter] | None:
         """Return a view of this task's own to open, or None where the view from above is all there is.

@@ -32,7 +32,7 @@ class Compass(Environment):
 
     def __init__(self, inner: Environment, length: float, labels: bool = False) -> None:
         super().__init__(inner.settings, inner.num_envs, inner.generators)
-        self.inner = inner
+        self.inner, self.heuristics = inner, inner.heuristics
         spec = inner.spec
         self._joint = spec.is_joint
         self.spec = framed(spec, labels)
@@ -59,6 +59,18 @@ class Compass(Environment):
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
         self.inner.load_state_dict(tensors)
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every world into a global state; its frame is left out."""
+        own = self.inner.spec
+        if self._joint:
+            rows = state.unflatten(-1, (own.num_agents, -1))
+            return self._framed(self.inner.set_state(rows[..., : own.observation.width].flatten(2)))
+        return self._framed(self.inner.set_state(state[..., : own.state.width]))
+
+    def has(self, method: str) -> bool:
+        """Return whether the task offers a method."""
+        return self.inner.has(method)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return what the task's hand-written policy does."""

@@ -30,8 +30,10 @@ Observer = Callable[[Floats, Floats, Floats], Floats]
 _WORLDS = 100
 _JITTER_M = 0.001
 """Of positions that are met in the task: in a perfect square two robots are equally near."""
-_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0, "heading_offset_rad": 0.0, "blind_sector_rad": 0.0}
-"""What disturbs a robot's sensors in training, poses do not show."""
+_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}
+"""The noise of a robot's sensors in training, which poses do not show."""
+_UNSEEN = ("heading_offset_rad", "blind_sector_rad")
+"""Settings of what a robot sees that are not built from poses."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Scenes:
     goals: Floats
     pillars: Floats
     seen: Floats
+
+
+def builds_observations(settings: Mapping[str, object]) -> bool:
+    """Return whether what a robot sees is built from poses under these settings of its task."""
+    return not any(settings[name] for name in _UNSEEN)
 
 
 @torch.no_grad()

@@ -113,13 +113,20 @@ def _numpy(job: _Job) -> Files:
 def _epuck(job: _Job, kind: str) -> Files:
     """Return the numpy policy with what a robot's program needs around it."""
     spec = job.alone.spec
-    if compass := job.alone.config.prior.effective().compass:
+    prior = job.alone.config.prior.effective()
+    if compass := prior.compass:
+        label = f" and the agent's number, from {-compass:g} to {compass:g}" if "agents" in prior.transforms else ""
         raise ValueError(
             f"webots and ros2 build what a robot sees from poses, and know no compass; train without prior.compass, or "
-            f"export numpy or c and end each observation with {compass:g}, 0, 0, {compass:g}"
+            f"export numpy or c and end each observation with {compass:g}, 0, 0, {compass:g}{label}"
         )
     if "robot" not in job.description:
         raise ValueError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
+    if not epuck.builds_observations(spec.settings):
+        raise ValueError(
+            "webots and ros2 build what a robot sees from poses, without heading_offset_rad and blind_sector_rad; "
+            "train without them, or export numpy or c"
+        )
     if job.program.memory_width:
         raise ValueError("webots and ros2 take policies that remember nothing; export one without --network gru")
     return epuck.controller_files(kind, _policy(job), spec.settings)
@@ -152,7 +159,8 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
     program = replace(program_of(alone.policy), masked=alone.spec.masks)
     sample = take_sample(alone, program)
     description = describe(alone, program, sample)
-    robotic = "robot" in description and not program.memory_width and {"c", "numpy", "webots", "ros2"} & set(formats)
+    drives = bool({"c", "numpy", "webots", "ros2"} & set(formats)) and not program.memory_width
+    robotic = drives and "robot" in description and epuck.builds_observations(alone.spec.settings)
     job = _Job(alone, program, sample, description, epuck.take_scenes(alone) if robotic else None)
     written = {name: WRITERS[name](job) for name in formats}
     c = c_source(program, "") if "c" in formats else None

@@ -18,6 +18,7 @@ _MANIFEST = f"""<?xml version="1.0"?>
   <maintainer email="you@example.org">you</maintainer>
   <license>MIT</license>
   <exec_depend>rclpy</exec_depend>
+  <exec_depend>rcl_interfaces</exec_depend>
   <exec_depend>geometry_msgs</exec_depend>
   <exec_depend>std_msgs</exec_depend>
   <exec_depend>launch</exec_depend>

@@ -83,9 +83,9 @@ def _play(controller: PolicyController, env: Environment, world: tuple[int, int]
         step = env.step(controller.act(env, observation))
         observation = step.next
         ended = bool(step.ended[world])
-        if ended and step.final is not None:
+        if ended and step.final is not None and env.has("set_state"):
             env.set_state(step.final.state)  # the world has reset itself; show how the episode ended
-        scenes.append(env.scene(world))
+        scenes.append(scenes[-1] if ended and not env.has("set_state") else env.scene(world))
         returns.append(returns[-1] + float(step.reward.mean(-1)[world]))
         if ended:
             break

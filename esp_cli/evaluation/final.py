@@ -15,7 +15,6 @@ from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
-from esp_envs.registry import task_class
 
 Mode = Literal["greedy", "stochastic"]
 """How a policy acts: by its most probable action, or by actions that it draws."""
@@ -87,7 +86,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     for played in (greedy, stochastic):
         for numbers in (played.returns, *played.metrics.values()):
             numbers[list(trained.stopped)] = float("nan")
-    names = task_class(trained.config.task).heuristics
+    names = build_environment(trained.config, 1, _STREAM, "shape").heuristics
     anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name

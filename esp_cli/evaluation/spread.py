@@ -32,7 +32,9 @@ def spread_over_episodes(returns: ArrayLike) -> EpisodeSpread:
     """Return standard error and 95 % interval of the mean over the episodes of one policy."""
     sample = np.asarray(returns, dtype=np.float64)
     mean, sem = mean_and_sem(sample)
-    if sem is None or sample.size <= MOST_RESAMPLED:
-        return EpisodeSpread(sem, None if sem is None else bootstrap_interval(sample))
+    if not sem:
+        return EpisodeSpread(sem, None)
+    if sample.size <= MOST_RESAMPLED:
+        return EpisodeSpread(sem, bootstrap_interval(sample))
     reach = float(scipy.stats.norm.ppf((1 + CONFIDENCE) / 2)) * sem
     return EpisodeSpread(sem, (mean - reach, mean + reach))

@@ -91,7 +91,7 @@ def returns_table(results: Results, whole: bool = False) -> Table:
 
 def comparison_table(results: Results) -> Table:
     """Return each cell beside its reference and the paper's number: intervals, and who is ahead."""
-    rows = []
+    rows, by_seed = [], True
     has_paper = any(cell.paper for cell in results.cells)
     columns = _COMPARED + (_PAPER_SIDE if has_paper else ())
     columns = ("trained to>", *columns) if any(cell.at is not None for cell in results.cells) else columns
@@ -100,10 +100,12 @@ def comparison_table(results: Results) -> Table:
         texts = {"trained to>": format_count(cell.step), "return>": _short(results, cell)}
         if found is not None and found.returns.mean is not None:
             texts |= _compared(cell, found)
+            by_seed &= found.gap is None or found.gap.paired
         rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
     welch = "Ours and the paper's means are compared by Welch's test at 5 %. " if has_paper else ""
     caption = (
-        f"The reference is {kind_of(results.kind).reference}, compared seed by seed; over all pairs: "
+        f"The reference is {kind_of(results.kind).reference}, compared seed by seed"
+        f"{'' if by_seed else ' where both have the same seeds'}; over all pairs: "
         f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}"
         "No interval is widened for the number of comparisons."
     )

@@ -251,7 +251,8 @@ class RosNode:
     def __init__(self, name: str) -> None:
         self.name, self.published = name, {}
 
-    def declare_parameter(self, name: str, default: object) -> SimpleNamespace:
+    def declare_parameter(self, name: str, default: list[float], descriptor: SimpleNamespace) -> SimpleNamespace:
+        assert descriptor.dynamic_typing or default, "rclpy takes an empty list for bytes, and then refuses numbers"
         return SimpleNamespace(value=self.parameters.get(name, default))
 
     def create_subscription(self, kind, topic: str, callback, depth: int) -> None:
@@ -285,6 +286,8 @@ def ros_fakes(spin=None) -> dict[str, ModuleType]:
         "rclpy.node": fake(Node=RosNode),
         "geometry_msgs": fake(),
         "geometry_msgs.msg": fake(PoseArray=SimpleNamespace, Twist=twist),
+        "rcl_interfaces": fake(),
+        "rcl_interfaces.msg": fake(ParameterDescriptor=SimpleNamespace),
         "std_msgs": fake(),
         "std_msgs.msg": fake(Float32MultiArray=SimpleNamespace),
     }

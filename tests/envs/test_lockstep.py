@@ -114,7 +114,7 @@ def test_what_a_task_lacks_is_said_in_one_sentence(method: str) -> None:
 
 
 def test_what_a_task_has_is_known(rendezvous: type[Environment]) -> None:
-    assert all(rendezvous.has(method) for method in ("heuristic", "scene", "set_state"))
+    assert all(worlds(rendezvous).has(method) for method in ("heuristic", "scene", "set_state"))
 
 
 def test_actions_arrive_within_their_bounds() -> None:

@@ -200,7 +200,7 @@ class ParallelTask(CopyHooks, Environment):
         copies = self._started()
         board = copies.board
         board.active[:] = active.flatten().numpy()
-        board.action[:] = action.flatten(0, 1).cpu().numpy()
+        board.action[:] = self.action.admissible(action).flatten(0, 1).cpu().numpy()
         board.cut[:] = (self._time + 1 == self.spec.horizon).flatten().numpy()
         copies.step()
         self._time += active

@@ -63,9 +63,10 @@ class Formation(LockstepTask):
     Terminated: never. Truncated: after `horizon` = 300 steps; bootstrap there.
 
     Metrics, per episode: `arrival_rate` share of robots that were within `arrival_radius_m` of their goal at some time;
-        `time_to_arrival_s` until then, the whole episode for a robot that never was; `collisions` how often two bodies
-        came to touch (robots with robots or pillars); `risky_rate` share of states in which two robots have a gap below
-        5 cm; `path_length_m` of a robot; `final_distance_m` between a robot and its goal at the end.
+        `time_to_arrival_s` until the step in which it was, the whole episode for a robot that never was; `collisions`
+        how often two bodies came to touch (robots with robots or pillars); `risky_rate` share of states in which two
+        robots have a gap below 5 cm; `path_length_m` of a robot; `final_distance_m` between a robot and its goal at
+        the end.
 
     Heuristics: `avoid` (default) drives to the goal, gives way to near bodies and passes them on the right; `straight`
         turns to the goal and drives.
@@ -78,7 +79,7 @@ class Formation(LockstepTask):
     """
 
     Settings: ClassVar[type[TaskSettings]] = FormationSettings
-    heuristics: ClassVar[tuple[str, ...]] = ("avoid", "straight")
+    heuristics = ("avoid", "straight")
     robot: ClassVar[Mapping[str, float]] = {**DIMENSIONS, "fading_m": FADING_M}
     settings: FormationSettings
 

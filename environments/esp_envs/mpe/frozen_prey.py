@@ -77,7 +77,7 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
         intact = False
     if not intact:
         raise ValueError(f"the prey policy {path} does not match its checksum; export it again")
-    return header, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.layers.")}
+    return header, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
 
 
 def _checked(header: dict[str, object], path: str) -> str:
@@ -96,6 +96,11 @@ def _checked(header: dict[str, object], path: str) -> str:
 
 def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tensor, Tensor]]:
     """Return (weight [in, out], bias [1, out]) of one seed, layer by layer, after checking that they chain."""
+    if other := sorted(name for name in tensors if not name.startswith("actor.layers.")):
+        raise ValueError(
+            f"the prey policy {path} has '{_short(other[0])}', but a prey needs a plain mlp; train one without "
+            "network.layer_norm, network.symmetrise and network.separate_parts"
+        )
     names = [(f"actor.layers.{k}.weight", f"actor.layers.{k}.bias") for k in range(len(tensors) // 2)]
     if not names or {name for pair in names for name in pair} != set(tensors):
         raise ValueError(f"the prey policy {path} lacks a weight or bias of its actor's layers; export it again")

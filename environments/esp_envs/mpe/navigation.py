@@ -104,7 +104,7 @@ class Navigation(ParticleTask):
     `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the landmarks) `flip-x`.
 
     Heuristics: `greedy` (each agent takes a landmark of its own), `cover` (agents share out all landmarks
-    between them, for L > N).
+    between them, for L > N; where there are at most 4096 ways, N^L, to do so).
 
     Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, greedy -112,
     cover -109.
@@ -114,12 +114,14 @@ class Navigation(ParticleTask):
     """
 
     Settings: ClassVar[type[NavigationSettings]] = NavigationSettings
-    heuristics: ClassVar[tuple[str, ...]] = ("greedy", "cover")
+    heuristics: tuple[str, ...] = ("greedy", "cover")
     settings: NavigationSettings
 
     def __init__(self, settings: NavigationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
+        if agents**landmarks > covering.MAX_SHARINGS:
+            self.heuristics = ("greedy",)
         bodies = Bodies(
             radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
             gain=settings.gains(*(SENSITIVITY,) * agents),
@@ -177,14 +179,15 @@ class Navigation(ParticleTask):
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
         bumps = (self.worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
         collisions = bumps.sum(0)
-        apart = self._squared_to(self.worlds.entity[agents:]) if self.settings.reward_offset else self._to_landmarks
-        nearest = apart.amin(0).sqrt_()
-        distance = nearest.sum(0)
+        nearest = self._to_landmarks.amin(0).sqrt_()
+        distance = paid = nearest.sum(0)
+        if self.settings.reward_offset:
+            paid = self._squared_to(self.worlds.entity[agents:]).amin(0).sqrt_().sum(0)
         if self.settings.convention == "esp":
-            reward = (distance * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)
+            reward = (paid * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)
         else:
             ratio = self.settings.local_ratio
-            reward = torch.addmm(distance.expand(agents, -1), self._takes_part, bumps, beta=ratio - 1, alpha=-ratio)
+            reward = torch.addmm(paid.expand(agents, -1), self._takes_part, bumps, beta=ratio - 1, alpha=-ratio)
         coverage = (nearest < OCCUPIED_WITHIN).float().mean(0)
         metrics = {"collisions": collisions, "landmark_distance": distance / landmarks, "coverage": coverage}
         return reward, metrics

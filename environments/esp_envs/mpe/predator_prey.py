@@ -95,7 +95,7 @@ class PredatorPrey(ParticleTask):
     """
 
     Settings: ClassVar[type[PredatorPreySettings]] = PredatorPreySettings
-    heuristics: ClassVar[tuple[str, ...]] = ("greedy",)
+    heuristics = ("greedy",)
     settings: PredatorPreySettings
 
     def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -240,16 +240,19 @@ class PredatorPrey(ParticleTask):
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         predators = self.settings.num_predators
-        apart = self.worlds.squared_contact_distance[:predators]
+        touches = paid = _touches(self.worlds.squared_contact_distance[:predators])
         if self.settings.reward_offset:
-            apart = self._squared_to(self.worlds.position[predators:])[:predators, 0]
-        touching = apart < (PREDATOR_RADIUS + PREY_RADIUS) ** 2
-        touches = touching.float().sum(0)
+            paid = _touches(self._squared_to(self.worlds.position[predators:])[:predators, 0])
         metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
-        reward = touches * TOUCH_REWARD
+        reward = paid * TOUCH_REWARD
         if self._prey_learns:
             reward = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
         return reward.unsqueeze(0), metrics
+
+
+def _touches(squared_distance: Tensor) -> Tensor:
+    """Return how many predators touch a prey [W], given squared distances of the centres [P, W]."""
+    return (squared_distance < (PREDATOR_RADIUS + PREY_RADIUS) ** 2).float().sum(0)
 
 
 def out_of_bounds(position: Tensor) -> Tensor:

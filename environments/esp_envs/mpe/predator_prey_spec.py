@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field as Setting
-from pydantic import model_validator
+from pydantic import field_validator, model_validator
 
 from esp_envs.breaking import Breaking, described, remaining
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
@@ -30,6 +31,11 @@ class PredatorPreySettings(ParticleSettings):
     learned_prey: float = Setting(
         0.0, ge=0, le=1, description="breaks symmetry: probability of a step in which the prey follows prey_policy"
     )
+
+    @field_validator("prey_policy")
+    @classmethod
+    def _found_from_anywhere(cls, path: str | None) -> str | None:
+        return path and str(Path(path).absolute())
 
     @property
     def turns(self) -> str:

@@ -73,7 +73,7 @@ class Wildlife(Environment):
     """
 
     Settings: ClassVar[type[WildlifeSettings]] = WildlifeSettings
-    heuristics: ClassVar[tuple[str, ...]] = ("surround",)
+    heuristics = ("surround",)
     settings: WildlifeSettings
 
     def __init__(self, settings: WildlifeSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:

@@ -26,6 +26,7 @@ import rclpy
 from esp_formation import policy
 from esp_formation.esp_epuck import Pilot
 from geometry_msgs.msg import PoseArray, Twist
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from std_msgs.msg import Float32MultiArray
 
@@ -53,7 +54,8 @@ class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
 
     def _points(self, name: str) -> list[tuple[float, float]]:
         """Read a parameter that lists x and y in turn."""
-        values = [float(value) for value in self.declare_parameter(name, [0.0][:0]).value or []]
+        any_numbers = ParameterDescriptor(dynamic_typing=True)  # rclpy takes an empty list for one of bytes
+        values = [float(value) for value in self.declare_parameter(name, [], any_numbers).value or []]
         if len(values) % 2:
             raise ValueError(f"the parameter {name} lists x and y in turn, but has {len(values)} numbers")
         return list(zip(values[::2], values[1::2], strict=True))
