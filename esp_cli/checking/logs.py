@@ -9,11 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from esp_cli.checking.transitions import Transitions
+from esp_cli.checking.transitions import FEWEST, Transitions
 from esp_envs.spec import Discrete, Spaces
 
-FEWEST = 64
-"""Episodes (or single transitions) below which nothing can be told."""
 _MOST_BYTES = 2**31
 _NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask",)
 

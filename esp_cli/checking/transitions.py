@@ -25,6 +25,8 @@ from esp_envs.spec import Discrete, Spaces
 EPISODES = 2048
 STEPS = 8
 """Steps of each episode that are looked at."""
+FEWEST = 64
+"""Episodes (or single transitions) below which nothing can be told."""
 _ASYMMETRIC = 0.05
 """Shift of the starts, in standard deviations, from which an element is not covered."""
 _RIDGE = 1e-3
@@ -93,12 +95,28 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
         spaces: what the numbers are, and the declared symmetry.
         data: anybody's transitions, of a policy that prefers no direction.
         elements: to try.
+
+    Raises:
+        ValueError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
     """
+    _refuse_what_says_nothing(spaces, data)
     half = len(data.obs) // 2
     inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
     model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
     held = data.episodes(slice(half, None))
     return [_judge(element, spaces, held, model) for element in elements]
+
+
+def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
+    if len(data.obs) < FEWEST:
+        raise ValueError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
+    for name in ("obs", "action", "reward", "next_obs"):
+        if not bool(getattr(data, name).isfinite().all()):
+            raise ValueError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
+    if isinstance(spaces.action, Discrete):
+        count, action = spaces.action.count, data.action
+        if action.is_floating_point() or not bool(((action >= 0) & (action < count)).all()):
+            raise ValueError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
 
 
 def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -> ElementVerdict:

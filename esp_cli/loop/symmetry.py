@@ -52,7 +52,8 @@ class Symmetry:
         generator: draws the elements; its state belongs into a checkpoint.
 
     Raises:
-        ValueError: the actions or layouts cannot carry the group, or all elements of an infinite group are asked for.
+        ValueError: the actions or layouts cannot carry the group, all elements of an infinite group are asked for, or
+            an argument is none of those above.
     """
 
     def __init__(
@@ -66,6 +67,10 @@ class Symmetry:
         copies: Literal["draw", "all"] = "draw",
         seed: int = 0,
     ) -> None:
+        if copies not in ("draw", "all"):
+            raise ValueError(f"copies is {copies!r}; choose 'draw' or 'all'")
+        if num_agents < 1:
+            raise ValueError(f"num_agents is {num_agents}; there is at least one agent")
         joint = joint_layout(observation, num_agents)
         self.spaces = unrestricted(
             Spaces(num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="c1")
@@ -163,7 +168,7 @@ class Symmetry:
             policy: obs [..., N, D] to a distribution of actions, or to a tensor, as `policy_divergence` knows them.
             obs: [..., N, D]; of a recurrent policy, whole histories.
             here: what the policy says of `obs`, where it is known already; detached, it stays fixed.
-            mask: [...] which rows count; the loss is 0 where none does.
+            mask: [...] which rows count, as flags or as 0 and 1; the loss is 0 where none does.
 
         Returns:
             A scalar, 0 if and only if the policy turns with the scene.
@@ -243,7 +248,8 @@ class Symmetry:
             transforms: which elements; by default those of the group.
 
         Raises:
-            ValueError: the transforms mean nothing, or nothing of them can be carried.
+            ValueError: the transforms mean nothing, nothing of them can be carried, or the transitions are fewer than
+                64 episodes, hold numbers that are not finite, or actions outside.
         """
         from esp_cli.checking import Transitions, candidates, check_transitions, collect  # noqa: PLC0415 - it trains too
 
@@ -265,5 +271,17 @@ class Symmetry:
 def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
     """Return the mean over elements, rows and agents, of the rows that count; 0 where none does."""
     gap = torch.stack(gaps)
-    counted = gap if mask is None else gap[:, mask]
+    counted = gap if mask is None else gap[:, _flags(mask, gap.shape[1:])]
     return counted.mean() if counted.numel() else counted.sum()
+
+
+def _flags(mask: Tensor, shape: torch.Size) -> Tensor:
+    """Return which rows count, of a mask of flags, or of zeros and ones, that goes with the first axes of `shape`."""
+    if mask.shape != shape[: mask.dim()]:
+        raise ValueError(
+            f"mask has shape {list(mask.shape)}, but the rows have {list(shape)}; give a flag for each row"
+        )
+    flags = mask.bool()
+    if mask.dtype != torch.bool and not torch.equal(flags.to(mask.dtype), mask):
+        raise ValueError("mask holds other numbers than 0 and 1; it says which rows count, and weighs none")
+    return flags

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -72,6 +74,24 @@ def test_anybodys_transitions_are_judged(drift: float, found: str) -> None:
     spaces, data = anybodys(drift)
     verdicts = check_transitions(spaces, data, candidates(spaces))
     assert found_group({v.element for v in verdicts if v.outcome == "holds"}, spaces) == found
+
+
+@pytest.mark.parametrize("name", ["obs", "action", "reward", "next_obs"])
+def test_transitions_that_say_nothing_are_refused(name: str) -> None:
+    spaces, data = anybodys(0.0)
+    with pytest.raises(ValueError, match="there are 63 episodes of transitions; record at least 64"):
+        check_transitions(spaces, data.episodes(slice(63)), candidates(spaces))
+    getattr(data, name)[-1] = torch.nan
+    with pytest.raises(ValueError, match=f"'{name}' of the transitions holds numbers that are not finite"):
+        check_transitions(spaces, data, candidates(spaces))
+
+
+def test_actions_that_are_no_indices_are_refused() -> None:
+    env = make("navigation", 64, [0])
+    data = collect(env, episodes=64)
+    for wrong in (data.action + 1, data.action - 1, data.action.float()):
+        with pytest.raises(ValueError, match="'action' of the transitions holds other than the indices 0 to 4"):
+            check_transitions(env.spec, replace(data, action=wrong), candidates(env.spec))
 
 
 def test_what_no_action_carries_is_not_tried() -> None:

@@ -171,6 +171,11 @@ def test_a_masked_row_does_not_count_and_a_known_answer_is_not_asked_again() -> 
     assert quarter().value_loss(value, state, mask=torch.tensor([True, False])).item() == 9
     assert quarter().value_loss(value, state, here=state[:, 0]).item() == (9 + 14**2) / 2
     assert len(asked) == 3
+    for kind in (torch.int64, torch.uint8, torch.float32):
+        assert quarter().value_loss(value, state, mask=torch.tensor([1, 0], dtype=kind)).item() == 9
+    for wrong, told in ((torch.ones(3), r"mask has shape \[3\], .* \[2\]"), (torch.tensor([0.5, 1.0]), "weighs none")):
+        with pytest.raises(ValueError, match=told):
+            quarter().value_loss(value, state, mask=wrong)
 
 
 @pytest.mark.parametrize(
