@@ -35,11 +35,13 @@ LARGE = {"team, values, equivariant": ("wildlife", "qmix", {"network.name": "emp
 """Exported alike; a comparison on thousands of observations takes long."""
 REFUSED = {"ensemble": ("navigation", "mappo", {"network.symmetrise": "c4"})}
 """What no export takes."""
+UNSEEN = {name: ("formation", "mappo", {f"task.{name}": 1.0}) for name in ("heading_offset_rad", "blind_sector_rad")}
+"""What a robot sees is not built from poses."""
 
 
 def drawn_policy(kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10)) -> TrainedPolicy:
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
-    task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
+    task, algorithm, settings = (KINDS | LARGE | REFUSED | UNSEEN)[kind]
     overrides = {"network.hidden": list(hidden), **settings}
     config = resolve_config(task, algorithm, seeds=seeds, steps=100, overrides=overrides)
     spec = build_environment(config, 1, "shape").spec

@@ -18,7 +18,7 @@ from esp_cli.training.loading import TrainedPolicy
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
-from tests.deploy.policies import drawn_policy
+from tests.deploy.policies import UNSEEN, drawn_policy
 
 STEPS = 40
 EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
@@ -130,6 +130,16 @@ def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         pilot.observations(poses, goals[:1])
     with pytest.raises(ValueError, match="sees 1 others, but there are 1 robots"):
         pilot.observations(poses[:1], goals[:1], [(0.5, 0.5)])
+
+
+@pytest.mark.parametrize("setting", UNSEEN)
+def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path, setting: str) -> None:
+    alone = drawn_policy(setting)
+    for kind in ("ros2", "webots"):
+        with pytest.raises(ValueError, match=r"without heading_offset_rad and blind_sector_rad; train without them"):
+            export(alone, [kind], tmp_path)
+    export(alone, ["numpy"], tmp_path)
+    assert "from poses" not in (tmp_path / "README.md").read_text()
 
 
 class Node:

@@ -19,6 +19,8 @@ from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
 from esp_envs import Body, Scene
+from esp_envs.base import Environment
+from esp_envs.compass import Compass
 from esp_envs.drawing import TopPainter, draw
 from tests.training.runs import tiny_config
 
@@ -93,6 +95,22 @@ def test_a_recording_ends_where_the_episode_ended_not_where_the_next_begins(trai
     scenes[-1] = env.scene((1, 0))
     assert scenes[-1] != following
     assert recorded == scenes
+
+
+def test_a_task_that_cannot_be_put_into_a_state_keeps_its_last_scene_and_one_with_a_compass_shows_its_end(
+    trained, monkeypatch
+):
+    ends = filmed(trained, 7, 1)[0].scenes[-1]
+    framed = Compass(build_environment(trained.config, 1, "film"), 0.5)
+    framed.reset()
+    before = framed.scene((1, 0))
+    seen = framed.set_state(framed.reset().state)
+    assert seen.obs.shape[-1] == trained.spec.observation.width + 4
+    assert framed.scene((1, 0)) != before
+    monkeypatch.setattr(type(framed.inner), "set_state", Environment.set_state)
+    assert not framed.has("set_state")
+    scenes = filmed(trained, 7, 1)[0].scenes
+    assert scenes[-1] == scenes[-2] != ends
 
 
 def test_seeds_and_noise_make_other_recordings_and_the_same_choice_the_same(trained):

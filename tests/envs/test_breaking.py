@@ -143,27 +143,27 @@ def test_the_reward_counts_places_to_the_right() -> None:
         env.set_state(torch.tensor([0.0, 0.0, x, 0.0, 0.0, 0.0]).expand(1, 1, 6))
         step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
         rewards.append(float(step.reward[0, 0, 0]) + 1)  # the collision with oneself
-        assert float(step.metrics["coverage"]) == (x == 0.3)
+        assert float(step.metrics["coverage"]) == (x == 0.0), "metrics are of the real places"
     assert rewards == pytest.approx([-0.3, 0.0], abs=1e-6)
     env = make("predator-prey", 1, [0], {"reward_offset": 0.5, "prey": "still", "num_predators": 2, "num_obstacles": 0})
     env.set_state(torch.tensor([0.0] * 6 + [0.5, 0.0, -0.5, 0.0, 0.0, 0.0]).expand(1, 1, 12))
     step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
-    assert float(step.metrics["touches"]) == 1, "who is right of the prey, and not who is left of it"
+    assert step.reward[0, 0].tolist() == [10.0, 10.0], "for who is right of the prey, and not for who is left of it"
+    assert float(step.metrics["touches"]) == 0, "nobody really touches it"
 
 
 def test_heuristics_know_where_forces_and_rewards_point() -> None:
     """The reference policies reach their goals with actions that are turned and landmarks that are off."""
 
-    def distance(**settings: float) -> float:
+    def missing(**settings: float) -> float:
+        """Return what the last rewards lack to those of agents that touch nobody and cover all places."""
         env = make("navigation", 64, [0], {"actions": "continuous", **settings})
         env.reset()
-        return float(
-            torch.stack([env.step(env.heuristic()).metrics["landmark_distance"] for _ in range(25)])[-1].mean()
-        )
+        return -3 - float([env.step(env.heuristic()).reward for _ in range(25)][-1].mean())
 
-    plain = distance()
-    assert distance(action_turn_rad=1.5) == pytest.approx(plain, rel=0.02)
-    assert distance(reward_offset=0.3) == pytest.approx(plain, rel=0.1)
+    plain = missing()
+    assert missing(action_turn_rad=1.5) == pytest.approx(plain, rel=0.02)
+    assert missing(reward_offset=0.3) == pytest.approx(plain, rel=0.1)
 
 
 def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from esp_envs import make
+from esp_envs.mpe.predator_prey_spec import PredatorPreySettings
 from esp_envs.policy_format import digest
 
 HEADER = {"format": "esp-policy", "version": 1, "task": "predator-prey", "network": "mlp", "activation": "tanh"}
@@ -123,6 +124,8 @@ def test_tensors_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     assert "do not fit together" in refused(write(path, flat))
     fewer = {name: value[: 1 if name.startswith("actor.layers.1") else 2] for name, value in network().items()}
     assert "seeds" in refused(write(path, {k: v.clone() for k, v in fewer.items()}), prey_policy_seed=1)
+    norms = network() | {"actor.norms.0.weight": torch.ones(SEEDS, 1, NUM_INPUTS)}
+    assert "has 'actor.norms.0.weight', but a prey needs a plain mlp" in refused(write(path, norms))
     broken = network() | {"actor.layers.0.bias": torch.full((SEEDS, 1, HIDDEN), torch.nan)}
     assert "not finite" in refused(write(path, broken))
 
@@ -131,3 +134,11 @@ def test_another_number_of_bodies_or_an_unknown_seed_is_refused(tmp_path: Path) 
     path = write(tmp_path / "prey.safetensors")
     assert "maps 14 observations" in refused(path, num_predators=2)
     assert "holds 2 seeds" in refused(path, prey_policy_seed=2)
+
+
+def test_the_file_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "prey.safetensors")
+    monkeypatch.chdir(tmp_path)
+    settings = PredatorPreySettings(prey="policy", prey_policy="prey.safetensors")
+    assert settings.prey_policy == str(tmp_path / "prey.safetensors")
+    assert PredatorPreySettings(**settings.model_dump()) == settings

@@ -132,6 +132,32 @@ def test_numbers_in_the_unit_interval_are_stretched_to_a_box() -> None:
     assert moved.mean((0, 1)).tolist() == pytest.approx([5.0, 10.0], abs=0.2)
 
 
+def test_a_long_vector_is_scaled_back_before_a_copy_gets_it() -> None:
+    got = []
+
+    class Fly(Walk):
+        def action_space(self, agent):
+            return spaces.Box(-1.0, 1.0, (2,))
+
+        def step(self, actions):
+            got.append(actions["walker_0"])
+            return super().step(actions)
+
+    class Flying(Walking):
+        action = Continuous(layout(Field("push", Kind.VECTOR)))
+
+        def make_one(self):
+            return Fly(self.settings.horizon)
+
+        def opponent(self, agent, observation, generator):
+            return 0.0
+
+    env = worlds(Flying, workers=0)
+    env.reset()
+    env.step(torch.ones(2, 5, 2, 2))
+    assert got[0].tolist() == pytest.approx([0.5**0.5] * 2)
+
+
 def test_metrics_state_and_reading_come_from_the_environment() -> None:
     class Reading(Walking):
         observation = layout(Field("place", Kind.SCALAR), Field("clock", Kind.VECTOR))

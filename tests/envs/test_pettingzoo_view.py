@@ -12,6 +12,7 @@ import torch
 pettingzoo_test = pytest.importorskip("pettingzoo.test")
 
 from esp_envs import make, register, task_class, task_names  # noqa: E402 - the view needs PettingZoo
+from esp_envs.drawing import draw  # noqa: E402
 from esp_envs.pettingzoo_view import ParallelView  # noqa: E402
 from esp_envs.registry import TASKS  # noqa: E402
 from tests.fenced import Fenced, Nothing  # noqa: E402
@@ -199,6 +200,20 @@ def test_it_renders_when_asked() -> None:
     assert ParallelView("predator-prey", 0).render() is None
     with pytest.raises(ValueError, match="render mode 'human'"):
         ParallelView("predator-prey", 0, render_mode="human")
+
+
+def test_the_last_picture_is_of_how_the_episode_ended() -> None:
+    view = ParallelView("navigation", 0, render_mode="rgb_array", horizon=1)
+    view.reset()
+    view.step(dict.fromkeys(view.agents, 1))
+    last = view.render()
+    shown = make("navigation", 1, [0])
+    shown.reset()
+    shown.set_state(torch.from_numpy(view.state()).view(1, 1, -1))
+    assert last is not None
+    assert np.array_equal(last, draw(shown.scene()))
+    view.reset()
+    assert not np.array_equal(last, view.render())
 
 
 def test_unknown_tasks_and_settings_are_refused() -> None:

@@ -53,6 +53,12 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     assert FinalEvaluation.model_validate_json(result.model_dump_json()) == result
 
 
+def test_a_heuristic_that_would_try_too_many_sharings_is_left_out(tmp_path):
+    result = evaluate(untrained(tmp_path, task__num_agents=6), 2)
+    assert result.heuristics == ("greedy",)
+    assert result.anchors.keys() == {"random", "heuristic"}
+
+
 def test_a_seed_that_stopped_has_no_numbers(tmp_path):
     whole = untrained(tmp_path)
     result = evaluate(replace(whole, stopped=(1,)), 3)

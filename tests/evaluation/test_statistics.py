@@ -249,6 +249,7 @@ def test_the_spread_over_episodes_is_that_of_their_mean() -> None:
     assert spread.ci95[0] < 4 < spread.ci95[1]
     assert spread_over_episodes([2.0]) == EpisodeSpread(None, None)
     assert spread_over_episodes([2.0, 2.0]) == EpisodeSpread(0.0, None)
+    assert spread_over_episodes([2.0] * (MOST_RESAMPLED + 1)) == EpisodeSpread(0.0, None)
 
 
 def test_many_episodes_have_the_normal_interval_and_it_is_near_the_bootstraps() -> None:
