@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic_core import to_jsonable_python
 
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
@@ -244,10 +245,16 @@ def completed(config: RunConfig) -> RunConfig:
         "algorithm_settings": ALGORITHMS[config.algorithm].config_class,
     }
     gained = {
-        part: {name: field.default for name, field in model.model_fields.items() if not field.is_required()}
+        part: {
+            name: field.get_default(call_default_factory=True)
+            for name, field in model.model_fields.items()
+            if not field.is_required()
+        }
         for part, model in models.items()
     }
-    return config.model_copy(update={part: new | getattr(config, part) for part, new in gained.items()})
+    return config.model_copy(
+        update={part: to_jsonable_python(new) | getattr(config, part) for part, new in gained.items()}
+    )
 
 
 def _read(value: object) -> object:

@@ -3,16 +3,20 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from pydantic import Field
 
 from esp_cli.algorithms.mappo import MappoConfig
 from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
 from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.prior import PriorConfig
+from esp_cli.training import config as config_module
 from esp_cli.training.config import EvaluationConfig, RunConfig, completed, resolve_config
 from esp_cli.training.loading import parse_config
+from esp_envs.registry import task_class
 
 
 def test_without_a_choice_every_default_is_the_models_own():
@@ -256,3 +260,12 @@ def test_a_stored_configuration_gets_the_settings_that_came_later_and_keeps_its_
     then = RunConfig.model_validate(now.model_dump(exclude=left_out))
     assert then != now
     assert completed(then) == now
+
+
+def test_a_setting_that_came_later_may_have_a_default_that_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Grown(task_class("navigation").Settings):
+        places: tuple[int, ...] = Field(default_factory=lambda: (1, 2))
+
+    then = resolve_config("navigation")
+    monkeypatch.setattr(config_module, "task_class", lambda name: SimpleNamespace(Settings=Grown))
+    assert completed(then).task_settings["places"] == [1, 2], "as JSON has it"
