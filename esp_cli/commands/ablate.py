@@ -49,7 +49,10 @@ def ablate(
     ] = None,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""
-    kind, names, settings = f"ablate-{part}", parse_names(methods), parse_names(broken_by)
+    from esp_cli.studies.kinds import KINDS
+
+    kind, settings = f"ablate-{part}", parse_names(broken_by)
+    names = parse_names(methods, KINDS[kind].variants)
     if settings and part != "breaking":
         raise ValueError("--broken-by is for esp ablate breaking; leave it out")
     words = [

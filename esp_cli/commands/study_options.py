@@ -6,7 +6,7 @@ import copy
 import functools
 import inspect
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -91,10 +91,22 @@ ReuseOption = Annotated[
 ]
 
 
-def parse_names(items: Sequence[str] | None) -> tuple[str, ...] | None:
-    """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix")."""
-    names = tuple(name.strip() for item in items or () for name in item.split(",") if name.strip())
-    return names or None
+def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
+    """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix").
+
+    Args:
+        items: as the option was given.
+        known: names that may have ", " in them; of those that fit, the longest is taken.
+    """
+    names: list[str] = []
+    for item in items or ():
+        parts = [part.strip() for part in item.split(",") if part.strip()]
+        while parts:
+            fits = (k for k in range(len(parts), 1, -1) if ", ".join(parts[:k]) in known)
+            end = next(fits, 1)
+            names.append(", ".join(parts[:end]))
+            del parts[:end]
+    return tuple(names) or None
 
 
 def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, int], ...] | None:
