@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from esp_cli.evaluation.final import Mode
 from esp_cli.files.documents import DocumentFormat
@@ -106,7 +106,7 @@ class Results(BaseModel):
     rows: Literal["panels", "variants"]
     episodes: int
     config: dict[str, JsonValue]
-    cells: tuple[CellResult, ...]
+    cells: tuple[CellResult, ...] = Field(min_length=1)
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
         """Return the cell that one is compared with."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+
+from pydantic import JsonValue
 
 from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
 from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
@@ -104,7 +106,7 @@ def comparison_table(results: Results) -> Table:
         rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
     welch = "Ours and the paper's means are compared by Welch's test at 5 %. " if has_paper else ""
     caption = (
-        f"The reference is {kind_of(results.kind).reference}, compared seed by seed"
+        f"The reference is {_reference(results)}, compared seed by seed"
         f"{'' if by_seed else ' where both have the same seeds'}; over all pairs: "
         f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}"
         "No interval is widened for the number of comparisons."
@@ -283,6 +285,19 @@ def _caption(results: Results) -> str:
     episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     said = f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
     return f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed.{said}"
+
+
+def _reference(results: Results) -> str:
+    """Say what runs are compared with."""
+    kind = kind_of(results.kind)
+    firsts = [results.config | cell.config for cell in results.cells if cell.reference is None]
+    return kind.reference if all(map(_is_plain, firsts)) else kind.otherwise
+
+
+def _is_plain(config: Mapping[str, JsonValue]) -> bool:
+    """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
+    symmetric = config["network.name"] in ("equivariant", "empn") or config.get("network.symmetrise")
+    return config["prior.kind"] == "none" and not symmetric
 
 
 def _mean_of(summary: SeedSummary | None) -> str:

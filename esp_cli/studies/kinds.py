@@ -76,7 +76,8 @@ class StudyKind:
         mode: evaluations that are reported, unless the user asks for others.
         thresholds: returns whose first passing is reported; by default that which the reference ended with.
         network_cost: whether to state the sizes of the networks, and to draw the paper's numbers as lines.
-        reference: what a run is compared with, in words.
+        reference: what a run is compared with, in words, where the plain learner is among the runs.
+        otherwise: the same where it is not.
     """
 
     title: str
@@ -97,6 +98,7 @@ class StudyKind:
     thresholds: tuple[float, ...] = ()
     network_cost: bool = False
     reference: str = "the plain learner (the first run) of the same panel"
+    otherwise: str = "the first run of the same panel"
 
 
 def _team(agents: int, landmarks: int | None) -> Team:
@@ -231,6 +233,7 @@ _OTHER = StudyKind("", rows="variants", varies=frozenset(), variants={})
 _TUNED = replace(
     _OTHER,
     reference="the plain run, tuned beside tuned and default beside default, and of a tuned plain run the default one",
+    otherwise="the default run with the same kind of prior",
 )
 
 

@@ -18,6 +18,9 @@ from tests.studies.small_studies import small_study, write_study
 
 PLAIN, ESP = [-150.0, -160.0, -140.0], [-130.0, -120.0, -140.0]
 
+EMPTY = {"format": "esp-results", "version": 1, "kind": "table1", "title": "", "command": "", "esp_version": "0.1.0"}
+EMPTY |= {"mode": "greedy", "rows": "panels", "episodes": 4, "config": {}, "cells": []}
+
 
 def column(results, name, heading):
     """Return one column of a table as texts."""
@@ -222,6 +225,7 @@ def test_the_document_has_the_fields_that_it_always_had(results):
         ("{}", "is foreign: it is not the results of a study"),
         ('{"format": "esp-results", "version": 99}', "was written by a newer esp"),
         ('{"format": "esp-results", "version": 1}', "the setting 'kind' is missing"),
+        (json.dumps(EMPTY), r"bad value \[\] for 'cells'"),
     ],
 )
 def test_what_is_no_results_file_is_told_in_one_sentence(tmp_path, content, sentence):
@@ -241,3 +245,13 @@ def test_an_ablation_has_its_variants_as_rows(tmp_path):
         ("augmentation", "not run"),
         ("both", "-130.00 ± 5.77"),
     )
+
+
+def test_the_reference_is_called_the_plain_learner_only_where_it_is(tmp_path):
+    for first, other, name in (
+        ("none", "both", "the plain learner (the first run)"),
+        ("both", "none", "the first run"),
+    ):
+        study = small_study("ablate-modules", variants=(first, other))
+        found = collect(write_study(tmp_path / first, study, {first: PLAIN, other: ESP})).results
+        assert TABLES["comparison"](found).caption.startswith(f"The reference is {name} of the same panel, compared")
