@@ -32,10 +32,9 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
     if missing:
         raise ValueError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
     if spaces is None:
-        if min(arrays["obs"].ndim, arrays["action"].ndim) < 2:
-            raise ValueError(
-                f"'obs' or 'action' of {path} has no axis of agents; save [episodes, steps, agents, width]"
-            )
+        flat = [name for name in ("obs", "action", "action_mask") if name in arrays and arrays[name].ndim < 2]
+        if flat:
+            raise ValueError(f"'{flat[0]}' of {path} has no axis of agents; save [episodes, steps, agents, width]")
         agents, width = arrays["obs"].shape[-2:]
         count, acts = None, arrays["action"].shape[-1]
         discrete = arrays["action"].dtype.kind in "iu"
@@ -54,6 +53,9 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
         raise ValueError(f"the arrays of {path} hold different numbers of transitions; give each the same")
     if len(tensors["obs"]) < FEWEST:
         raise ValueError(f"{path} holds {len(tensors['obs'])} episodes; record at least {FEWEST}")
+    empty = [name for name, tensor in tensors.items() if not tensor.numel()]
+    if empty:
+        raise ValueError(f"'{empty[0]}' of {path} holds no number; record at least one step of one agent")
     if discrete:
         chosen = tensors["action"]
         if int(chosen.min()) < 0 or (count is not None and int(chosen.max()) >= count):

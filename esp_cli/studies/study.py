@@ -168,6 +168,8 @@ class StudyFolder:
         if not path.is_dir():
             raise StudyError(f"{path} is no study: there is no such folder")
         study = STUDY_FORMAT.parse(path / STUDY, Study)
+        if not study.cells:
+            raise StudyError(f"{path / STUDY} is damaged: it names no run; plan the study again under another --out")
         return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
 
     def _refuse_old_rules(self, cell: Cell) -> None:

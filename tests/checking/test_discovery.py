@@ -228,6 +228,11 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
         assert "there is no file" in refused("discover", tmp_path / "none.npz", *words)
     assert "does not say what its numbers are" in refused("discover", recorded(tmp_path), "--transforms", "d4")
     assert "has no axis of agents" in refused("discover", recorded(tmp_path, obs=np.zeros(64)))
+    scalar = recorded(tmp_path, action=np.zeros((1536, 8, 3), int), action_mask=np.array(True))
+    assert "'action_mask' of" in refused("discover", scalar)
+    nothing = {"obs": (1536, 0, 3, 4), "next_obs": (1536, 0, 3, 4), "action": (1536, 0, 3), "reward": (1536, 0, 3)}
+    empty = {name: np.zeros(shape, int if name == "action" else float) for name, shape in nothing.items()}
+    assert "holds no number; record at least one step" in refused("discover", recorded(tmp_path, **empty))
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
     assert "is for a file of transitions" in refused("discover", tmp_path, "--task", "navigation")

@@ -14,6 +14,8 @@ from tests.studies.small_studies import small_study, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
 
+EMPTY = {"format": "esp-study", "version": 1, "cells": []}
+
 
 def test_a_study_is_read_as_it_was_written_and_going_on_changes_nothing(tmp_path):
     study = small_study()
@@ -59,6 +61,7 @@ def test_something_foreign_is_never_written_into(tmp_path):
         (b'{"format": "other"}', "is foreign"),
         (b'{"format": "esp-study", "version": 99}', "newer esp"),
         (b'{"format": "esp-study", "version": 1}', "the setting 'kind' is missing"),
+        (json.dumps(small_study().model_dump() | EMPTY).encode(), "it names no run; plan the study again"),
     ],
 )
 def test_a_damaged_study_is_told_in_one_sentence(tmp_path, content, sentence):
