@@ -23,7 +23,7 @@ from esp_cli.studies.tuning import REDUCTION, RUNGS, Point, TuningFolder, score
 from esp_cli.studies.tuning_space import space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.folder_names import JOURNAL, METRICS
-from esp_cli.training.metrics import read_last_row
+from esp_cli.training.metrics import elapsed_s, read_last_row
 from esp_cli.training.run_folder import RunFolder
 
 _REFUSED = "refused"
@@ -157,7 +157,7 @@ class Trials:
             pruned=sum(t.state == TrialState.PRUNED for t in trials),
             refused=tuple(t.user_attrs[_REFUSED] for t in trials if _REFUSED in t.user_attrs),
             env_steps=seeds * sum(int(row.get("step", 0)) for row in rows),
-            seconds=sum(float(row.get("time/elapsed_s") or 0.0) for row in rows),
+            seconds=sum(map(elapsed_s, rows)),
             best=None if best is None else best.number,
             best_score=None if best is None else best.value,
             default_score=next((t.value for t in done if t.number == 0 and self._has_defaults(prior, t)), None),

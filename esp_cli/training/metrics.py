@@ -170,6 +170,12 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
+def elapsed_s(row: Mapping[str, Any]) -> float:
+    """Return the seconds of training up to a row; 0 where it states no number."""
+    seconds = row.get("time/elapsed_s")
+    return float(seconds) if isinstance(seconds, int | float) else 0.0
+
+
 def _plain(name: str, value: Value) -> float | int | list[float | int | None] | None:
     """Return a number, or a list of numbers, with None where it is not finite."""
     plain = value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value

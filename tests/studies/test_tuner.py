@@ -285,6 +285,13 @@ def test_a_score_is_called_that_of_the_default_settings_only_where_trial_0_had_t
     assert found.best_score is not None, "the trial has a score all the same"
 
 
+def test_a_trial_that_does_not_state_its_seconds_as_a_number_counts_none(tmp_path):
+    trials = search(tmp_path / "t", tuning(priors=("none",), budget=1)).trials
+    with (tmp_path / "t" / "trials" / "none-000" / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 901, "time/elapsed_s": [1.0]}\n')
+    assert trials.outcome("none").seconds == 0.0
+
+
 def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budgets(tmp_path):
     tuner = search(tmp_path / "t", tuning(budget=16))
     trials = tuner.trials
