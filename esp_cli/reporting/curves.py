@@ -13,7 +13,7 @@ from esp_cli.evaluation.final import Mode
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config
-from esp_cli.training.metrics import column, read_metrics
+from esp_cli.training.metrics import column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.spec import TaskSpec
 
@@ -29,6 +29,7 @@ class RunCurve:
         values: [K, S] returns; NaN where a seed stopped.
         seconds: training time so far.
         trained: environment steps per seed so far, where they are more than those of the last evaluation.
+        task_version: of the task that it was trained on; None where its folder does not say, which is that of today.
     """
 
     label: str
@@ -37,11 +38,13 @@ class RunCurve:
     values: NDArray[np.float64]
     seconds: float
     trained: int = 0
+    task_version: int | None = None
 
     @cached_property
     def spec(self) -> TaskSpec:
-        """What the task says of itself, the convention of its returns among it."""
-        return spec_of(self.config.of_one_seed())
+        """What the task says of itself, the convention of its returns among it; the version is that of the run."""
+        spec = spec_of(self.config.of_one_seed())
+        return spec if self.task_version is None else replace(spec, version=self.task_version)
 
     @property
     def last_step(self) -> int:
@@ -70,7 +73,6 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
         raise ValueError(
             f"{path} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
         )
-    times = (row.get("time/elapsed_s") for row in rows)
-    seconds = max((time for time in times if isinstance(time, int | float)), default=0.0)
+    seconds = max(map(elapsed_s, rows), default=0.0)
     trained = max((row["step"] for row in rows if isinstance(row.get("step"), int)), default=0)
-    return RunCurve(label or path.name, config, steps, values, seconds, trained)
+    return RunCurve(label or path.name, config, steps, values, seconds, trained, folder.task_version())

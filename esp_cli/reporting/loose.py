@@ -37,7 +37,8 @@ def put_together(
         thresholds: returns whose first passing is stated.
 
     Raises:
-        ValueError: a label twice, or runs of different tasks or settings of the task, whose returns do not compare.
+        ValueError: a label twice, or runs of different tasks, versions or settings of the task, whose returns do not
+            compare.
     """
     labels = [curve.label for curve in curves]
     twice = next((label for label in labels if labels.count(label) > 1), None)
@@ -45,6 +46,12 @@ def put_together(
         raise ValueError(f"two runs are called '{twice}'; give each a label of its own, as in plain={paths[0]}")
     if len({(c.config.task, str(sorted(c.config.task_settings.items()))) for c in curves}) > 1:
         raise ValueError("these runs have different tasks or task settings, so their returns do not compare")
+    versions = sorted({curve.spec.version for curve in curves})
+    if len(versions) > 1:
+        raise ValueError(
+            f"these runs were trained on versions {' and '.join(map(str, versions))} of {curves[0].config.task}, in "
+            "which observations, actions or rewards differ, so their returns do not compare; train the older ones again"
+        )
     steps = tuple(dict.fromkeys(at)) or (min(curve.last_step for curve in curves),)
     cells, states, by_name, runs = [], {}, {}, {}
     for step in steps:

@@ -10,12 +10,13 @@ Layout: the safetensors metadata has the key ``esp``, whose text is a JSON objec
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -113,11 +114,37 @@ def load_checkpoint(
     Raises:
         CheckpointError: the file is missing, unreadable, truncated, damaged, foreign or of another format.
     """
-    try:
+    with _naming(path):
         content = _read(Path(path))
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
             raise CheckpointError("is not the file that its manifest names: their SHA-256 differ; get both anew")
         return _decode(content, format_name, version)
+
+
+def read_description(
+    path: str | os.PathLike[str], format_name: str = CHECKPOINT_FORMAT, version: int = CHECKPOINT_VERSION
+) -> dict[str, Any]:
+    """Read the description alone from the header of a file; its checksum is not verified.
+
+    Args:
+        path: file to read.
+        format_name: kind of file that is expected.
+        version: newest version of that format that the caller understands.
+
+    Raises:
+        CheckpointError: the file is missing, unreadable, foreign or of another format, or its header is damaged.
+    """
+    with _naming(path):
+        return _description(
+            parse_object(_read(Path(path), whole=False)[_LENGTH_BYTES:], "header"), format_name, version
+        )
+
+
+@contextlib.contextmanager
+def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Put the name of the file before what is wrong with it."""
+    try:
+        yield
     except (CheckpointError, DocumentError) as error:
         raise CheckpointError(f"{path} {error}") from None
     except OSError as error:
@@ -144,8 +171,8 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     return stored
 
 
-def _read(path: Path) -> bytes:
-    """Return the bytes of a plain file whose header, as declared, fits into it."""
+def _read(path: Path, whole: bool = True) -> bytes:
+    """Return the bytes of a plain file whose header, as declared, fits into it; all of them, or up to its tensors."""
     # a pipe or a device would block or never end, so only plain files are opened
     if not path.is_file():
         raise CheckpointError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
@@ -156,11 +183,12 @@ def _read(path: Path) -> bytes:
         prefix = file.read(_LENGTH_BYTES)
         if len(prefix) < _LENGTH_BYTES:
             raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
-        if struct.unpack("<Q", prefix)[0] > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
+        (header_bytes,) = struct.unpack("<Q", prefix)
+        if header_bytes > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
             raise CheckpointError(
                 "is truncated or no safetensors file: the header that it declares does not fit into it"
             )
-        return prefix + file.read(size - _LENGTH_BYTES)
+        return prefix + file.read(size - _LENGTH_BYTES if whole else header_bytes)
 
 
 def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -30,12 +30,19 @@ from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
-from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from esp_cli.training.checkpoint import (
+    CHECKPOINT_FORMAT,
+    CheckpointError,
+    load_checkpoint,
+    read_description,
+    save_checkpoint,
+)
 from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
 from esp_cli.training.locking import LockError, acquire
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
+from esp_envs.policy_format import POLICY_FORMAT
 
 
 class RunFolderError(ValueError):
@@ -246,6 +253,16 @@ class RunFolder:
             return tensors, meta
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
+        return None
+
+    def task_version(self) -> int | None:
+        """Return the version of the task that the run was trained on; None where no good file states it."""
+        formats = [(self.policy_path, POLICY_FORMAT), *((file, CHECKPOINT_FORMAT) for file in self.checkpoints()[::-1])]
+        for file, format_name in formats:
+            with contextlib.suppress(CheckpointError):
+                version = read_description(file, format_name).get("task_version")
+                if type(version) is int:
+                    return version
         return None
 
     def truncate_metrics(self, after_step: int) -> int:

@@ -14,6 +14,7 @@ from esp_cli.evaluation.statistics import mean_and_sem
 from esp_cli.formatting import format_mean
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
 from esp_cli.studies.tuning import TUNING_FORMAT, TuningFolder
+from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
@@ -214,3 +215,14 @@ def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path
 def test_the_document_of_a_tuning_is_not_overwritten_either(tmp_path: Path) -> None:
     TUNING_FORMAT.write(tmp_path / TuningFolder.document, {})
     assert "belongs to the run or study" in refused("settings", "--json", tmp_path / TuningFolder.document)
+
+
+def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(finished: Path, copied: Path) -> None:
+    policy = DAMAGE["a policy of another version"][0](copied)
+    assert "were trained on versions 0 and 1 of navigation" in refused("report", finished, copied)
+    assert json.loads(esp("report", copied, "--json", "-").stdout)["task_version"] == 0
+    policy.unlink()
+    checkpoint = next((copied / "checkpoints").iterdir())
+    tensors, meta = load_checkpoint(checkpoint)
+    save_checkpoint(checkpoint, tensors, meta | {"task_version": 2})
+    assert "were trained on versions 1 and 2 of navigation" in refused("report", finished, copied)
