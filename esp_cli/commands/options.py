@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
+from esp_cli import console
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 
 T = TypeVar("T")
@@ -47,6 +48,12 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
                 raise ValueError(f"--set {name} has a value that is not JSON; write lists as [64,64]") from None
             settings[name] = text.strip()
     return settings
+
+
+def note_without_effect(names: Iterable[str]) -> None:
+    """Name the settings that were asked for and that change nothing beside the others."""
+    if idle := ", ".join(sorted(names)):
+        console.note(f"without effect beside the other settings: {idle}")
 
 
 def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dict[str, object]:

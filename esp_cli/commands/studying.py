@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from esp_cli import console
+from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
@@ -48,7 +49,7 @@ def run_study(
     Raises:
         ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
-    from esp_cli.studies.catalogue import plan
+    from esp_cli.studies.catalogue import plan, without_effect
     from esp_cli.studies.study import StudyFolder
     from esp_cli.training.build import build_learner
 
@@ -58,6 +59,7 @@ def run_study(
         build_learner(cell.config.of_one_seed())
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(study.cells[0].config.device)
+        note_without_effect(without_effect(kind, request))
         if choices.dry_run:
             _dry_run(StudyFolder(out, study), others, jobs, choices.json)
             return

@@ -23,6 +23,7 @@ from esp_cli.commands.options import (
     StepsOption,
     TaskOption,
     TransformsOption,
+    note_without_effect,
     parse_assignments,
     register_learners,
     register_tasks,
@@ -154,7 +155,7 @@ def train(
         choices, overrides, said = with_file(context, config, choices, overrides)
     init_from = choices.pop("init_from")
     kept = init_from if isinstance(init_from, OwnCopy) else None
-    idle = sorted(said & resolve_config(**choices | {"device": "cpu"}, overrides=overrides).without_effect())
+    idle = said & resolve_config(**choices | {"device": "cpu"}, overrides=overrides).without_effect()
     init_from = None if kept else init_from
     resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
     if kept is not None:
@@ -162,8 +163,7 @@ def train(
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    if idle:
-        console.note(f"without effect beside the other settings: {', '.join(idle)}")
+    note_without_effect(idle)
     _train(begin(resolved, weights, out), trackers)
 
 

@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import check_finite
+from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
+from esp_cli.commands.studying import (
+    follow,
+    measuring,
+    open_engine,
+    refuse_failed,
+    report_study,
+    run_cells,
+    say_disk,
+)
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -75,6 +83,8 @@ def tune(
     with open_engine(choices, out) as engine:
         jobs = choices.jobs or engine.places(tuning.device)
         others = choices.reused()
+        idle = frozenset.intersection(*map(tuning.without_effect, priors))
+        note_without_effect([name for name in tuning.overrides if name in idle])
         if choices.dry_run:
             _dry_run(tuning, request.seeds, request.episodes, jobs, out, choices.json)
             return

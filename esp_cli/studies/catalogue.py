@@ -59,19 +59,47 @@ def plan(name: str, request: Request) -> Study:
         ValueError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
     """
     kind = KINDS[name]
+    return Study(
+        kind=name,
+        title=kind.title,
+        command=request.command,
+        episodes=request.episodes,
+        rows=kind.rows,
+        cells=tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request)),
+    )
+
+
+def without_effect(name: str, request: Request) -> list[str]:
+    """Return the settings that a user asked for and that change nothing in any run of a study.
+
+    Args:
+        name: of `KINDS`.
+        request: what the user asked for.
+
+    Raises:
+        ValueError: as `plan`.
+    """
+    configs = [cell.config for cell in _cells(KINDS[name], request)]
+    idle = [(config, config.without_effect()) for config in configs]
+    return [
+        setting
+        for setting in request.overrides
+        if all(task_setting(setting, c.task) in names for c, names in idle if _concerns(setting, c.task, c.algorithm))
+    ]
+
+
+def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
+    """Return the runs of a study as the user asked for them, before anything is measured for them."""
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
     if not variants or len(set(variants)) < len(variants) or not set(variants) <= set(kind.variants):
-        raise ValueError(f"name each variant of this study once; they are {', '.join(kind.variants)}")
+        raise ValueError(f"name each variant of this study once; they are {', '.join(map(repr, kind.variants))}")
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
     for setting in request.overrides:
         if any(task_setting(setting, task) in kind.varies for task in tasks):
             raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
     _refuse_unused(kind, request, tasks, algorithms)
     build = _pairs if kind.rows == "panels" else _variants
-    cells = tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
-    return Study(
-        kind=name, title=kind.title, command=request.command, episodes=request.episodes, rows=kind.rows, cells=cells
-    )
+    return tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
 
 
 def _pairs(
@@ -153,11 +181,16 @@ def _config(task: str, algorithm: str, steps: int, request: Request, choice: Set
     """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
     settings = dict(common)
     for name, value in request.overrides.items():
-        section = name.rpartition(".")[0]
-        if section in (task, algorithm) or section not in (*ALGORITHMS, *task_names()):
+        if _concerns(name, task, algorithm):
             settings[task_setting(name, task)] = value
     settings |= choice
-    return planned(resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings))
+    return resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
+
+
+def _concerns(name: str, task: str, algorithm: str) -> bool:
+    """Return whether a setting is one of all runs, or of those of this task or algorithm."""
+    section = name.rpartition(".")[0]
+    return section in (task, algorithm) or section not in (*ALGORITHMS, *task_names())
 
 
 def _comparable(config: RunConfig, settings: Settings) -> bool:

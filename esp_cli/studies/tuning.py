@@ -19,7 +19,7 @@ from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.folder_names import METRICS, TUNING
-from esp_cli.training.metrics import MetricsError, column, read_metrics
+from esp_cli.training.metrics import MetricsError, column, elapsed_s, read_metrics
 
 Goal = Literal["return", "steps", "seconds"]
 SMOOTHED = 3
@@ -73,12 +73,20 @@ class Tuning(Strict):
         Raises:
             ValueError: a setting is unknown or out of range.
         """
-        chosen = {**self.overrides, "prior.kind": prior, **settings}
-        run_seeds = self.trial_seeds if seeds is None else seeds
-        config = planned(
-            resolve_config(self.task, self.algorithm, self.preset, self.steps, run_seeds, self.device, chosen)
-        )
+        config = planned(self._asked(prior, settings, self.trial_seeds if seeds is None else seeds))
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
+
+    def _asked(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
+        """Return a run before anything is measured for it."""
+        chosen = {**self.overrides, "prior.kind": prior, **settings}
+        return resolve_config(self.task, self.algorithm, self.preset, self.steps, seeds, self.device, chosen)
+
+    def without_effect(self, prior: str) -> frozenset[str]:
+        """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""
+        space = space_of(self.space, prior)
+        tried: list[dict[str, object]] = [{name: value} for name, d in space.items() for value in d.corners()]
+        configs = (self._asked(prior, settings, self.trial_seeds) for settings in ({}, *tried))
+        return frozenset.intersection(*(config.without_effect() for config in configs))
 
     def check(self, seeds: Sequence[int]) -> None:
         """Refuse what cannot be run.
@@ -87,8 +95,9 @@ class Tuning(Strict):
             seeds: of the runs that judge the best settings.
 
         Raises:
-            ValueError: a trial has one of the seeds, a setting of the space is unknown, refuses a value or is not the
-                learner's, a choice cannot be trained, or the goal lacks its return.
+            ValueError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
+                learner's or changes nothing, nothing is left to search, a choice cannot be trained, or the goal lacks
+                its return.
         """
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
@@ -110,8 +119,30 @@ class Tuning(Strict):
                     raise ValueError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
                 for value in dimension.corners():
                     self.config(prior, {name: value})
+        self._check_effects()
         for prior in self.priors:
             self._check_choices(prior)
+
+    def _check_effects(self) -> None:
+        """Refuse a setting that changes nothing with any prior that it is searched for, and a search of no setting.
+
+        Raises:
+            ValueError: there is one.
+        """
+        spaces = {prior: space_of(self.space, prior) for prior in self.priors}
+        for prior, space in spaces.items():
+            if not space:
+                raise ValueError(
+                    f"with --prior {prior} no setting of the space changes anything, so its trials would be equal; add "
+                    "a setting of the learner, or leave this prior out"
+                )
+        idle = {prior: self.without_effect(prior) for prior in self.priors}
+        for name in self.space:
+            searched = [prior for prior, space in spaces.items() if name in space]
+            if searched and all(name in idle[prior] for prior in searched):
+                raise ValueError(
+                    f"the space varies '{name}', which is without effect beside the other settings; leave it out"
+                )
 
     def _check_choices(self, prior: str) -> None:
         """Refuse a choice with which nothing can be trained, before trials are spent on it.
@@ -214,7 +245,7 @@ class TuningFolder(StudyFolder):
         except MetricsError:
             return []
         means = returns.mean(1).tolist()
-        seconds = [float(row.get("time/elapsed_s") or 0.0) for row in rows]
+        seconds = [elapsed_s(row) for row in rows]
         return [
             Point(
                 int(step), seconds[k], mean, math.fsum(means[max(0, k + 1 - SMOOTHED) : k + 1]) / min(k + 1, SMOOTHED)

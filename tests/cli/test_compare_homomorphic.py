@@ -63,7 +63,10 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--methods", "mpn,cnn"], "name each variant of this study once; they are mpn, mpn-esp, empn, mpn-ensemble"),
+        (
+            ["--methods", "mpn,cnn"],
+            "they are 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'",
+        ),
         (["--contestants", "mpn,mpn"], "name each variant of this study once"),
         (["--grid", "6"], "use odd numbers"),
         (["--group", "so2"], "so2 cannot act on wildlife"),

@@ -17,6 +17,7 @@ from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
@@ -34,6 +35,12 @@ KILLED_STEPS = 1500
 def test_names_and_steps_are_read_from_lists() -> None:
     assert parse_names(["mappo, qmix", "maddpg"]) == ("mappo", "qmix", "maddpg")
     assert parse_names(None) is parse_names([","]) is None
+    assert parse_names(["none,rot90,rot90, rot180", "C4,drawn"], KINDS["ablate-transforms"].variants) == (
+        "none",
+        "rot90",
+        "rot90, rot180",
+        "C4, drawn",
+    )
     assert parse_study_steps(["500k,formation=1M", "3M"]) == (
         (None, 500_000),
         ("formation", 1_000_000),
@@ -69,6 +76,13 @@ def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> Non
 
 
 @pytest.mark.usefixtures("forked_jobs")
+def test_a_setting_that_no_run_of_a_study_heeds_is_named(tmp_path: Path) -> None:
+    words = ("ablate", "prior", "--steps", 100, "--seeds", 1, *TINY_OPTIONS, "--out", tmp_path / "s", "--dry-run")
+    idle, heeded = ("--set", "prior.replay=stored"), ("--set", "prior.consistency_coef=0")
+    told = esp(*words, *idle, *heeded).stderr
+    assert "without effect beside the other settings: prior.replay\n" in told
+
+
 def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) -> None:
     out = tmp_path / "s"
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--jobs", 1)
@@ -147,6 +161,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
     [
         (["ablate", "colours"], "'colours' is not one of"),
         (["ablate", "modules", "--steps", "soon"], "'soon' is not a number of steps"),
+        (["ablate", "transforms", "--methods", "rot90, rot270"], "once; they are 'none', 'rot90', 'rot90, rot180', "),
         (["ablate", "modules", "--algo", "magic"], "unknown algorithm 'magic'"),
         (["ablate", "coefficient", "--set", "prior.consistency_coef=1"], "varies by itself"),
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from esp_cli.checking import measured
 from esp_cli.prior import PriorConfig
-from esp_cli.studies.catalogue import Request, paper_cells, plan
+from esp_cli.studies.catalogue import Request, paper_cells, plan, without_effect
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import Reported, horizons, reported, tasks
 from esp_cli.symmetry import parse
@@ -147,6 +149,13 @@ def test_a_setting_reaches_the_runs_that_it_concerns():
         assert config.task_settings.get("prey") == ("fleeing" if config.task == "predator-prey" else None)
         assert config.network.hidden == (8,)
         assert config.prior.transforms == ("c4" if config.prior.kind == "esp" else PriorConfig().transforms)
+
+
+def test_a_setting_is_without_effect_where_every_run_that_it_concerns_leaves_it_unused():
+    asked = {"mappo.truncation": 5, "prior.replay": "stored", "prior.terms": "both", "prior.consistency_coef": 0}
+    chosen = request(algorithms=("mappo", "qmix"), tasks=("navigation",), overrides=asked)
+    assert without_effect("table1", chosen) == ["mappo.truncation", "prior.terms"]
+    assert without_effect("table1", replace(chosen, algorithms=("mappo",))) == list(asked)[:3]
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,14 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
         ),
         ({"space": {"evaluation.episodes": Dimension(low=1, high=9)}}, "fix it by --set evaluation.episodes=VALUE"),
         ({"overrides": {"mappo.gamma": 0.9}}, "--set mappo.gamma fixes what the space varies"),
+        (
+            {"space": SPACE | {"prior.replay": Dimension(choices=("sampled", "stored"))}},
+            r"varies 'prior\.replay', which is without effect",
+        ),
+        (
+            {"space": {"prior.consistency_coef": Dimension(low=0.1, high=1.0)}},
+            "with --prior none no setting of the space",
+        ),
         ({"goal": "steps"}, "--for steps needs --reach RETURN"),
         ({"reach": -100.0}, "--for return takes no --reach"),
     ],
@@ -138,6 +146,13 @@ def test_a_choice_of_the_prior_is_not_asked_of_the_plain_learner():
     tuning(priors=("none",), space=SPACE | {"prior.transforms": Dimension(choices=("c4", "zz"))}).check((0, 1))
 
 
+def test_a_setting_that_another_one_of_the_space_gives_an_effect_is_searched():
+    doubt = {"prior.doubt": Dimension(low=1.0, high=9.0)}
+    with pytest.raises(ValueError, match=r"varies 'prior\.doubt', which is without effect"):
+        tuning(priors=("esp",), space=doubt).check((0, 1))
+    tuning(priors=("esp",), space=doubt | {"prior.trust": Dimension(choices=("full", "measured"))}).check((0, 1))
+
+
 def test_a_setting_of_the_task_may_be_fixed_though_none_is_searched():
     tuning(overrides={"task.num_agents": 2, "evaluation.episodes": 2}).check((0, 1))
 
@@ -167,11 +182,13 @@ def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
     path.mkdir(parents=True)
     rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0], "time/elapsed_s": k} for k in range(5)]
     rows.insert(1, {"step": 50})
+    rows[-1]["time/elapsed_s"] = [4.0]
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     found = folder.curve(cell)
     assert [point.step for point in found] == [0, 100, 200, 300, 400]
     assert [point.mean for point in found] == [0.0, -4.0, -8.0, -12.0, -16.0]
     assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
+    assert [point.seconds for point in found] == [0.0, 1.0, 2.0, 3.0, 0.0], "a list is no number of seconds"
     assert folder.curve(folder.cell("esp", 4, {})) == []
 
 
