@@ -160,9 +160,10 @@ def _tune(
         raise ValueError(f"Optuna is not installed: {install('tune')}") from None
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TuningFolder, fresh_study
+    from esp_cli.training.folder_names import FRESH
 
     out, fresh = choices.folder("tune"), None
-    judged = out / "fresh"
+    judged = out / FRESH
     with TuningFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
             StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))

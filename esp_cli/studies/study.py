@@ -27,14 +27,14 @@ from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
+from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
-from esp_cli.training.folder_names import CONFIG, FINAL, LOG, POLICY, STUDY, STUDY_LOCK
+from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
 from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire
 from esp_cli.training.run_folder import RunFolder
 
-_RUNS = "runs"
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _OLD_FINAL = "judgement.json"
 
@@ -106,10 +106,12 @@ class StudyFolder:
         path: the folder.
         study: all that was ever planned in it.
         document: name of the file that makes a folder one.
+        runs: name of the folder of its run folders.
         noun: what messages call what it holds.
     """
 
     document: ClassVar[str] = STUDY
+    runs: ClassVar[str] = "runs"
     noun: ClassVar[str] = "study"
 
     def __init__(self, path: Path, study: Study) -> None:
@@ -193,12 +195,15 @@ class StudyFolder:
         """Make the folder, empty, unless it is there.
 
         Raises:
-            StudyError: it holds something foreign.
+            StudyError: it holds something foreign, or a link where its runs belong.
         """
         if path.is_file():
             raise StudyError(f"{path} is a file; choose another --out")
+        if (path / cls.runs).is_symlink():
+            raise StudyError(f"{path / cls.runs} is a link, which is not followed; put the folder itself there")
         if not cls.is_one(path) and path.is_dir():
-            foreign = [entry.name for entry in path.iterdir() if entry.name != STUDY_LOCK]
+            names = (entry.name for entry in path.iterdir())
+            foreign = [name for name in names if name != STUDY_LOCK and not name.startswith(TEMPORARY_PREFIX)]
             if foreign:
                 raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
         path.mkdir(parents=True, exist_ok=True)
@@ -208,6 +213,8 @@ class StudyFolder:
     def held(cls, path: Path) -> Iterator[None]:
         """Hold the folder, made if missing, so that no second process plans or works in it.
 
+        Half-written documents that a killed process left are removed, those of the fresh study of a tuning too.
+
         Raises:
             StudyError: it holds something foreign.
             LockError: another process holds it.
@@ -215,13 +222,16 @@ class StudyFolder:
         cls.make(path)
         descriptor = acquire(path / STUDY_LOCK)
         try:
+            for folder in (path, path / FRESH):
+                for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
+                    file.unlink(missing_ok=True)
             yield
         finally:
             os.close(descriptor)
 
     def run_path(self, cell: Cell) -> Path:
         """Return the run folder of a cell."""
-        return self.path / _RUNS / cell.name
+        return self.path / self.runs / cell.name
 
     def log_path(self, cell: Cell) -> Path:
         """Return the file that the processes of a cell write to."""
@@ -270,7 +280,7 @@ class StudyFolder:
 
         Links in its folder are left out: they would bring in files from anywhere.
         """
-        part = self.path / _RUNS / f".{cell.name}.part"
+        part = self.path / self.runs / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:

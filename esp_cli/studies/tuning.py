@@ -28,7 +28,6 @@ RUNGS = 2
 """Times that successive halving looks at a trial before its end."""
 REDUCTION = 3
 """One of so many trials goes on at each rung, and trains so many times as long."""
-_TRIALS = "trials"
 _GIVEN = ("task", "evaluation")
 """Sections that no search varies: it would choose the easiest task, or the evaluation that scores highest."""
 NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
@@ -192,6 +191,7 @@ class TuningFolder(StudyFolder):
     """
 
     document = TUNING
+    runs = "trials"
     noun = "tuning"
 
     def __init__(self, path: Path, tuning: Tuning) -> None:
@@ -222,16 +222,12 @@ class TuningFolder(StudyFolder):
 
     def trial_path(self, prior: str, number: int) -> Path:
         """Return the run folder of a trial."""
-        return self.path / _TRIALS / f"{prior}-{number:03d}"
+        return self.path / self.runs / f"{prior}-{number:03d}"
 
     def cell(self, prior: str, number: int, settings: Mapping[str, object]) -> Cell:
         """Return the run of a trial."""
         name = self.trial_path(prior, number).name
         return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
-
-    def run_path(self, cell: Cell) -> Path:
-        """Return the run folder of a trial's cell."""
-        return self.path / _TRIALS / cell.name
 
     def is_finished(self, cell: Cell) -> bool:
         """Return whether a trial is trained to its end; it has no evaluation beside its curve."""

@@ -12,6 +12,8 @@ LOG, FINAL = "log.txt", "final-evaluation.json"
 """Of the run of a study."""
 STUDY, TUNING, STUDY_LOCK, JOURNAL = "study.json", "tuning.json", "study.lock", "journal.jsonl"
 """Of the folder of a study or a tuning."""
+FRESH = "fresh"
+"""Of the folder of the study that judges the best settings of a tuning."""
 
 
 def is_leftover(entry: Path) -> bool:

@@ -7,8 +7,10 @@ import sys
 
 import pytest
 
+from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.study import StudyError, StudyFolder, read_evaluation
+from esp_cli.studies.tuning import TuningFolder
 from esp_cli.training.locking import LockError, is_held
 from tests.studies.small_studies import small_study, write_study
 
@@ -237,3 +239,25 @@ def test_planted_links_at_the_lock_and_the_log_are_not_written_to(tmp_path):
     with pytest.raises(OSError, match="no regular file is there; remove it"):
         LocalEngine([sys.executable, "-c", "pass"]).start(["x"], log)
     assert mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", [StudyFolder, TuningFolder])
+def test_a_study_killed_while_its_first_document_is_written_goes_on(tmp_path, kind):
+    (tmp_path / f"{TEMPORARY_PREFIX}0").write_text("half")
+    with kind.held(tmp_path):
+        assert [path.name for path in tmp_path.iterdir()] == ["study.lock"]
+    (tmp_path / "fresh").mkdir()
+    (tmp_path / "fresh" / f"{TEMPORARY_PREFIX}0").write_text("half")
+    (tmp_path / kind.document).write_text("{}")
+    with kind.held(tmp_path):
+        StudyFolder.create(tmp_path / "fresh", small_study())
+        assert [path.name for path in (tmp_path / "fresh").iterdir()] == ["study.json"]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(StudyFolder, "runs"), (TuningFolder, "trials")])
+def test_runs_are_not_written_through_a_link(tmp_path, kind, name):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / name).symlink_to(tmp_path / "outside")
+    with pytest.raises(StudyError, match=f"{name} is a link, which is not followed"), kind.held(tmp_path / "s"):
+        pass
