@@ -154,8 +154,13 @@ class RunFolder:
         removed.
 
         Raises:
-            RunFolderError: another process, or this one, holds it already, or the file system cannot lock.
+            RunFolderError: another process, or this one, holds it already, the file system cannot lock, or the folder
+                of checkpoints is a link.
         """
+        if (self.path / CHECKPOINTS).is_symlink():
+            raise RunFolderError(
+                f"{self.path / CHECKPOINTS} is a link, which is not followed; put the folder itself there"
+            )
         try:
             descriptor = acquire(self.lock_path)
         except LockError as error:

@@ -396,3 +396,13 @@ def test_a_full_disk_is_no_mistake_of_the_user(folder, full_disk):
     assert folder.checkpoints() == []
     write_checkpoints(folder, 100)
     assert names(folder) == ["step-000000000100.safetensors"]
+
+
+def test_a_link_at_the_checkpoints_is_refused_before_anything_is_removed(folder, tmp_path):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / f"{TEMPORARY_PREFIX}mine").touch()
+    (folder.path / "checkpoints").rmdir()
+    (folder.path / "checkpoints").symlink_to(tmp_path / "outside")
+    with pytest.raises(RunFolderError, match="checkpoints is a link, which is not followed"), folder.lock():
+        pass
+    assert len(list((tmp_path / "outside").iterdir())) == 1
