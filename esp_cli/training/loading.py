@@ -85,7 +85,7 @@ def _check_settings(model: type[BaseModel], settings: object, section: str, sour
 
 
 def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
-    """Load the policy of a run folder (its newest checkpoint) or of a policy file.
+    """Load the policy of a run folder (its newest checkpoint, else its policy file) or of a policy file.
 
     Args:
         path: of the folder or file.
@@ -101,6 +101,8 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
     folder = RunFolder.open(path)
     notes: list[str] = []
     found = folder.latest_checkpoint(notes.append)
+    if found is None and folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
+        return _build(path, parse_config(folder.config, path), *read_policy(folder.policy_path))
     if found is None:
         raise ValueError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
     tensors, meta = found

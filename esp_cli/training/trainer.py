@@ -91,7 +91,8 @@ class Trainer:
         track: names of trackers that get the metrics too.
 
     Raises:
-        ValueError: the checkpoint does not fit the configuration, or a tracker is not installed.
+        ValueError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
+            installed.
     """
 
     def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = ()) -> None:
@@ -150,8 +151,8 @@ class Trainer:
         tracked = TrackedRun(self.folder.path, self.config.seeds, self.folder.config, self.step)
         sinks = open_trackers(self.track, tracked, self.notes.append)
         with MetricsWriter(self.folder.metrics_path, sinks) as writer:
-            if self.iteration == 0:
-                self._record(writer, self._evaluate(), listener)
+            if self.iteration == 0 and not self._record(writer, self._evaluate(), listener):
+                return False
             while not self.is_complete:
                 tick = time.monotonic()
                 row, seconds = self._iterate()
@@ -252,6 +253,10 @@ class Trainer:
     def _restore(self) -> None:
         """Continue from the newest good checkpoint; without one, start from the beginning."""
         found = self.folder.latest_checkpoint(self.notes.append)
+        if found is None and self.folder.policy_path.is_file():
+            raise ValueError(
+                f"{self.folder.path} is trained and has no checkpoint to go on from; train anew under another --out"
+            )
         if found is not None:
             tensors, meta = found
             self._load(tensors)

@@ -91,6 +91,7 @@ def _truncate(file: Path) -> Path:
 
 def _without_checkpoints(run: Path) -> Path:
     shutil.rmtree(run / "checkpoints")
+    (run / "policy.safetensors").unlink()
     return run
 
 

@@ -55,7 +55,7 @@ def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, c
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())
     initial = tmp_path / "cut" / "initial-policy.safetensors"
     initial.write_bytes((tmp_path / "whole" / "policy.safetensors").read_bytes())
-    for file in (tmp_path / "cut" / "checkpoints").iterdir():
+    for file in (*(tmp_path / "cut" / "checkpoints").iterdir(), tmp_path / "cut" / "policy.safetensors"):
         file.unlink()
     assert "does not hold the policy that the run started from" in refused("train", "--resume", tmp_path / "cut")
 

@@ -50,6 +50,15 @@ def test_run_and_policy_file_give_the_weights_that_were_trained(trained):
         assert all(torch.equal(tensor, weights[name]) for name, tensor in loaded.policy.state_dict().items())
 
 
+def test_a_run_that_keeps_no_checkpoint_is_loaded_from_its_policy_file(folder):
+    shutil.rmtree(folder.path / "checkpoints")
+    loaded, file = load_policy(folder.path), load_policy(folder.policy_path)
+    assert (loaded.config, loaded.spec, loaded.source) == (file.config, file.spec, folder.path)
+    assert (loaded.step, loaded.stopped) == (file.step, file.stopped)
+    weights = file.policy.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in loaded.policy.state_dict().items())
+
+
 def test_a_damaged_checkpoint_is_passed_over_with_a_note_and_no_warning(folder):
     good = folder.checkpoints()[-1]
     folder.checkpoint_path(150).write_bytes(good.read_bytes()[:-1])

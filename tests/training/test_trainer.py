@@ -165,6 +165,26 @@ def test_a_run_whose_every_seed_stopped_trains_no_further_when_it_is_resumed(tmp
     assert all(same_bits(again[name], tensors[name]) for name in tensors)
 
 
+def test_a_finished_run_without_checkpoints_is_refused_and_keeps_its_metrics(tmp_path):
+    folder = tiny_folder(tmp_path / "run", steps=100)
+    trainer(folder).run(lambda news: True)
+    rows = folder.metrics_path.read_bytes()
+    for file in folder.checkpoints():
+        file.unlink()
+    with pytest.raises(ValueError, match="is trained and has no checkpoint to go on from"):
+        trainer(folder)
+    assert folder.metrics_path.read_bytes() == rows
+
+
+def test_a_run_stopped_at_its_first_evaluation_trains_nothing_and_is_resumed(tmp_path):
+    straight, halted = tiny_folder(tmp_path / "a", steps=100), tiny_folder(tmp_path / "b", steps=100)
+    assert not trainer(halted).run(lambda news: False)
+    assert [row["step"] for row in read_metrics(halted.metrics_path)] == [0]
+    for folder in (straight, halted):
+        assert trainer(folder).run(lambda news: True)
+    assert untimed(straight) == untimed(halted)
+
+
 def test_another_configuration_cannot_continue_a_checkpoint(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(stop_after(2))
