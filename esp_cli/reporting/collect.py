@@ -21,7 +21,7 @@ from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
 from esp_cli.training.folder_names import CONFIG, METRICS
-from esp_cli.training.metrics import MetricsError, read_last_row
+from esp_cli.training.metrics import NoMetricError, read_last_row
 
 _DIGITS = 4
 """Decimals that are kept of a return; the bootstrap and the tables need two."""
@@ -115,11 +115,11 @@ def results_of(study: Study, states: Mapping[str, RunState], mode: Mode, thresho
 
 def _read_curve(run: Path, cell: Cell, mode: Mode) -> RunCurve | None:
     """Read the evaluations of a cell's run; None where there are none yet."""
-    if not (run / CONFIG).is_file():
+    if not (run / CONFIG).is_file() or not (run / METRICS).exists():
         return None
     try:
         return read_curve(run, cell.variant, mode)
-    except MetricsError:  # it has only begun
+    except NoMetricError:  # it has only begun
         return None
 
 

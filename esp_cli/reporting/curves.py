@@ -13,7 +13,7 @@ from esp_cli.evaluation.final import Mode
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config
-from esp_cli.training.metrics import column, elapsed_s, read_metrics
+from esp_cli.training.metrics import MetricsError, column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.spec import TaskSpec
 
@@ -67,7 +67,10 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     """
     folder = RunFolder.open(path)
     rows = read_metrics(folder.metrics_path)
-    steps, values = column(rows, f"eval/return_{mode}")
+    try:
+        steps, values = column(rows, f"eval/return_{mode}")
+    except MetricsError as error:
+        raise type(error)(f"{folder.metrics_path}: {error}") from None
     config = parse_config(folder.config, path)
     if values.shape[1] != len(config.seeds):
         raise ValueError(
@@ -75,4 +78,5 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
         )
     seconds = max(map(elapsed_s, rows), default=0.0)
     trained = max((row["step"] for row in rows if isinstance(row.get("step"), int)), default=0)
-    return RunCurve(label or path.name, config, steps, values, seconds, trained, folder.task_version())
+    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
+    return RunCurve(label or name, config, steps, values, seconds, trained, folder.task_version())

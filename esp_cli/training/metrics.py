@@ -7,6 +7,7 @@ steps per seed, a list has one number per seed, a bare number belongs to the run
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import math
@@ -30,11 +31,15 @@ Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 
 
 _TAIL_BYTES = 2**18
-"""Longer than any row."""
+"""Longer than most rows."""
 
 
 class MetricsError(ValueError):
     """A metrics file cannot be written or read; the text is one sentence for the user."""
+
+
+class NoMetricError(MetricsError):
+    """No row has a metric."""
 
 
 class MetricsWriter:
@@ -108,14 +113,15 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
-    try:
-        with Path(path).open("rb") as file:
-            file.seek(0, os.SEEK_END)
-            file.seek(max(0, file.tell() - _TAIL_BYTES))
-            lines = file.read().split(b"\n")
-    except OSError:
-        return {}
-    return next((row for row in map(_parse, reversed(lines)) if row is not None), {})
+    size, row = _TAIL_BYTES, None
+    with contextlib.suppress(OSError), Path(path).open("rb") as file:
+        end = start = file.seek(0, os.SEEK_END)
+        while row is None and start > 0:
+            start = file.seek(max(0, end - size))
+            lines = reversed(file.read().split(b"\n"))
+            row = next((row for row in map(_parse, lines) if row is not None), None)
+            size *= 2
+    return row or {}
 
 
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
@@ -152,14 +158,15 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
         Steps [K] (env steps per seed) and values [K, S]; a bare number is a value of one seed.
 
     Raises:
-        MetricsError: no row has the metric, or its rows differ in the number of seeds.
+        NoMetricError: no row has the metric.
+        MetricsError: its rows differ in the number of seeds, or hold something else than numbers.
     """
     found = [(row["step"], row[name]) for row in rows if name in row]
     if not found:
         names = sorted({key for row in rows for key in row if key != "step"})
         near = difflib.get_close_matches(name, names, 3, 0.4) or names[:3]
         hint = f"; there is {', '.join(near)}" if near else ", and no other metric either"
-        raise MetricsError(f"no row has the metric '{name}'{hint}")
+        raise NoMetricError(f"no row has the metric '{name}'{hint}")
     lists = [value if isinstance(value, list) else [value] for _, value in found]
     if len({len(numbers) for numbers in lists}) > 1:
         raise MetricsError(f"the rows of '{name}' differ in the number of seeds")

@@ -234,3 +234,10 @@ def test_each_step_asked_for_is_a_panel_and_a_run_that_did_not_get_there_says_wh
         ("ESP", "-5.00 ± 0.58", "at 100"),
     )
     assert [cell.status for cell in material.results.cells] == ["finished"] * 3 + ["unfinished"]
+
+
+def test_a_run_has_the_name_of_its_folder_from_inside_it_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(written(tmp_path / "cn", [{"step": 0, "eval/return_greedy": [1.0, 2.0]}]).path)
+    (tmp_path / "link").symlink_to(tmp_path / "cn")
+    labels = [read_curve(Path(path), None, "greedy").label for path in (".", "../cn", "../link")]
+    assert labels == ["cn", "cn", "link"]

@@ -255,3 +255,21 @@ def test_the_reference_is_called_the_plain_learner_only_where_it_is(tmp_path):
         study = small_study("ablate-modules", variants=(first, other))
         found = collect(write_study(tmp_path / first, study, {first: PLAIN, other: ESP})).results
         assert TABLES["comparison"](found).caption.startswith(f"The reference is {name} of the same panel, compared")
+
+
+def test_damaged_metrics_are_not_taken_for_a_run_that_has_only_begun(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
+    metrics = folder.run_path(folder.study.cells[0]) / "metrics.jsonl"
+    whole = metrics.read_text()
+    for damaged, sentence in (
+        ("{\n" + whole, "line 1 is not a row of metrics"),
+        (whole + '{"step": 300, "eval/return_greedy": [1]}\n', "differ in the number of seeds"),
+    ):
+        metrics.write_text(damaged)
+        with pytest.raises(ValueError, match=f"{metrics}.* {sentence}"):
+            collect(folder)
+    for young in ("", '{"step": 50}\n'):
+        metrics.write_text(young)
+        assert collect(folder).results.cells[0].step <= 50
+    metrics.unlink()
+    assert collect(folder).results.cells[0].step == 0

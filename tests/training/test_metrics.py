@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.training.metrics import MetricsError, MetricsWriter, column, read_metrics, truncate_metrics
+from esp_cli.training import metrics
+from esp_cli.training.metrics import (
+    MetricsError,
+    MetricsWriter,
+    column,
+    read_last_row,
+    read_metrics,
+    truncate_metrics,
+)
 
 ROWS = [
     {"step": 100, "train/loss": [1.0, 2.0], "time/seconds": 0.5},
@@ -162,3 +170,12 @@ def test_a_torn_line_does_not_swallow_the_next_row(path):
         with MetricsWriter(path) as writer:
             writer.write(999, {"train/loss": [1.0]})
         assert read_metrics(path) == [*before, {"step": 999, "train/loss": [1.0]}]
+
+
+def test_the_last_row_is_found_however_long_it_is(path, monkeypatch):
+    monkeypatch.setattr(metrics, "_TAIL_BYTES", 8)
+    with path.open("a") as file:
+        file.write('{"step": 400, "train/l')
+    assert read_last_row(path) == ROWS[-1]
+    path.write_text("torn")
+    assert read_last_row(path) == {}
