@@ -11,6 +11,7 @@ from esp_cli.prior import PriorConfig
 from esp_cli.studies.catalogue import Request, paper_cells, plan, without_effect
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import Reported, horizons, reported, tasks
+from esp_cli.studies.study import StudyFolder
 from esp_cli.symmetry import parse
 from esp_envs import registry, task_class
 from tests.studies.small_studies import request, small_study
@@ -206,3 +207,10 @@ def test_two_numbers_of_steps_that_are_one_row_of_a_task_are_run_once():
 def test_a_seed_stands_in_a_run_once():
     with pytest.raises(ValueError, match="twice"):
         plan("table1", request(tasks=("navigation",), seeds=(0, 0)))
+
+
+def test_a_class_with_letters_beyond_ascii_has_a_study(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry.TASKS, "_registered", {})
+    own = registry.register(type("Fläche", (task_class("navigation"),), {"__module__": "feld"}))
+    study = plan("ablate-prior", Request(tasks=(own,), steps=((None, 20_000),)))
+    assert StudyFolder.create(tmp_path / "s", study).study.cells[0].name.startswith("feld-fl-che-")
