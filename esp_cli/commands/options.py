@@ -133,8 +133,10 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     return parser
 
 
-def not_over_a_run(path: T) -> T:
+def not_over_a_run(context: typer.Context, path: T) -> T:
     """Return the path of an option that writes a table or results, unless it is what a run or a study needs.
+
+    Only `esp eval` may write the final evaluation of a run.
 
     Raises:
         ValueError: the path is that of a document or weights in the folder of a run, a study or a tuning.
@@ -143,20 +145,17 @@ def not_over_a_run(path: T) -> T:
 
     if path is None or str(path) == "-":
         return path
+    from esp_cli.files.documents import begins_with  # pydantic comes with it, which no help needs
+
     real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
     documents = (of.CONFIG, of.STUDY, of.TUNING)
-    owned = real.name in (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
-    if owned and real.is_file() and any(map(_is_document, (real.parent / name for name in documents))):
-        raise ValueError(f"{path} belongs to the run or study in {real.parent}; write to another file")
+    names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
+    owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))
+    home = next((folder.parent for folder in real.parents if folder.name == of.CHECKPOINTS), None)
+    for folder in (real.parent if owned else None, home):
+        if folder and any(begins_with(folder / name, '"format": "esp-') for name in documents):
+            raise ValueError(f"{path} belongs to the run or study in {folder}; write to another file")
     return path
-
-
-def _is_document(path: Path) -> bool:
-    """Return whether a file is a document of esp, which begins with its format."""
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return b'"format": "esp-' in file.read(100)
 
 
 TaskOption = Annotated[

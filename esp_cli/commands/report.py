@@ -110,7 +110,8 @@ def report(
     from esp_cli.reporting import collect, curves, loose
     from esp_cli.reporting.csv_file import write_csv
     from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuning import TuningFolder
+    from esp_cli.studies.tuning import TUNING_FORMAT
+    from esp_cli.training.folder_names import FRESH, TUNING
 
     register_tasks(task)
     register_learners(algo or [], network or [])
@@ -123,8 +124,8 @@ def report(
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
     y_limits = _limits(y_limits, view)
-    if TuningFolder.is_one(Path(runs[0])):
-        fresh = shlex.quote(str(Path(runs[0]) / "fresh"))
+    if TUNING_FORMAT.is_one(Path(runs[0]) / TUNING):  # the report of a tuning has a file of this name too
+        fresh = shlex.quote(str(Path(runs[0]) / FRESH))
         raise ValueError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
     is_study = StudyFolder.is_one(Path(runs[0]))
     if is_study:

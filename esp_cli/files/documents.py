@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -75,6 +76,10 @@ class DocumentFormat:
             raise self.error(f"{path} was written by a newer esp; update esp to use it")
         return document
 
+    def is_one(self, path: Path) -> bool:
+        """Return whether a file is such a document, which begins with its format."""
+        return begins_with(path, f'"format": "{self.name}"')
+
     def parse(self, path: str | os.PathLike[str], model: type[Model]) -> Model:
         """Read a document and validate its content.
 
@@ -102,6 +107,14 @@ class DocumentFormat:
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Return content with the keys that say what it is."""
         return {"format": self.name, "version": self.version, **content}
+
+
+def begins_with(path: Path, text: str) -> bool:
+    """Return whether the first lines of a file hold a text, such as the format of a document."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return text.encode() in file.read(100)
 
 
 def validate(model: type[Model], content: object) -> Model:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -60,10 +61,14 @@ def write_report(material: Material, out: Path) -> list[Path]:
         The files: the page, the Markdown, the pictures, the results and the form for marl-eval.
 
     Raises:
-        ValueError: no run has an evaluation yet, or a file cannot be written.
+        ValueError: no run has an evaluation yet, the folder has a report of something else, or a file cannot be
+            written.
     """
     if not material.curves:
         raise ValueError("no run of this study has an evaluation yet; run it first, or wait a little")
+    foreign = next((out / name for name in (MARKDOWN, RESULTS) if os.path.lexists(out / name)), None)
+    if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
+        raise ValueError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
     out.mkdir(parents=True, exist_ok=True)
     panels = _panels(material)
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
@@ -103,7 +108,7 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
         watch: told how many are done.
     """
     for count, run in enumerate(runs.values(), start=1):
-        if (run / POLICY).is_file() and not (run / FILM).is_file():
+        if (run / POLICY).is_file() and not _is_film(run / FILM):
             trained = load_policy(run / POLICY)
             speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
             with TemporaryDirectory() as scratch:
@@ -194,7 +199,15 @@ def draw_over_strength(results: Results, out: Path) -> Pictures:
 
 def _films(material: Material) -> dict[Path, str]:
     titles = {cell.name: f"{cell.panel}: {cell.variant}" for cell in material.study.cells}
-    return {run / FILM: titles[name] for name, run in material.runs.items() if (run / FILM).is_file()}
+    return {run / FILM: titles[name] for name, run in material.runs.items() if _is_film(run / FILM)}
+
+
+def _is_film(path: Path) -> bool:
+    """Return whether a film is there; a link is not followed."""
+    if path.is_symlink() or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(4) == b"GIF8"
 
 
 def _runs(material: Material) -> list[RunText]:

@@ -206,6 +206,9 @@ def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path
         before = file.read_bytes()
         assert f"{file} belongs to the run or study in" in refused("report", copied, option, file)
         assert file.read_bytes() == before
+    for file in (copied / "final-evaluation.json", copied / "checkpoints" / "new" / "table.csv"):
+        esp("eval", copied, "--episodes", "4", "--json", copied / "final-evaluation.json")
+        assert f"{file} belongs to the run or study in {copied};" in refused("report", copied, option, file)
     for file in (copied / "all.csv", tmp_path / "config.json"):
         file.touch()
         esp("report", copied, option, file)
@@ -226,3 +229,12 @@ def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(fin
     tensors, meta = load_checkpoint(checkpoint)
     save_checkpoint(checkpoint, tensors, meta | {"task_version": 2})
     assert "were trained on versions 1 and 2 of navigation" in refused("report", finished, copied)
+
+
+def test_the_report_of_a_tuning_is_not_taken_for_a_tuning(tmp_path: Path) -> None:
+    TUNING_FORMAT.write(tmp_path / TuningFolder.document, {})
+    assert f"is a tuning with a report of its own; report its study by: esp report {tmp_path}/fresh" in refused(
+        "report", tmp_path
+    )
+    (tmp_path / TuningFolder.document).write_text("{}")
+    assert "is no run folder" in refused("report", tmp_path)

@@ -128,6 +128,27 @@ def test_a_study_that_has_not_begun_has_no_report(tmp_path):
         write_report(Material(made.study, made.results, {}, {}), tmp_path / "out")
 
 
+@pytest.mark.parametrize("name", ["report.md", "results.json"])
+def test_a_report_of_somebody_else_is_not_replaced(tmp_path, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    with pytest.raises(ValueError, match=f"{name} is not of a report by esp; move it away"):
+        write_report(material(tmp_path), tmp_path / "out")
+    assert {file.name: file.read_text() for file in (tmp_path / "out").iterdir()} == {name: "mine"}
+    (tmp_path / "out" / name).unlink()
+    for _ in range(2):
+        write_report(material(tmp_path), tmp_path / "out")
+
+
+def test_a_film_that_is_a_link_or_no_film_stays_out_of_the_page(tmp_path):
+    made = material(tmp_path)
+    first, second = made.runs.values()
+    (tmp_path / "secret").write_bytes(b"GIF8 of mine")
+    (first / "film.gif").symlink_to(tmp_path / "secret")
+    (second / "film.gif").write_text("text")
+    assert "data:image/gif" not in write_report(made, tmp_path / "out")[0].read_text()
+
+
 def test_a_hostile_label_stays_text_in_markdown(tmp_path):
     assert markdown_text("a|b <i>*c*</i> `d` [e](f)\ng") == r"a\|b \<i>\*c\*\</i> \`d\` [e\](f) g"
     table = Table("t", ("a|b",), (("c|d",),), "e|f").markdown()
