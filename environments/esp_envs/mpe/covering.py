@@ -78,17 +78,9 @@ def shared_out(position: Tensor, landmark: Tensor) -> Tensor:
 
     Args:
         position: [N, 2, W].
-        landmark: [L, 2, W].
-
-    Raises:
-        ValueError: more than MAX_SHARINGS ways.
+        landmark: [L, 2, W]; N^L ways are tried, for which `MAX_SHARINGS` is a good limit.
     """
     agents, landmarks = position.shape[0], landmark.shape[0]
-    if agents**landmarks > MAX_SHARINGS:
-        raise ValueError(
-            f"the heuristic 'cover' would try {agents**landmarks} sharings of {landmarks} landmarks among {agents} "
-            f"agents; use 'greedy' above {MAX_SHARINGS}"
-        )
     places, costs = _places(position, landmark)
     best = torch.full_like(position[0, 0], torch.inf)
     goal = position.clone()
