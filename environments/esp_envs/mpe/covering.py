@@ -15,7 +15,7 @@ LOOKAHEAD_S = 0.2
 FULL_FORCE_DISTANCE = 0.2
 """How far one step of full force carries an agent in all (0.5 length/s, fading by a quarter a step, 0.1 s each)."""
 MAX_SHARINGS = 4096
-"""Most ways of sharing out landmarks that `shared_out` tries."""
+"""Most ways of sharing out landmarks that `shared_out` should try."""
 TRAVEL_WEIGHT = 0.25
 """Weight of the distance to travel against the distance that remains, in `shared_out`; found by search."""
 
