@@ -296,8 +296,8 @@ def _reference(results: Results) -> str:
 
 def _is_plain(config: Mapping[str, JsonValue]) -> bool:
     """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
-    symmetric = config["network.name"] in ("equivariant", "empn") or config.get("network.symmetrise")
-    return config["prior.kind"] == "none" and not symmetric
+    symmetric = config.get("network.name") in ("equivariant", "empn") or config.get("network.symmetrise")
+    return config.get("prior.kind") == "none" and not symmetric
 
 
 def _mean_of(summary: SeedSummary | None) -> str:

@@ -255,6 +255,10 @@ def test_the_reference_is_called_the_plain_learner_only_where_it_is(tmp_path):
         study = small_study("ablate-modules", variants=(first, other))
         found = collect(write_study(tmp_path / first, study, {first: PLAIN, other: ESP})).results
         assert TABLES["comparison"](found).caption.startswith(f"The reference is {name} of the same panel, compared")
+    silent = found.model_copy(
+        update={"config": {}, "cells": tuple(c.model_copy(update={"config": {}}) for c in found.cells)}
+    )
+    assert "The reference is the first run of" in TABLES["comparison"](silent).caption, "a file may say less"
 
 
 def test_damaged_metrics_are_not_taken_for_a_run_that_has_only_begun(tmp_path):
