@@ -102,7 +102,7 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
             return {}, {}, {}, {}, {}
         step = self._env.step(self._joint(actions))
         terminated, truncated = bool(step.terminated[0, 0]), bool(step.truncated[0, 0])
-        if (terminated or truncated) and self._env.has("set_state"):
+        if (terminated or truncated) and self.render_mode is not None and self._env.has("set_state"):
             self._env.set_state(step.reached.state)  # the world has reset itself; show how the episode ended
         seen, agents = step.reached, self.agents
         living = self._living(seen, agents)

@@ -14,15 +14,7 @@ from esp_cli import console
 from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import (
-    follow,
-    measuring,
-    open_engine,
-    refuse_failed,
-    report_study,
-    run_cells,
-    say_disk,
-)
+from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
