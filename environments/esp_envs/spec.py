@@ -218,6 +218,16 @@ class Continuous:
 
     layout: Layout
 
+    def __post_init__(self) -> None:
+        """Refuse what is no vector of numbers.
+
+        Raises:
+            ValueError: a field is a picture, a ring or a record.
+        """
+        for part in self.layout.fields:
+            if part.kind in (Kind.PICTURE, Kind.RING, Kind.RECORD):
+                raise ValueError(f"an action cannot hold '{part.name}', a {part.kind.name}; give vectors and numbers")
+
     @property
     def width(self) -> int:
         """Numbers per agent."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 
+from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import exchangeable
 from esp_cli.symmetry.elements import order_name
@@ -60,7 +61,12 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
-    factors = Factors.of(spaces.symmetry)
+    if spaces.symmetry not in ("", "c1") and element in parse_elements(spaces.symmetry, spaces.num_agents):
+        return True
+    try:
+        factors = Factors.of(spaces.symmetry)
+    except ValueError:  # it is one order of items, which holds nothing but itself
+        return False
     if not all(factors.allow(name, len(places)) for name, places in element.orders):
         return False
     if element.in_place.is_identity:
@@ -71,15 +77,18 @@ def is_declared(element: Element, spaces: Spaces) -> bool:
     return element.in_place in group
 
 
-def found_group(holding: Collection[str], spaces: Spaces) -> str:
+def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
+    holding = {verdict.element for verdict in verdicts if verdict.outcome == "holds"}
+    broken = {verdict.element for verdict in verdicts if verdict.outcome == "broken"}
     plane = "c1"
     for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_elements(name, 1))):
         if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
             plane = name
-    if "rot57" in holding:
-        plane = "o2" if "flip23" in holding else "so2"
-    agents = any(name.startswith("agents-") for name in holding)
+    for name, of_any_angle, steps in (("so2", {"rot57"}, "c8"), ("o2", {"rot57", "flip23"}, "d8")):
+        if of_any_angle <= holding and broken.isdisjoint(element.name for element in _elements(steps, 1)):
+            plane = name
+    agents = spaces.num_agents > 1 and set(_orders("agents", spaces.num_agents)) <= set(holding)
     counts = exchangeable(spaces).items()
     items = {name: count for name, count in counts if set(_orders(name, count)) <= set(holding)}
     return Factors(plane, agents, items).name

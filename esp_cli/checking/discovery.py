@@ -161,16 +161,14 @@ def _is_readable(text: str, accepted: Sequence[Element]) -> bool:
 def _plane(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, str]:
     """Return the name and the `--transforms` of the largest planar group whose tried elements are all accepted."""
     held, seen = set(accepted), set(tried)
-    names = {e.name for e in accepted}
     best, text, size = "c1", "", 0
     for name, elements in _subgroups():
         known = [e for e in elements if e in seen]
         if len(known) > size and held.issuperset(known) and _generate(known, elements):
             best, text, size = name, name if "," not in name else ",".join(e.name for e in known), len(known)
-    if {"rot57", "flip23"} <= names:
-        return "o2", "o2"
-    if "rot57" in names and best.startswith("c"):
-        return "so2", "so2"
+    for name, of_any_angle, steps in (("o2", "rot57,flip23", "d16"), ("so2", "rot57", "c16")):
+        if held.issuperset((*_listed(of_any_angle), *seen.intersection(_listed(steps)))):
+            return name, name
     return best, text
 
 

@@ -55,5 +55,4 @@ def check_symmetry(make: MakeWorlds, transforms: str | None = None) -> SymmetryR
     else:
         worlds = min(_COPIES, max(32, 8192 // spec.horizon))
         method, verdicts = "transitions", check_transitions(spec, collect(make(worlds, [0])), elements)
-    holding = {verdict.element for verdict in verdicts if verdict.outcome == "holds"}
-    return SymmetryReport(spec.name, method, spec.symmetry, found_group(holding, spec), tuple(verdicts))
+    return SymmetryReport(spec.name, method, spec.symmetry, found_group(verdicts, spec), tuple(verdicts))

@@ -213,11 +213,11 @@ def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
         heuristic: return of the heuristic policy.
 
     Raises:
-        ValueError: the anchors agree, or are not finite.
+        ValueError: the heuristic policy is not better than the random one, or an anchor is not finite.
     """
-    if not np.isfinite([random, heuristic]).all() or random == heuristic:
+    if not np.isfinite([random, heuristic]).all() or random >= heuristic:
         raise ValueError(
-            f"the anchors random = {random} and heuristic = {heuristic} give no scale; they have to differ"
+            f"the anchors random = {random} and heuristic = {heuristic} give no scale; the heuristic has to be better"
         )
     return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
 

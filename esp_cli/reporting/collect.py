@@ -171,7 +171,7 @@ def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonVa
 
 def _timed(results: Results, cell: CellResult, curve: RunCurve | None, thresholds: Sequence[float]) -> CellResult:
     """Return a cell with the first steps at thresholds, by default at what its reference ended with."""
-    if curve is None or cell.status != "finished":
+    if curve is None or (not thresholds and cell.status != "finished"):
         return cell
     if not thresholds:
         other = results.reference_of(cell)

@@ -133,7 +133,8 @@ def read_results(path: Path) -> Results:
 def join(several: Sequence[Results]) -> Results:
     """Return the results of studies of one kind as those of one study, the cells in their order.
 
-    A cell that two of them have with the same returns, as a run and its repetition do, counts once.
+    A cell that two of them have with the same returns, as a run and its repetition do, counts once; of a cell that one
+    of them has not finished, the other one's returns count.
 
     Raises:
         ValueError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
@@ -145,10 +146,10 @@ def join(several: Sequence[Results]) -> Results:
     for results in several:
         for cell in results.cells:
             there = cells.get(cell.name)
-            if there is None:
+            if there is None or (cell.returns and not there.returns):
                 whole = {"config": results.config | cell.config, "episodes": cell.episodes or results.episodes}
                 cells[cell.name] = cell.model_copy(update=whole)
-            elif (there.returns, there.seeds, there.step) != (cell.returns, cell.seeds, cell.step):
+            elif cell.returns and (there.returns, there.seeds, there.step) != (cell.returns, cell.seeds, cell.step):
                 raise ValueError(f"{cell.name} stands in two of the results files, with different returns")
     command = "\n".join(dict.fromkeys(results.command for results in several))
     return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells.values())})

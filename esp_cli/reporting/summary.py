@@ -168,6 +168,6 @@ def side_of(interval: tuple[float, float] | None) -> Side | None:
 
 def _normalised(cell: CellResult, values: Floats) -> Floats | None:
     heuristics = [value for name, value in cell.anchors.items() if name != "random"]
-    if "random" not in cell.anchors or not heuristics or cell.anchors["random"] == max(heuristics):
+    if "random" not in cell.anchors or not heuristics or cell.anchors["random"] >= max(heuristics):
         return None
     return normalise(values, cell.anchors["random"], max(heuristics))

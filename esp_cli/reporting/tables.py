@@ -253,7 +253,7 @@ def all_tables(results: Results) -> list[Table]:
 def _compared(cell: CellResult, found: CellSummary) -> dict[str, str]:
     """Return the texts of a finished cell by heading."""
     returns, gap = found.returns, found.gap
-    texts = {"return>": format_mean(returns.mean, returns.sem), "95 % interval>": format_interval(returns.ci95)}
+    texts = {"return>": _mean_of(returns), "95 % interval>": format_interval(returns.ci95)}
     if cell.reference is None:
         texts |= dict.fromkeys(_GAP, "")
     elif gap is not None:
@@ -269,7 +269,7 @@ def _short(results: Results, cell: CellResult) -> str:
     """Return the number of a cell, or how far it is."""
     found = summarise_cell(results, cell)
     if found is not None:
-        return format_mean(found.returns.mean, found.returns.sem) if found.returns.mean is not None else _STOPPED
+        return _mean_of(found.returns) if found.returns.mean is not None else _STOPPED
     return NOT_RUN if cell.status == "not run" else f"at {format_count(cell.step)}"
 
 
@@ -301,7 +301,11 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
 
 
 def _mean_of(summary: SeedSummary | None) -> str:
-    return NOTHING if summary is None else format_mean(summary.mean, summary.sem)
+    """Return mean and standard error, and how many seeds stopped and are not in them."""
+    if summary is None or summary.mean is None:
+        return NOTHING
+    stopped = summary.per_seed.count(None)
+    return format_mean(summary.mean, summary.sem) + (f" ({stopped} stopped)" if stopped else "")
 
 
 def _return_at(results: Results, cell: CellResult, early: bool) -> str:

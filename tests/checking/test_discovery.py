@@ -148,6 +148,8 @@ def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
         ("rot180,flip-diagonal,flip-antidiagonal", "rot180,flip-diagonal,flip-antidiagonal", None),
         ("d16,rot57,flip23", "o2", "o2"),
         ("c16,rot57", "so2", "so2"),
+        ("rot45,rot57,flip23", "c1", ""),
+        ("d4,rot57", "d4", "d4"),
         ("d4,agents-1-0-2,agents-0-2-1,agents-2-1-0", "d4*agents", "d4*agents"),
         ("flip-x,agents-1-0-2", "flip-x and agents-1-0-2", "flip-x,agents-1-0-2"),
         ("d4,marks-1-0-2,marks-0-2-1", "d4*marks-3", "d4*marks-3"),
@@ -345,3 +347,14 @@ def test_where_nothing_is_found_there_is_no_prior() -> None:
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:"}))
     plain = resolve_config("navigation")
     assert prepared(plain) is plain
+
+
+def test_few_transitions_say_nothing() -> None:
+    env = make("navigation", 64, [0])
+    data = collect(env, 128, 1)
+    (verdict,) = check_by_regression(env.spec, data, parse_elements("flip-x", 3))
+    assert (verdict.outcome, verdict.fields) == ("not covered", ())
+    # 226 numbers x 4, of 3 agents at once: 302 episodes, and as many to predict
+    assert verdict.reason == "128 episodes are too few, record at least 604"
+    (enough,) = check_by_regression(env.spec, collect(env, 640, 1), parse_elements("flip-x", 3))
+    assert not enough.reason

@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from esp_cli.checking import Transitions, candidates, check_transitions, collect
-from esp_cli.checking.candidates import found_group
+from esp_cli.checking.candidates import found_group, is_declared
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
 from esp_envs.spec import Field, Items, Kind, Spaces, layout
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
+HOLDS = FieldVerdict("position", "holds", 0.0, 0.1)
 CONTINUOUS = {"actions": "continuous"}
 
 
@@ -73,7 +75,33 @@ def anybodys(drift: float) -> tuple[Spaces, Transitions]:
 def test_anybodys_transitions_are_judged(drift: float, found: str) -> None:
     spaces, data = anybodys(drift)
     verdicts = check_transitions(spaces, data, candidates(spaces))
-    assert found_group({v.element for v in verdicts if v.outcome == "holds"}, spaces) == found
+    assert found_group(verdicts, spaces) == found
+
+
+def test_one_exchange_is_not_all_orders() -> None:
+    row = layout(Field("position", Kind.VECTOR))
+    state = layout(Field("position", Kind.VECTOR, 3, items=Items.AGENTS))
+    spaces = Spaces(num_agents=3, observation=row, state=state, action=FORCE, symmetry="c1")
+    swap, around = (ElementVerdict(name, False, (HOLDS,)) for name in ("agents-1-0-2", "agents-1-2-0"))
+    broken = replace(around, fields=(replace(HOLDS, outcome="broken"),))
+    assert found_group([swap, broken], spaces) == "c1"
+    assert found_group([swap, around], spaces) == "c1*agents"
+
+
+def test_any_angle_needs_the_steps_too() -> None:
+    spaces, _ = anybodys(0.0)
+    names = [element.name for element in parse_elements("c8,rot57", 2)]
+    verdicts = [ElementVerdict(name, False, (HOLDS,)) for name in names]
+    assert found_group(verdicts, spaces) == "so2"
+    verdicts[0] = replace(verdicts[0], fields=(replace(HOLDS, outcome="broken"),))
+    assert found_group(verdicts, spaces) != "so2"
+
+
+def test_an_order_that_is_declared_alone_is_declared() -> None:
+    spaces, _ = anybodys(0.0)
+    swap, turn, both = parse_elements("agents-1-0,rot90,rot90*agents-1-0", 2)
+    spaces = replace(spaces, symmetry="rot90*agents-1-0")
+    assert [is_declared(one, spaces) for one in (swap, turn, both)] == [False, False, True]
 
 
 @pytest.mark.parametrize("name", ["obs", "action", "reward", "next_obs"])

@@ -330,3 +330,11 @@ def test_the_tasks_of_the_page_keep_every_promise(page: None, task: str, package
     horizon = {} if package == "gymnasium" else {"horizon": 8}
     findings = list(check(Subject(lambda n, seeds: make(name, n, seeds, {"workers": 0, **horizon}))))
     assert [finding for finding in findings if finding.broken] == []
+
+
+@pytest.mark.parametrize(
+    "field", [Field("ring", Kind.RING, rays=4), Field("pair", Kind.RECORD, parts=(Field("a", Kind.VECTOR),))]
+)
+def test_an_action_holds_vectors_and_numbers_alone(field: Field) -> None:
+    with pytest.raises(ValueError, match=f"an action cannot hold '{field.name}', a {field.kind.name}; give vectors"):
+        Continuous(layout(field))

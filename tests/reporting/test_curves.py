@@ -241,3 +241,9 @@ def test_a_run_has_the_name_of_its_folder_from_inside_it_too(tmp_path, monkeypat
     (tmp_path / "link").symlink_to(tmp_path / "cn")
     labels = [read_curve(Path(path), None, "greedy").label for path in (".", "../cn", "../link")]
     assert labels == ["cn", "cn", "link"]
+
+
+def test_a_threshold_that_was_passed_counts_in_a_run_that_ended_before_the_comparison():
+    short, whole = curve(PLAIN[:3], "short", STEPS[:3]), curve(ESP, "whole")
+    runs = compare([short, whole], [300], [-5.0])["runs"]
+    assert [run["steps_to"]["-5.0"]["mean"] for run in runs] == [200, 100]

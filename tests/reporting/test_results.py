@@ -9,7 +9,7 @@ import pytest
 
 from esp_cli.evaluation.statistics import average_improvement, leader
 from esp_cli.reporting.collect import collect
-from esp_cli.reporting.results import Passing, read_results
+from esp_cli.reporting.results import Passing, join, read_results
 from esp_cli.reporting.summary import aggregates, summarise_cell
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.paper import reported
@@ -56,6 +56,26 @@ def test_returns_are_normalised_by_the_best_heuristic(results):
     assert summarise_cell(results, cell).normalised.mean == pytest.approx(1 / 3), "-150 is a third of -200 to -50"
     alone = cell.model_copy(update={"anchors": {"random": -200.0}})
     assert summarise_cell(results, alone).normalised is None
+    poor = cell.model_copy(update={"anchors": {"random": -50.0, "heuristic": -60.0}})
+    assert summarise_cell(results, poor).normalised is None, "a worse run would have the higher score"
+
+
+def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(results):
+    first, second = results.cells
+    begun = second.model_copy(update={"status": "not run", "returns": {}, "step": 0})
+    early = results.model_copy(update={"cells": (first, begun)})
+    for several in ([early, results], [results, early]):
+        assert [cell.returns for cell in join(several).cells] == [first.returns, second.returns]
+    other = second.model_copy(update={"returns": first.returns})
+    with pytest.raises(ValueError, match="stands in two of the results files, with different returns"):
+        join([results, results.model_copy(update={"cells": (first, other)})])
+
+
+def test_the_study_says_how_many_seeds_stopped(results):
+    first, second = results.cells
+    stopped = second.model_copy(update={"returns": {"greedy": (-20.0, -21.0, None)}})
+    shown = returns_table(results.model_copy(update={"cells": (first, stopped)}))
+    assert "-20.50 ± 0.50 (1 stopped)" in [text for row in shown.rows for text in row]
 
 
 def test_steps_to_where_the_reference_ended(results):
