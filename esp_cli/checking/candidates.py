@@ -88,10 +88,15 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     for name, of_any_angle, steps in (("so2", {"rot57"}, "c8"), ("o2", {"rot57", "flip23"}, "d8")):
         if of_any_angle <= holding and broken.isdisjoint(element.name for element in _elements(steps, 1)):
             plane = name
-    agents = spaces.num_agents > 1 and set(_orders("agents", spaces.num_agents)) <= set(holding)
+    agents = any(_is_order(name) for name in holding) and not any(_is_order(name) for name in broken)
     counts = exchangeable(spaces).items()
     items = {name: count for name, count in counts if set(_orders(name, count)) <= set(holding)}
     return Factors(plane, agents, items).name
+
+
+def _is_order(name: str) -> bool:
+    """Return whether an element only changes the places of agents."""
+    return name.startswith("agents-")
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:

@@ -124,7 +124,7 @@ int main(void)
 
 
 def _header(program: Program, comment: str) -> str:
-    told = "\n".join(f" * {line}".rstrip() for line in comment.replace("*/", "* /").splitlines())
+    told = "\n".join(f" * {line}".rstrip() for line in comment.replace("*/", "* /").replace("/*", "/ *").splitlines())
     if program.team > 1:
         returns = "Writes the index of each agent's best action; the observations stand side by side."
     elif program.head == "choose":

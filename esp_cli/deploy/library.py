@@ -117,6 +117,8 @@ class LoadedPolicy:
             return np.zeros(shape, np.float32 if isinstance(space, Continuous) else np.int64), carried
         policy, noise = self.trained.policy, None
         if rng is not None:
+            if not isinstance(rng, np.random.Generator):
+                raise ValueError(f"rng is {rng!r}; give a generator, as numpy.random.default_rng makes it")
             generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
             noise = policy.head.noise((1, count), [generator])
         seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
@@ -151,9 +153,12 @@ class LoadedPolicy:
     def _checked(self, values: ArrayLike, width: int, what: str, meaning: str) -> Floats:
         """Return [..., width] float32 after checking that it is that."""
         try:
-            array = np.asarray(values, np.float32)
+            given = np.asarray(values)
         except (TypeError, ValueError):
-            raise ValueError(f"the {what} is not an array of numbers; give (..., {width}): {meaning}") from None
+            given = np.asarray("")
+        if given.dtype.kind not in "fiub":  # numpy would make numbers of texts, and cut complex ones
+            raise ValueError(f"the {what} is not an array of real numbers; give (..., {width}): {meaning}")
+        array = given.astype(np.float32, copy=False)
         if array.ndim == 0 or array.shape[-1] != width:
             raise ValueError(
                 f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}"

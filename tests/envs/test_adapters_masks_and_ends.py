@@ -8,7 +8,7 @@ import torch
 
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_envs import Discrete, Environment, Field, Kind, generators_for, layout, register
+from esp_envs import Continuous, Discrete, Environment, Field, Kind, generators_for, layout, register
 from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
@@ -188,3 +188,138 @@ def test_gymnasiums_masks_come_from_infos():
         expected = [first.action_mask(int(place)) for place in seen.obs.flatten()]
         assert torch.equal(seen.action_mask[0, :, 0], torch.tensor(np.array(expected)).bool())
         seen = env.step(env.random_action()).next
+
+
+class Hunt(Corridor):
+    """A prey that does not learn is paid the opposite of the wolves; the first wolf leaves after a step."""
+
+    possible_agents = ("prey", "wolf_0", "wolf_1")
+
+    def step(self, actions):
+        self.time += 1
+        acted = list(self.agents)
+        reward = {name: -10.0 if name == "prey" else 10.0 for name in acted}
+        out = {name: name == "wolf_0" for name in acted}
+        cut = dict.fromkeys(acted, self.time == STEPS)
+        seen = self._seen()
+        self.agents = [name for name in acted if not (out[name] or cut[name])]
+        return seen, reward, out, cut, {name: {} for name in acted}
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.time, self.places = list(self.possible_agents), 0, dict.fromkeys(self.possible_agents, 2)
+        return self._seen(), {name: {} for name in self.agents}
+
+
+def test_a_shared_reward_that_goes_on_is_that_of_the_learners():
+    class Wolves(Walkers):
+        learners, shared_reward, masks = "wolf", True, False
+
+        def make_one(self):
+            return Hunt()
+
+        def opponent(self, agent, observation, generator):
+            return 0
+
+    env = worlds(Wolves, 1, (3,))
+    env.reset()
+    steps = [env.step(torch.zeros(1, 1, 2, dtype=torch.int64)) for _ in range(3)]
+    assert [step.reward.flatten().tolist() for step in steps] == [[10.0, 10.0]] * 3
+
+
+class Door(gymnasium.Env):
+    """Pays what it is given; `state` and `width_m` are its own."""
+
+    observation_space = gymnasium.spaces.Box(-9.0, 9.0, (1,))
+    width_m = 0.5
+
+    def __init__(self, space):
+        self.action_space = space
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), f"{action!r} is no action"
+        return np.ones(1, np.float32), float(np.sum(action)), False, False, {}
+
+    def state(self):
+        return [self.width_m, 7.0]
+
+
+def door(space, action, **attributes) -> type[SingleAgentTask]:
+    class Doors(SingleAgentTask):
+        Settings = CorridorSettings
+        observation = layout(Field("place", Kind.SCALAR))
+        symmetry, convention = "c1", "place"
+
+        def make_single(self):
+            return Door(space)
+
+    Doors.action = action
+    for name, value in attributes.items():
+        setattr(Doors, name, value)
+    return Doors
+
+
+TWO_WAYS = Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("stay", "on"))
+ONE_NUMBER = Continuous(layout(Field("force", Kind.SCALAR)))
+
+
+def test_indices_begin_where_the_space_begins():
+    env = worlds(door(gymnasium.spaces.Discrete(2, start=3), TWO_WAYS), 1, (3,))
+    env.reset()
+    assert [float(env.step(torch.tensor([[[a]]])).reward) for a in (0, 1)] == [3.0, 4.0]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_an_action_never_leaves_its_box(dtype):
+    env = worlds(door(gymnasium.spaces.Box(-2.0, 0.2, (1,), dtype), ONE_NUMBER), 1, (3,))
+    env.reset()
+    rewards = [float(env.step(torch.full((1, 1, 1, 1), a)).reward) for a in (-1.0, 0.0, 1.0)]
+    assert rewards == pytest.approx([-2.0, -0.9, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("space", "action"),
+    [(gymnasium.spaces.MultiBinary(2), TWO_WAYS), (gymnasium.spaces.Box(0, 10, (1,), np.int64), ONE_NUMBER)],
+)
+def test_spaces_that_hold_other_things_are_refused(space, action):
+    with pytest.raises(ValueError, match=r"agent acts in .*, but the task says"):
+        worlds(door(space, action))
+
+
+def test_state_and_measure_reach_the_gymnasium_environment():
+    state = layout(Field("width_m", Kind.SCALAR), Field("number", Kind.SCALAR))
+    cls = door(gymnasium.spaces.Discrete(2), TWO_WAYS, state=state, metrics=("width_m",))
+    cls.measure = lambda self, env, infos: {"width_m": env.unwrapped.width_m}
+    env = worlds(cls, 1, (3,))
+    assert env.reset().state.flatten().tolist() == [0.5, 7.0]
+    assert float(env.step(torch.zeros(1, 1, 1, dtype=torch.int64)).metrics["width_m"]) == 0.5
+
+
+@pytest.mark.parametrize(
+    ("attributes", "sentence"),
+    [
+        ({"metrics": ("width_m",), "measure": lambda *_: {}}, r"raises in 'measure': KeyError: 'width_m'"),
+        ({"reading": lambda _, name, seen: {0.0: seen}[float(seen[0])]}, r"raises in 'reading': KeyError: 1\.0"),
+    ],
+)
+def test_what_fails_in_a_hook_is_named(attributes, sentence):
+    env = worlds(door(gymnasium.spaces.Discrete(2), TWO_WAYS, **attributes))
+    env.reset()
+    with pytest.raises(ValueError, match=f"copy 0 of Doors {sentence}"):
+        env.step(torch.zeros(2, 5, 1, dtype=torch.int64))
+
+
+def test_an_agent_that_joins_later_is_refused():
+    class Late(Corridor):
+        def reset(self, seed=None, options=None):
+            seen, infos = super().reset(seed)
+            return {"walker_0": seen["walker_0"]}, infos
+
+    class Joining(Walkers):
+        def make_one(self):
+            return Late()
+
+    with pytest.raises(ValueError, match="walker_1 gets no observation from 'reset'"):
+        worlds(Joining)

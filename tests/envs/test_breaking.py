@@ -270,3 +270,15 @@ def test_breakings_are_off_by_default_and_named_in_the_convention_when_on(task: 
     assert make(task, 1, [0], {name: 0.25}).spec.convention == f"{env.spec.convention}, {name} 0.25"
     with pytest.raises(ValueError, match=name):
         make(task, 1, [0], {name: -0.1})
+
+
+@pytest.mark.parametrize("sight", ["offset", "nearness"])
+def test_noise_shows_nothing_of_a_hidden_body(sight: str) -> None:
+    all_round = SMALL | {"blind_sector_rad": 6.2, "sight": sight}
+    plain, noisy = (
+        make("formation", 8, [0], all_round | {"sensor_noise_m": noise}).reset().obs for noise in (0.0, 0.01)
+    )
+    hidden = plain == 0
+    assert hidden[..., 2:].any()
+    assert bool((noisy[..., 2:][hidden[..., 2:]] == 0).all())
+    assert not torch.equal(noisy, plain), "what is seen has noise"

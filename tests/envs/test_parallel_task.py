@@ -188,7 +188,7 @@ SENTENCES = {
     "walker_0 acts in Discrete(3), but the task says 2 discrete actions": {
         "action": Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("a", "b"))
     },
-    "walker_0 acts in Discrete(3), but the task says 1 bounded numbers": {
+    "walker_0 acts in Discrete(3), but the task says 1 bounded real numbers": {
         "action": Continuous(layout(Field("speed", Kind.SCALAR)))
     },
     "the environment's state has 3 numbers, but the layout has 1": {"state": layout(Field("x", Kind.SCALAR))},

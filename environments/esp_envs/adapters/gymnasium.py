@@ -35,6 +35,12 @@ class _OneAgent:
     def __init__(self, env: Any) -> None:
         self._env = env
 
+    def __getattr__(self, name: str) -> Any:
+        """Give `state`, `unwrapped` and all else of the environment."""
+        if name == "_env":  # not there while it is unpacked
+            raise AttributeError(name)
+        return getattr(self._env, name)
+
     def action_space(self, agent: str) -> Any:
         return self._env.action_space
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -89,7 +90,9 @@ class Copy:
         if not self.learners:
             raise ValueError(f"no agent's name begins with '{task.learners}'; the agents are {', '.join(agents)}")
         self.rest = [name for name in agents if name not in self.learners]
-        self._boxes = [_bounds(self.env.action_space(name)) for name in self.learners]
+        spaces = [self.env.action_space(name) for name in self.learners]
+        self._boxes = [_bounds(space) for space in spaces]
+        self._starts = [int(getattr(space, "start", 0)) for space in spaces]
 
     def require_spaces(self) -> None:
         """Refuse spaces that differ from the layouts, by looking at the first observation.
@@ -100,6 +103,8 @@ class Copy:
         task = self._task
         first, infos = self.env.reset(seed=0)
         for name in self.learners:
+            if name not in first:
+                raise ValueError(f"{name} gets no observation from 'reset', and agents that join later cannot learn")
             width = task.reading(name, first[name]).size
             if width != task.observation.width:
                 raise ValueError(f"{name} sees {width} numbers, but the layout has {task.observation.width}")
@@ -109,10 +114,12 @@ class Copy:
                     raise ValueError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
             space = self.env.action_space(name)
             if isinstance(task.action, Discrete):
-                if getattr(space, "n", None) != task.action.count:
+                if getattr(space, "n", None) != task.action.count or space.shape:
                     raise ValueError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
             elif _bounds(space) is None or space.shape != (task.action.width,):
-                raise ValueError(f"{name} acts in {space}, but the task says {task.action.width} bounded numbers")
+                raise ValueError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
+        if task.state is not None and not hasattr(self.env, "state"):
+            raise ValueError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and np.size(self.env.state()) != task.state.width:
             got = np.size(self.env.state())
             raise ValueError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
@@ -120,9 +127,9 @@ class Copy:
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""
         if (box := self._boxes[i]) is None:
-            return int(action)
+            return self._starts[i] + int(action)
         low, high = box
-        return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).astype(np.float32)
+        return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)
 
     def close(self) -> None:
         """Let go of the copy."""
@@ -156,10 +163,8 @@ class CopyStepper:
     def _start(self, k: int) -> None:
         seed = int(self._board.seed[k])
         self._dice[k] = np.random.default_rng(seed)
-        try:
+        with self._naming(k, "reset"):
             self._seen[k], self._infos[k] = self._copies[k].env.reset(seed=seed)
-        except Exception as error:
-            raise ValueError(self._sentence(k, "reset", error)) from error
         self._gone[k] = set()
         board = self._board
         self._write(k, board.obs, board.state, board.mask, board.alive)
@@ -169,16 +174,14 @@ class CopyStepper:
         gone = self._gone[k]
         chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name not in gone}
         chosen |= {name: task.opponent(name, seen[name], self._dice[k]) for name in copy.rest if name in seen}
-        try:
+        with self._naming(k, "step"):
             self._seen[k], reward, terminated, truncated, self._infos[k] = copy.env.step(chosen)
+        with self._naming(k, "measure"):
             found = task.measure(copy.env, self._infos[k])
-        except Exception as error:
-            raise ValueError(self._sentence(k, "step", error)) from error
+            board.metrics[k] = [found[name] for name in task.metrics]
         acting = [name for name in copy.learners if name not in gone]
-        board.reward[k] = [
-            reward.get(name, 0.0) if name in acting else self._passive_reward(reward) for name in copy.learners
-        ]
-        board.metrics[k] = [found[name] for name in task.metrics]
+        shared = next((reward[name] for name in acting if name in reward), 0.0) if task.shared_reward else 0.0
+        board.reward[k] = [reward.get(name, 0.0) if name in acting else shared for name in copy.learners]
         ended = {name: terminated.get(name, True) for name in acting}  # an agent that is not mentioned has left
         over = [name for name in acting if ended[name] or truncated.get(name, False)]
         if over and len(over) < len(acting) and not task.agents_end:
@@ -196,10 +199,6 @@ class CopyStepper:
             board.obs[k], board.state[k] = board.final_obs[k], board.final_state[k]
             board.mask[k], board.alive[k] = board.final_mask[k], board.final_alive[k]
 
-    def _passive_reward(self, reward: Mapping[str, float]) -> float:
-        """Return the reward of an agent that has ended: 0, or what the others get where it is shared."""
-        return next(iter(reward.values()), 0.0) if self._task.shared_reward else 0.0
-
     def _how(self, k: int, over: bool, terminated: bool) -> int:
         """Return how the episode of a copy ended, 0 where it goes on; the horizon counts as a cut in any case."""
         task = self._task
@@ -215,15 +214,23 @@ class CopyStepper:
         copy, seen, infos, gone = self._copies[k], self._seen[k], self._infos[k], self._gone[k]
         for i, name in enumerate(copy.learners):
             there = name in seen
-            obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if there else 0
+            with self._naming(k, "reading"):
+                obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if there else 0
             alive[k, i] = name not in gone
             if self._task.masks:
-                mask[k, i] = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[k, i] else 1
+                with self._naming(k, "allowed"):
+                    mask[k, i] = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[k, i] else 1
         state[k] = obs[k].reshape(-1) if self._task.state is None else np.asarray(copy.env.state()).reshape(-1)
 
-    def _sentence(self, k: int, what: str, error: Exception) -> str:
-        lines = str(error).strip().splitlines() or [""]
-        return f"copy {k} of {type(self._task).__name__} raises in '{what}': {type(error).__name__}: {lines[-1]}"
+    @contextmanager
+    def _naming(self, k: int, what: str) -> Iterator[None]:
+        """Say which copy fails, and where, if one does."""
+        try:
+            yield
+        except Exception as error:
+            line = (str(error).strip().splitlines() or [""])[-1]
+            place = f"copy {k} of {type(self._task).__name__} raises in '{what}'"
+            raise ValueError(f"{place}: {type(error).__name__}: {line}") from error
 
 
 def _has(place: Any, name: str) -> bool:
@@ -231,7 +238,7 @@ def _has(place: Any, name: str) -> bool:
 
 
 def _bounds(space: Any) -> tuple[Array, Array] | None:
-    """Return the bounds of a finite Box, None for any other space."""
-    if not hasattr(space, "low") or not np.isfinite([space.low, space.high]).all():
+    """Return the bounds of a finite Box of real numbers, None for any other space."""
+    if not hasattr(space, "low") or space.dtype.kind != "f" or not np.isfinite([space.low, space.high]).all():
         return None
     return np.asarray(space.low), np.asarray(space.high)

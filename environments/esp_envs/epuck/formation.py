@@ -18,7 +18,7 @@ from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
-from esp_envs.epuck.sight import FADING_M, formation_scene, nearest, nearness, outside_sector, within
+from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, nearest, nearness, within
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
 
@@ -195,10 +195,12 @@ class Formation(LockstepTask):
         if self.settings.seen_robots:
             offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
         seen = torch.cat(offsets, 2)
-        if self.settings.blind_sector_rad:
-            seen[:, :, 1:] = outside_sector(seen[:, :, 1:], self.settings.blind_sector_rad)
+        blind = self.settings.blind_sector_rad
+        hidden = in_sector(seen[:, :, 1:], blind) if blind else None
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(heading, seen)
+        if hidden is not None:
+            seen[:, :, 1:] = seen[:, :, 1:].masked_fill(hidden, 0.0)
         if self.settings.heading_offset_rad:
             heading = heading + self.settings.heading_offset_rad
         direction = torch.stack([heading.cos(), heading.sin()], -1)

@@ -37,10 +37,9 @@ def nearness(offset: Tensor, reach_m: float) -> Tensor:
     return offset / distance * torch.exp(-(distance - reach_m).clamp(min=0) / FADING_M)
 
 
-def outside_sector(offset: Tensor, width_rad: float) -> Tensor:
-    """Return offsets [..., 2] with (0, 0) for bodies in the sector of this width around the direction of x."""
-    angle = torch.atan2(offset[..., 1:], offset[..., :1])
-    return torch.where(angle.abs() < width_rad / 2, 0.0, offset)
+def in_sector(offset: Tensor, width_rad: float) -> Tensor:
+    """Return which offsets [..., 2] lie in the sector of this width around the direction of x, [..., 1]."""
+    return torch.atan2(offset[..., 1:], offset[..., :1]).abs() < width_rad / 2
 
 
 def within(offset: Tensor, unit_m: float) -> Tensor:
