@@ -28,7 +28,7 @@ demo: $(VENV)/.installed ## teach eight robots to change places, evaluate and dr
 	$(BIN)/esp render $(DEMO) -o $(DEMO)/demo.gif
 	@echo "Look at $(DEMO)/demo.gif"
 
-test: $(VENV)/.installed-test ## run the tests (4 minutes), but for those marked slow
+test: $(VENV)/.installed-test ## run the tests (5 minutes), but for those marked slow
 	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
 
 test-slow: $(VENV)/.installed-test ## run the tests marked slow (3 minutes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from esp_cli.checking.verdicts import ElementVerdict
-from esp_cli.symmetry import Element, Group, build_transform, parse_elements
+from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.groups import swap_and_round
@@ -83,7 +83,10 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     broken = {verdict.element for verdict in verdicts if verdict.outcome == "broken"}
     plane = "c1"
     for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_elements(name, 1))):
-        if (elements := _elements(name, 1)) and all(element.name in holding for element in elements):
+        elements = _elements(name, 1)
+        known = [element for element in elements if element.name in holding | broken]
+        whole = len(known) == len(elements) or (name in _NAMED and _order(known) == len(elements) + 1)
+        if known and whole and broken.isdisjoint(element.name for element in known):
             plane = name
     for name, of_any_angle, steps in (("so2", {"rot57"}, "c8"), ("o2", {"rot57", "flip23"}, "d8")):
         if of_any_angle <= holding and broken.isdisjoint(element.name for element in _elements(steps, 1)):
@@ -92,6 +95,11 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     counts = exchangeable(spaces).items()
     items = {name: count for name, count in counts if set(_orders(name, count)) <= set(holding)}
     return Factors(plane, agents, items).name
+
+
+def _order(elements: Sequence[Element]) -> int:
+    """Return how many elements a group has that some elements generate."""
+    return FiniteGroup.generated_by("known", elements).order if elements else 1
 
 
 def _is_order(name: str) -> bool:

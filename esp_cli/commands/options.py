@@ -69,7 +69,7 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
         if not name.startswith("task."):
             raise ValueError(f"--set {name} is not a setting of the task; this command takes only task.NAME=VALUE")
     own = {name.removeprefix("task."): value for name, value in settings.items()}
-    return own if physics is None else {**own, "physics": physics}
+    return own if physics is None else {"physics": physics, **own}
 
 
 def check_finite(option: str, *values: float) -> None:

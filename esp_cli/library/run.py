@@ -9,6 +9,7 @@ run.render("cn.gif")
 
 from __future__ import annotations
 
+import itertools
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -194,7 +195,9 @@ def plan(
 def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:
     """Make the folder of a new run, by default a new one in runs/."""
     name = f"{file_name(config.task)}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
-    path = Path("runs") / name if out is None else Path(out)
+    numbered = (Path("runs") / f"{name}-{k}" for k in itertools.count(2))
+    free = (path for path in itertools.chain([Path("runs") / name], numbered) if not path.exists())
+    path = next(free) if out is None else Path(out)
     return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from pydantic import JsonValue
 
 from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
@@ -178,7 +179,8 @@ def _timed(results: Results, cell: CellResult, curve: RunCurve | None, threshold
         values = returns_of(cell if other is None or not other.returns else other, results.mode)
         mean = None if values is None else summarise(values).mean
         thresholds = [] if mean is None else [mean]
-    passed = [(limit, steps_to_threshold(curve.steps, curve.values, limit)) for limit in thresholds]
+    rounded = np.round(curve.values, _DIGITS)  # as the returns are, from which thresholds are taken
+    passed = [(limit, steps_to_threshold(curve.steps, rounded, limit)) for limit in thresholds]
     found = tuple(
         Passing(threshold=round(limit, _DIGITS), of_mean=p.of_mean, per_seed=p.per_seed) for limit, p in passed
     )

@@ -88,6 +88,16 @@ def test_one_exchange_is_not_all_orders() -> None:
     assert found_group([swap, around], spaces) == "c1*agents"
 
 
+@pytest.mark.parametrize(
+    ("tried", "found"),
+    [("rot90", "c4"), ("rot90,flip-x", "d4"), ("rot180", "c2"), ("flip-x", "flip-x"), ("rot45", "c8")],
+)
+def test_what_the_tried_elements_generate_is_found(tried: str, found: str) -> None:
+    spaces, _ = anybodys(0.0)
+    verdicts = [ElementVerdict(element.name, False, (HOLDS,)) for element in parse_elements(tried, 2)]
+    assert found_group(verdicts, spaces) == found
+
+
 def test_any_angle_needs_the_steps_too() -> None:
     spaces, _ = anybodys(0.0)
     names = [element.name for element in parse_elements("c8,rot57", 2)]

@@ -126,3 +126,12 @@ def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
         train(out=run.path)
     with pytest.raises(ValueError, match="cannot write"):
         run.render(tmp_path / "film.txt")
+
+
+def test_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda _: "20261125-090121")
+    tiny = {"mappo.num_envs": 2, "task.horizon": 4, "evaluation.episodes": 1}
+    names = [train(steps=8, seeds=(seed,), settings=tiny).path.name for seed in (0, 1, 2)]
+    first = "navigation-mappo-esp-20261125-090121"
+    assert names == [first, f"{first}-2", f"{first}-3"]

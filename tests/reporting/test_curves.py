@@ -247,3 +247,12 @@ def test_a_threshold_that_was_passed_counts_in_a_run_that_ended_before_the_compa
     short, whole = curve(PLAIN[:3], "short", STEPS[:3]), curve(ESP, "whole")
     runs = compare([short, whole], [300], [-5.0])["runs"]
     assert [run["steps_to"]["-5.0"]["mean"] for run in runs] == [200, 100]
+
+
+def test_a_run_reaches_what_it_ended_with_however_that_is_rounded():
+    ends = curve([[-9.0], [-187.80964]], "one", (0, 100), (0,))
+    (cell,) = gathered([ends]).results.cells
+    assert cell.steps_to[0].of_mean == 0
+    rising = curve([[-200.0], [-187.80964]], "one", (0, 100), (0,))
+    (cell,) = gathered([rising]).results.cells
+    assert (cell.steps_to[0].threshold, cell.steps_to[0].of_mean) == (-187.8096, 100)
