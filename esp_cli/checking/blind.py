@@ -75,7 +75,7 @@ def discover_blindly(source: str, spaces: Spaces | None, data: Transitions) -> D
     found, transforms = f"{'' if is_complete else 'at least '}{group.order()} maps of numbers", ""
     if spaces is not None:
         known = [element for element in default_candidates(spaces) if element.permutation is None]
-        name, transforms = named(_held(known, spaces, data, maps, group), known)
+        name, transforms = named(*_held(known, spaces, data, maps, group))
         found = f"{name} among {found}"
     return Discovery(source, BLIND, found, transforms, results)
 
@@ -119,15 +119,17 @@ def _refuse_wide(numbers: int) -> None:
 
 def _held(
     known: Sequence[Element], spaces: Spaces, data: Transitions, maps: Sequence[NumberMap], group: PermutationGroup
-) -> list[Element]:
-    """Return those of some elements that are products of maps that were found."""
+) -> tuple[list[Element], list[Element]]:
+    """Return those of some elements that are products of maps that were found, and those that can be such products."""
     matrices = {element.name: _matrix(element, spaces, data) for element in known}
-    held = {name for name, m in matrices.items() if (points := _points(m)) and group.contains(Permutation(points))}
+    signed = {name: points for name, matrix in matrices.items() if (points := _points(matrix))}
+    held = {name for name, points in signed.items() if group.contains(Permutation(points))}
     turn = matrices.get("rot57")
     turns = [way for one in maps for way in (one.matrix, one.matrix.mT)]
     if turn is not None and any(torch.allclose(turn, way, atol=1e-5) for way in turns):
         held |= {"rot57", "flip23"} if any(name.startswith("flip") for name in held) else {"rot57"}
-    return [element for element in known if element.name in held]
+    tried = signed.keys() | {"rot57", "flip23"}
+    return [e for e in known if e.name in held], [e for e in known if e.name in tried]
 
 
 def _matrix(element: Element, spaces: Spaces, data: Transitions) -> Tensor:

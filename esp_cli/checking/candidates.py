@@ -61,11 +61,11 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
-    if spaces.symmetry not in ("", "c1") and element in parse_elements(spaces.symmetry, spaces.num_agents):
+    if _lists(spaces, element):
         return True
     try:
         factors = Factors.of(spaces.symmetry)
-    except ValueError:  # it is one order of items, which holds nothing but itself
+    except ValueError:  # it names single orders of items, and this is none of them
         return False
     if not all(factors.allow(name, len(places)) for name, places in element.orders):
         return False
@@ -75,6 +75,14 @@ def is_declared(element: Element, spaces: Spaces) -> bool:
         return False
     group = parse_elements(factors.plane, spaces.num_agents)
     return element.in_place in group
+
+
+def _lists(spaces: Spaces, element: Element) -> bool:
+    """Return whether a declared symmetry can be listed, and holds an element as it is written."""
+    try:
+        return element in parse_elements(spaces.symmetry, spaces.num_agents)
+    except ValueError:
+        return False
 
 
 def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:

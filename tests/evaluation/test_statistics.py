@@ -212,7 +212,7 @@ def test_curves_that_are_none_are_one_sentence(steps, values, text):
 def test_normalise_sets_random_to_zero_and_heuristic_to_one():
     assert normalise([-220.0, -110.0, -165.0, -55.0], -220.0, -110.0).tolist() == [0.0, 1.0, 0.5, 1.5]
     for heuristic in (-220.0, math.nan):
-        with pytest.raises(ValueError, match="have to differ"):
+        with pytest.raises(ValueError, match="the heuristic has to be better"):
             normalise([1.0], -220.0, heuristic)
 
 
