@@ -93,7 +93,7 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_elements(name, 1))):
         elements = _elements(name, 1)
         known = [element for element in elements if element.name in holding | broken]
-        whole = len(known) == len(elements) or (name in _NAMED and _order(known) == len(elements) + 1)
+        whole = generate(known, elements) if name in _NAMED else len(known) == len(elements)
         if known and whole and broken.isdisjoint(element.name for element in known):
             plane = name
     for name, of_any_angle, steps in (("so2", {"rot57"}, "c8"), ("o2", {"rot57", "flip23"}, "d8")):
@@ -105,9 +105,9 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     return Factors(plane, agents, items).name
 
 
-def _order(elements: Sequence[Element]) -> int:
-    """Return how many elements a group has that some elements generate."""
-    return FiniteGroup.generated_by("known", elements).order if elements else 1
+def generate(known: Sequence[Element], elements: Sequence[Element]) -> bool:
+    """Return whether the tried elements of a group generate all of it."""
+    return bool(known) and FiniteGroup.generated_by("known", known).order == len(elements) + 1
 
 
 def _is_order(name: str) -> bool:

@@ -12,12 +12,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from esp_cli.checking.candidates import candidates
+from esp_cli.checking.candidates import candidates, generate
 from esp_cli.checking.paired import MakeWorlds, check_paired
 from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
-from esp_cli.symmetry import Element, FiniteGroup
+from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import DISCOVERED, exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.parse import parse_elements
@@ -164,17 +164,12 @@ def _plane(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[str, 
     best, text, size = "c1", "", 0
     for name, elements in _subgroups():
         known = [e for e in elements if e in seen]
-        if len(known) > size and held.issuperset(known) and _generate(known, elements):
+        if len(known) > size and held.issuperset(known) and generate(known, elements):
             best, text, size = name, name if "," not in name else ",".join(e.name for e in known), len(known)
     for name, of_any_angle, steps in (("o2", "rot57,flip23", "d16"), ("so2", "rot57", "c16")):
         if held.issuperset((*_listed(of_any_angle), *seen.intersection(_listed(steps)))):
             return name, name
     return best, text
-
-
-def _generate(known: Sequence[Element], elements: Sequence[Element]) -> bool:
-    """Return whether the tried elements of a group generate all of it."""
-    return bool(known) and FiniteGroup.generated_by("known", known).order == len(elements) + 1
 
 
 def _subgroups() -> list[tuple[str, tuple[Element, ...]]]:

@@ -152,13 +152,10 @@ class LoadedPolicy:
 
     def _checked(self, values: ArrayLike, width: int, what: str, meaning: str) -> Floats:
         """Return [..., width] float32 after checking that it is that."""
-        try:
-            given = np.asarray(values)
+        try:  # "same_kind" takes no texts and cuts no complex numbers
+            array = np.asarray(values).astype(np.float32, casting="same_kind", copy=False)
         except (TypeError, ValueError):
-            given = np.asarray("")
-        if given.dtype.kind not in "fiub":  # numpy would make numbers of texts, and cut complex ones
-            raise ValueError(f"the {what} is not an array of real numbers; give (..., {width}): {meaning}")
-        array = given.astype(np.float32, copy=False)
+            raise ValueError(f"the {what} is not an array of real numbers; give (..., {width}): {meaning}") from None
         if array.ndim == 0 or array.shape[-1] != width:
             raise ValueError(
                 f"the {what} has shape {array.shape}, but {self.spec.name} needs (..., {width}): {meaning}"

@@ -70,6 +70,8 @@ def test_drawn_actions_follow_their_generator() -> None:
         (0.5, r"the observation has shape \(\)"),
         ([[1.0, 2.0], [3.0]], "the observation is not an array of real numbers"),
         ("left", "the observation is not an array of real numbers"),
+        (np.full((1, 8), "1"), "the observation is not an array of real numbers"),
+        (np.ones((1, 8), complex), "the observation is not an array of real numbers"),
         (None, "the observation"),
         (np.full((2, 8), np.nan), r"the observation holds nan at \(0, 0\); give finite numbers"),
         (np.where(np.arange(16).reshape(2, 8) == 11, np.inf, 0), r"holds inf at \(1, 3\)"),

@@ -279,9 +279,8 @@ def test_a_seed_alone_equals_itself_among_others(name) -> None:
     )
     rows = obs.flatten(1, 2)
     ours, theirs = both.unroll(rows.unsqueeze(2)), alone.unroll(rows[1:].unsqueeze(2))
-    torch.testing.assert_close(
-        ours[1:], theirs, rtol=0, atol=1e-6
-    )  # some processors sum the products of one seed otherwise
+    # some processors sum the products of one seed otherwise than those of several
+    torch.testing.assert_close(ours[1:], theirs, rtol=0, atol=1e-6)
     (gradient,) = torch.autograd.grad(ours[0].sum(), [next(both.parameters())])
     assert gradient[1].abs().max() == 0
 

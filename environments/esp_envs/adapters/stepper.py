@@ -212,13 +212,13 @@ class CopyStepper:
     def _write(self, k: int, obs: Array, state: Array, mask: Array, alive: Array) -> None:
         """Write what the agents of a copy see; zeros, and everything allowed, for one that is there no more."""
         copy, seen, infos, gone = self._copies[k], self._seen[k], self._infos[k], self._gone[k]
-        for i, name in enumerate(copy.learners):
-            there = name in seen
-            with self._naming(k, "reading"):
-                obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if there else 0
-            alive[k, i] = name not in gone
-            if self._task.masks:
-                with self._naming(k, "allowed"):
+        alive[k] = [name not in gone for name in copy.learners]
+        with self._naming(k, "reading"):
+            for i, name in enumerate(copy.learners):
+                obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if name in seen else 0
+        if self._task.masks:
+            with self._naming(k, "allowed"):
+                for i, name in enumerate(copy.learners):
                     mask[k, i] = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[k, i] else 1
         state[k] = obs[k].reshape(-1) if self._task.state is None else np.asarray(copy.env.state()).reshape(-1)
 
