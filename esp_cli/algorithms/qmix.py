@@ -19,6 +19,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
+from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
@@ -62,7 +63,8 @@ class Qmix(OffPolicyLearner):
         super().build(env, network)
         config, generators = self.config, self.generators["learner"]
         widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
-        self.mixer = MonotonicMixer(generators, *widths).to(self.device)
+        compiled = perceptron(network, "relu").compiled
+        self.mixer = MonotonicMixer(generators, *widths, compiled).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
         self.optimiser = self.adam(self.policy, self.mixer, learning_rate=config.learning_rate)

@@ -63,8 +63,8 @@ AnyNetworkConfig = Annotated[SerializeAsAny[NetworkConfig], BeforeValidator(_sto
 
 
 def perceptron(config: NetworkConfig, activation: ActivationName) -> MlpConfig:
-    """Return the settings of a perceptron with the widths of another network, and its precision if it is plain."""
-    shared = {"precision", "layer_norm"} if isinstance(config, PlainConfig) else set()
+    """Return the settings of a perceptron with the widths of another network, and its products if it is plain."""
+    shared = {"precision", "compiled", "layer_norm"} if isinstance(config, PlainConfig) else set()
     return MlpConfig(activation=activation, **config.model_dump(include={"hidden"} | shared))
 
 

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, perceptron
+from esp_cli.networks.kernel import CompiledPass, library
+from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, passed, perceptron
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
 """Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
@@ -72,6 +73,10 @@ class SeedMLP(nn.Module):
         layer_norm: normalise the input and every hidden activation, as the MAPPO paper's code does.
         activate_output: end with an activation, for a body on which something else stands.
         precision: of the matrix products; parameters, inputs, outputs and parameter gradients stay float32.
+        compiled: whether passes on the CPU go through the compiled kernel; not with layer normalisation.
+
+    Raises:
+        ValueError: there is no compiler for it.
     """
 
     def __init__(
@@ -83,6 +88,7 @@ class SeedMLP(nn.Module):
         layer_norm: bool = False,
         activate_output: bool = False,
         precision: torch.dtype = torch.float32,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         hidden_gain = GAINS[activation]
@@ -93,6 +99,9 @@ class SeedMLP(nn.Module):
         self.activation = activation
         self.activate_output = activate_output
         self.precision = precision
+        self.compiled = compiled and not layer_norm
+        if self.compiled:
+            library()
         normed = sizes if activate_output else sizes[:-1]
         self.norms = nn.ModuleList(SeedLayerNorm(len(generators), w) for w in normed) if layer_norm else None
 
@@ -106,9 +115,9 @@ class SeedMLP(nn.Module):
             return self._forward_normed(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
         return self._from_layer(0, parts, rows_innermost)
 
-    def passed(self, x: Tensor) -> Pass:
+    def passed(self, x: Tensor) -> Pass | CompiledPass:
         """Map [S, B, in] as `forward` does, with a backward to call by hand; not with layer normalisation."""
-        return Pass(self._shape(), [x], self._from(0))
+        return passed(self._shape(), [x], self._from(0))
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
         """Map what the first layer gives, x W_1 + b_1 before its activation, [S, B, H], to [S, B, out].
@@ -139,7 +148,7 @@ class SeedMLP(nn.Module):
         return perceptron(self._shape(rows_innermost), parts, self._from(first))
 
     def _shape(self, rows_innermost: bool = False) -> Shape:
-        return Shape(self.activation, self.activate_output, self.precision, rows_innermost)
+        return Shape(self.activation, self.activate_output, self.precision, rows_innermost, self.compiled)
 
     def _from(self, first: int) -> list[Tensor]:
         layers: list[SeedLinear] = [*self.layers][first:]

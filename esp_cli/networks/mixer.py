@@ -24,15 +24,22 @@ class MonotonicMixer(nn.Module):
         state_width: width of what the hypernetwork sees.
         width: M, hidden units of the mixer.
         hidden: hidden units of the hypernetwork.
+        compiled: whether the hypernetwork is; see `SeedMLP`.
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], num_agents: int, state_width: int, width: int, hidden: int
+        self,
+        generators: Sequence[torch.Generator],
+        num_agents: int,
+        state_width: int,
+        width: int,
+        hidden: int,
+        compiled: bool = False,
     ) -> None:
         super().__init__()
         self.num_agents, self.width = num_agents, width
         outputs = num_agents * width + 2 * width + 1
-        self.hypernetwork = SeedMLP(generators, (state_width, hidden, outputs), "relu", HYPER_GAIN)
+        self.hypernetwork = SeedMLP(generators, (state_width, hidden, outputs), "relu", HYPER_GAIN, compiled=compiled)
 
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
         """Mix the agents' values.

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from esp_cli.networks.kernel import CompiledPass
+
 CACHED_ROWS = 4096
 """Rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache."""
 
@@ -30,12 +32,14 @@ class Shape(NamedTuple):
         activate_output: whether it ends with an activation.
         precision: of the products; what goes in and out stays float32.
         rows_innermost: whether the outputs [S, B, out] lie in memory as [S, out, B]; those of thin outputs always do.
+        compiled: whether passes on the CPU go through the compiled kernel, in float32.
     """
 
     activation: str
     activate_output: bool
     precision: torch.dtype
     rows_innermost: bool = False
+    compiled: bool = False
 
 
 def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
@@ -48,9 +52,20 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
+    if _runs_compiled(shape, inputs):
+        return CompiledPass(shape, inputs, parameters, keep=False).outputs
     if shape.precision != torch.float32:
         parameters = [p.to(shape.precision) for p in parameters]
     return _joined([_run(shape, x, parameters)[-1] for x in _pieces(shape, inputs)])
+
+
+def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
+    """Return a pass with a backward to call by hand; arguments as of `perceptron`."""
+    return (CompiledPass if _runs_compiled(shape, inputs) else Pass)(shape, inputs, parameters)
+
+
+def _runs_compiled(shape: Shape, inputs: Sequence[Tensor]) -> bool:
+    return shape.compiled and inputs[0].device.type == "cpu"
 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
@@ -133,7 +148,7 @@ class _Perceptron(Function):
 
     @staticmethod
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
-        ctx.num_inputs, ctx.run = num_inputs, Pass(shape, tensors[:num_inputs], tensors[num_inputs:])
+        ctx.num_inputs, ctx.run = num_inputs, passed(shape, tensors[:num_inputs], tensors[num_inputs:])
         ctx.save_for_backward(*tensors[num_inputs:])  # so that autograd notices a change of them
         return ctx.run.outputs
 

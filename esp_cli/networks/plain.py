@@ -21,6 +21,9 @@ class PlainConfig(NetworkConfig):
 
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
+    compiled: bool = Field(
+        False, description="perceptrons compiled for this processor: faster, other rounding; needs a C++ compiler"
+    )
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
     separate_parts: bool = Field(
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
@@ -35,11 +38,13 @@ class PlainConfig(NetworkConfig):
     def _fits(self) -> PlainConfig:
         if self.separate_parts and self.symmetrise:
             raise ValueError("separate_parts and symmetrise exclude each other; leave one of them off")
+        if self.compiled and self.precision != "float32":
+            raise ValueError("compiled perceptrons compute in float32; leave compiled off, or precision as it is")
         return self
 
     def without_effect(self) -> frozenset[str]:
-        """Return "precision" where layers are normalised: those products are of float32."""
-        return frozenset({"precision"}) if self.layer_norm else frozenset()
+        """Return what concerns perceptrons without layer normalisation where there is one."""
+        return frozenset({"precision", "compiled"}) if self.layer_norm else frozenset()
 
     def least_parameters(self, inputs: int) -> int:
         """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
@@ -79,7 +84,8 @@ class MLP(SeedMLP, Memoryless):
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
-        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, config.dtype)
+        products = (config.dtype, config.compiled)
+        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *products)
 
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return outputs and the way back; see `Network.traced`."""
@@ -104,7 +110,8 @@ class GRU(Network):
         gain = GAINS[config.activation]
         sizes = (inputs, *config.hidden)
         self.memory_width = width
-        self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, config.dtype)
+        products = (config.dtype, config.compiled)
+        self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, *products)
         self.gru = SeedGRU(generators, width, width)
         self.norm = SeedLayerNorm(len(generators), width) if config.layer_norm else nn.Identity()
         self.head = SeedLinear(generators, width, outputs, output_gain)

@@ -147,7 +147,7 @@ def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
         raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
     network = trained.config.network
     if isinstance(network, PlainConfig):
-        network = network.model_copy(update={"precision": "float32"})
+        network = network.model_copy(update={"precision": "float32", "compiled": False})
     config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
     policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
     index = seeds.index(seed)
@@ -178,8 +178,10 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
-    build = ALGORITHMS[config.algorithm].build_policy
-    policy = build(spec, config.network, generators(config.seeds, "shape")).to(config.device).eval()
+    build, network = ALGORITHMS[config.algorithm].build_policy, config.network
+    if isinstance(network, PlainConfig):  # whoever uses a policy needs no compiler
+        network = network.model_copy(update={"compiled": False})
+    policy = build(spec, network, generators(config.seeds, "shape")).to(config.device).eval()
     _fill(policy, tensors, path, misfit)
     return TrainedPolicy(config, policy, spec, step, path, notes, _stopped(meta, len(config.seeds)))
 

@@ -1,6 +1,7 @@
 """Measure how fast this working tree trains against an older commit, on this machine.
 
-    python tests/benchmarks/against.py [--commit 1b792e9] [--rounds 5] [--cases NAME ...] [--json ratios.json]
+    python tests/benchmarks/against.py [--commit 1b792e9] [--rounds 5] [--cases NAME ...] [--set NAME=VALUE ...]
+                                       [--json ratios.json]
 
 The older commit is checked out beside the working tree, in a temporary folder. Each round runs every case once with the
 old and once with the new code, each in a process of its own. A case of training is `esp train`; its rate is the median
@@ -18,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -52,11 +53,11 @@ class Training:
     steps: int
     end_to_end: bool = False
 
-    def measure(self, tree: Path, folder: Path) -> float:
-        """Return seed-steps per second with the code of `tree`."""
+    def measure(self, tree: Path, folder: Path, chosen: Sequence[str]) -> float:
+        """Return seed-steps per second with the code of `tree`, with more options behind those of the case."""
         options = self.options if self.end_to_end else f"{self.options} {NO_EVALUATION}"
         begin = time.perf_counter()
-        size = ("--seeds", str(self.seeds), "--steps", str(self.steps), "--out", "run")
+        size = ("--seeds", str(self.seeds), "--steps", str(self.steps), "--out", "run", *chosen)
         python(tree, folder, *ESP, "train", *options.split(), *size)
         seconds = time.perf_counter() - begin
         if self.end_to_end:
@@ -71,7 +72,7 @@ class Worlds:
 
     task: str
 
-    def measure(self, tree: Path, folder: Path) -> float:
+    def measure(self, tree: Path, folder: Path, _: Sequence[str]) -> float:
         """Return environment steps per second with the code of `tree`."""
         script = str(tree / "tests" / "benchmarks" / "env_speed.py")
         python(tree, folder, script, "--task", self.task, "--worlds", "1024", "--json", "speed.json")
@@ -154,10 +155,10 @@ def checked_out(commit: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
 
 
-def measure(case: Case, tree: Path) -> float:
+def measure(case: Case, tree: Path, chosen: Sequence[str] = ()) -> float:
     """Return the rate of a case with the code of `tree`, in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
-        return case.measure(tree, Path(folder))
+        return case.measure(tree, Path(folder), chosen)
 
 
 def use(tree: Path) -> None:
@@ -179,6 +180,7 @@ def main() -> None:
     parser.add_argument("--commit", default="1b792e9", help="what to compare with")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--cases", nargs="+", default=["*"], metavar="PATTERN", help="names, or patterns as 'qmix*'")
+    parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the working tree alone")
     parser.add_argument("--json", type=Path, help="also write every rate to this file")
     args = parser.parse_args()
     names = [name for name in CASES if any(fnmatch(name, pattern) for pattern in args.cases)]
@@ -186,13 +188,13 @@ def main() -> None:
         parser.error(f"no case has such a name; the cases are: {'; '.join(CASES)}")
     rates: dict[str, dict[str, list[float]]] = {name: {"old": [], "new": []} for name in names}
     with checked_out(args.commit) as old:
-        trees = {"old": old, "new": ROOT}
+        trees, chosen = {"old": old, "new": ROOT}, [word for pair in args.set for word in ("--set", pair)]
         for tree in trees.values():
             use(tree)
         for turn in range(args.rounds):
             for name in names:
                 for side, tree in trees.items():
-                    rates[name][side].append(measure(CASES[name], tree))
+                    rates[name][side].append(measure(CASES[name], tree, chosen if side == "new" else ()))
                 last = rates[name]["new"][-1] / rates[name]["old"][-1]
                 print(f"round {turn + 1} of {args.rounds}: {name}: {last:.2f}", file=sys.stderr, flush=True)
     ratios = {
@@ -206,7 +208,7 @@ def main() -> None:
     Console(width=100).print(table)
     if args.json:
         records = [{"case": name, "ratio": ratios[name], **rates[name]} for name in names]
-        args.json.write_text(json.dumps({"commit": args.commit, "records": records}, indent=2) + "\n")
+        args.json.write_text(json.dumps({"commit": args.commit, "set": args.set, "records": records}, indent=2) + "\n")
 
 
 if __name__ == "__main__":

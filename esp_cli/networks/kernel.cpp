@@ -1,0 +1,342 @@
+// The passes of perceptron.py for S seeds at once, in blocks of rows that stay in a core's cache through all layers.
+//
+// Parameters are [S, in, out] and [S, 1, out], data [S, R, in], row after row; what hidden layers give is kept as
+// [S, R, padded(out)], layer after layer. A seed's gradient is summed over parts of its rows that depend on R alone, so
+// the results depend neither on the other seeds nor on the number of threads.
+
+#include <algorithm>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <utility>
+
+#if defined(__AVX512F__)
+#include <immintrin.h>
+constexpr int LANES = 16, VECTORS = 4;
+#elif defined(__AVX__)
+constexpr int LANES = 8, VECTORS = 2;
+#else
+constexpr int LANES = 4, VECTORS = 4;
+#endif
+constexpr int TILE = 6;         // rows of a product whose sums stay in registers, VECTORS of them each
+constexpr int64_t PAD = 16;     // widths are filled up with zeros to a multiple of this
+constexpr int64_t BLOCK = 128;  // most rows that go through all layers at once
+constexpr int64_t PART = 256;   // most rows of a seed that one thread works on at a time, while there are few parts
+constexpr int64_t MOST_PARTS = 16;
+
+typedef float Vec __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+typedef int32_t Ints __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+
+static Vec &vec(float *at) { return *reinterpret_cast<Vec *>(at); }
+static const Vec &vec(const float *at) { return *reinterpret_cast<const Vec *>(at); }
+
+static int64_t padded(int64_t width) { return (width + PAD - 1) / PAD * PAD; }
+
+struct Free {
+    void operator()(float *at) const { std::free(at); }
+};
+using Scratch = std::unique_ptr<float[], Free>;
+
+static Scratch scratch(int64_t count) {
+    return Scratch(static_cast<float *>(std::aligned_alloc(64, static_cast<size_t>(padded(count + 1)) * 4)));
+}
+
+// ---- Products
+
+struct Matrix {
+    const float *at;
+    int64_t row, column;  // steps to the next one
+};
+
+template <int M, int N>
+static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add, float *c,
+                        int64_t c_row) {
+    Vec sum[M][N];
+    for (int m = 0; m < M; m++)
+        for (int n = 0; n < N; n++)
+            sum[m][n] = bias ? vec(bias + n * LANES) : add ? vec(c + m * c_row + n * LANES) : Vec{};
+    for (int64_t k = 0; k < depth; k++) {
+        Vec row[N];
+        for (int n = 0; n < N; n++) row[n] = vec(b + k * b_row + n * LANES);
+        for (int m = 0; m < M; m++) {
+            float factor = a.at[m * a.row + k * a.column];
+            for (int n = 0; n < N; n++) sum[m][n] += factor * row[n];
+        }
+    }
+    for (int m = 0; m < M; m++)
+        for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
+}
+
+template <int N>
+static void panel(int64_t rows, int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add,
+                  float *c, int64_t c_row) {
+    for (; rows > 0; rows -= TILE, a.at += TILE * a.row, c += TILE * c_row) {
+        switch (std::min<int64_t>(TILE, rows)) {
+            case 6: tile<6, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 5: tile<5, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 4: tile<4, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 3: tile<3, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 2: tile<2, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            default: tile<1, N>(depth, a, b, b_row, bias, add, c, c_row);
+        }
+    }
+}
+
+// c [rows, columns] = a b, plus a bias or plus c; columns is a multiple of PAD.
+static void product(int64_t rows, int64_t columns, int64_t depth, Matrix a, const float *b, int64_t b_row,
+                    const float *bias, bool add, float *c, int64_t c_row) {
+    int64_t n = 0;
+    for (; n + VECTORS * LANES <= columns; n += VECTORS * LANES)
+        panel<VECTORS>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+    for (; n < columns; n += LANES)
+        panel<1>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+}
+
+// Copy a matrix [rows, columns], a few rows at a time, so that both sides go through memory in whole lines.
+static void copy(int64_t rows, int64_t columns, Matrix from, float *to, int64_t to_row, int64_t to_column) {
+    for (int64_t begin = 0; begin < rows; begin += PAD) {
+        int64_t end = std::min(rows, begin + PAD);
+        for (int64_t c = 0; c < columns; c++)
+            for (int64_t r = begin; r < end; r++)
+                to[r * to_row + c * to_column] = from.at[r * from.row + c * from.column];
+    }
+}
+
+// ---- Activations
+
+static inline Vec reciprocal(Vec x) {
+#if defined(__AVX512F__)
+    Vec guess = (Vec)_mm512_maskz_rcp14_ps(0xFFFF, (__m512)x);
+    return guess * (2.0f - x * guess);
+#else
+    return 1.0f / x;
+#endif
+}
+
+static inline Vec tanh_of(Vec x) {  // 1 - 2 / (exp(2 x) + 1), where exp(y) = 2^n exp(r) and |r| <= ln(2) / 2
+    const float most = 40.0f, round = 12582912.0f;  // 1.5 * 2^23: what is added to it becomes an integer
+    Vec y = 2.0f * x;
+    y = y > most ? Vec{} + most : y;
+    y = y < -most ? Vec{} - most : y;
+    Vec n = y * 1.44269504088896341f + round;
+    Ints exponent = (Ints)n << 23;
+    n -= round;
+    Vec r = (y - n * 0.693359375f) + n * 2.12194440e-4f;  // ln(2) in two parts
+    Vec e = 1.0f / 5040 * r + 1.0f / 720;
+    e = e * r + 1.0f / 120;
+    e = e * r + 1.0f / 24;
+    e = e * r + 1.0f / 6;
+    e = e * r + 0.5f;
+    e = e * r + 1.0f;
+    e = e * r + 1.0f;
+    return 1.0f - 2.0f * reciprocal((Vec)((Ints)e + exponent) + 1.0f);
+}
+
+static void activate(float *x, int64_t count, bool tanh) {
+    for (int64_t i = 0; i < count; i += LANES) {
+        Vec v = vec(x + i);
+        vec(x + i) = tanh ? tanh_of(v) : v < 0.0f ? Vec{} : v;
+    }
+}
+
+// Multiply a gradient by the slope of the activation, read off its output y.
+static void times_slope(float *gradient, const float *y, int64_t count, bool tanh) {
+    for (int64_t i = 0; i < count; i += LANES) {
+        Vec g = vec(gradient + i), v = vec(y + i);
+        vec(gradient + i) = tanh ? g - g * v * v : v <= 0.0f ? Vec{} : g;
+    }
+}
+
+// ---- Passes
+
+struct Span {
+    int64_t begin, end;
+    int64_t size() const { return end - begin; }
+    Span part(int64_t k, int64_t parts) const {
+        return {begin + size() * k / parts, begin + size() * (k + 1) / parts};
+    }
+};
+
+// What kernel.py fills in.
+
+struct Perceptron {
+    int64_t seeds, rows, layers, tanh, activate_output, threads;
+    const int64_t *widths;                 // layers + 1
+    const float *const *parameters;        // W_1, b_1, ... of the first seed
+    const int64_t *strides;                // of each parameter, from seed to seed
+    const float *inputs;                   // [S, R, widths[0]]
+    float *hidden;                         // what hidden layers give, and an activated output; null: not kept
+};
+
+struct Outputs {
+    float *at;
+    int64_t seed, row, column;  // steps to the next one
+};
+
+struct Layout : Perceptron {
+    int64_t parts, widest;
+
+    explicit Layout(const Perceptron &given) : Perceptron(given), parts(1), widest(PAD) {
+        while (parts < MOST_PARTS && parts * PART < rows) parts *= 2;
+        for (int64_t k = 0; k <= layers; k++) widest = std::max(widest, padded(widths[k]));
+    }
+    int64_t in(int64_t k) const { return widths[k]; }
+    int64_t out(int64_t k) const { return widths[k + 1]; }
+    bool activates(int64_t k) const { return k < layers - 1 || activate_output; }
+    const float *weight(int64_t k, int64_t seed) const { return parameters[2 * k] + seed * strides[2 * k]; }
+    const float *bias(int64_t k, int64_t seed) const { return parameters[2 * k + 1] + seed * strides[2 * k + 1]; }
+    int64_t blocks(Span part) const { return (part.size() + BLOCK - 1) / BLOCK; }
+    // What layer k gives to a row, activated.
+    float *given(int64_t k, int64_t seed, int64_t row) const {
+        int64_t below = 0;
+        for (int64_t j = 0; j < k; j++) below += padded(out(j));
+        return hidden + below * seeds * rows + (seed * rows + row) * padded(out(k));
+    }
+    // What layer k reads.
+    Matrix read(int64_t k, int64_t seed, int64_t row) const {
+        if (k == 0) return {inputs + (seed * rows + row) * in(0), in(0), 1};
+        return {given(k - 1, seed, row), padded(in(k)), 1};
+    }
+    // Whether the gradient of a weight is computed as [out, in], so that thin outputs are not filled up.
+    bool turned(int64_t k) const { return k > 0 && out(k) < PAD; }
+    int64_t weight_room(int64_t k) const { return turned(k) ? out(k) * padded(in(k)) : in(k) * padded(out(k)); }
+};
+
+extern "C" {
+
+// Compute the outputs, and keep what hidden layers give where there is room for it.
+void forward(const Perceptron *given, const Outputs *outputs) {
+    const Layout net(*given);
+    int64_t room = 0;
+    for (int64_t k = 0; k < net.layers; k++) room += (net.in(k) + 1) * padded(net.out(k));
+    Scratch packed = scratch(net.seeds * room);
+#pragma omp parallel num_threads(static_cast<int>(net.threads))
+    {
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < net.seeds; s++) {
+            float *to = packed.get() + s * room;
+            for (int64_t k = 0; k < net.layers; k++) {
+                int64_t width = padded(net.out(k));
+                for (int64_t i = 0; i <= net.in(k); i++, to += width) {
+                    const float *from = i < net.in(k) ? net.weight(k, s) + i * net.out(k) : net.bias(k, s);
+                    std::copy(from, from + net.out(k), to);
+                    std::fill(to + net.out(k), to + width, 0.0f);
+                }
+            }
+        }
+        Scratch own = scratch(2 * BLOCK * net.widest);
+#pragma omp for schedule(static)
+        for (int64_t task = 0; task < net.seeds * net.parts; task++) {
+            int64_t s = task / net.parts;
+            Span part = Span{0, net.rows}.part(task % net.parts, net.parts);
+            for (int64_t b = 0; b < net.blocks(part); b++) {
+                Span span = part.part(b, net.blocks(part));
+                Matrix from = net.read(0, s, span.begin);
+                const float *weight = packed.get() + s * room;
+                for (int64_t k = 0; k < net.layers; k++) {
+                    int64_t width = padded(net.out(k));
+                    bool kept = net.hidden && net.activates(k);
+                    float *to = kept ? net.given(k, s, span.begin) : own.get() + (k % 2) * BLOCK * net.widest;
+                    const float *bias = weight + net.in(k) * width;
+                    product(span.size(), width, net.in(k), from, weight, width, bias, false, to, width);
+                    if (net.activates(k)) activate(to, span.size() * width, net.tanh);
+                    from = {to, width, 1};
+                    weight = bias + width;
+                }
+                float *to = outputs->at + s * outputs->seed + span.begin * outputs->row;
+                copy(span.size(), net.out(net.layers - 1), from, to, outputs->row, outputs->column);
+            }
+        }
+    }
+}
+
+// Compute the gradients by the parameters, [S, P] in their order, and by the inputs, [S, R, in], unless they are null.
+void backward(const Perceptron *given, const Outputs *by_outputs, float *by_parameters, float *by_inputs) {
+    const Layout net(*given);
+    int64_t turned_room = 0, sum_room = 0, count = 0;
+    for (int64_t k = 0; k < net.layers; k++) {
+        turned_room += net.out(k) * padded(net.in(k));
+        sum_room += net.weight_room(k) + padded(net.out(k));
+        count += (net.in(k) + 1) * net.out(k);
+    }
+    Scratch turned = scratch(net.seeds * turned_room);
+    Scratch sums = scratch(by_parameters ? net.seeds * net.parts * sum_room : 0);
+#pragma omp parallel num_threads(static_cast<int>(net.threads))
+    {
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < net.seeds; s++) {
+            float *to = turned.get() + s * turned_room;
+            for (int64_t k = 0; k < net.layers; k++)
+                for (int64_t o = 0; o < net.out(k); o++, to += padded(net.in(k))) {
+                    for (int64_t i = 0; i < net.in(k); i++) to[i] = net.weight(k, s)[i * net.out(k) + o];
+                    std::fill(to + net.in(k), to + padded(net.in(k)), 0.0f);
+                }
+        }
+        Scratch own = scratch(2 * BLOCK * net.widest);
+#pragma omp for schedule(static)
+        for (int64_t task = 0; task < net.seeds * net.parts; task++) {
+            int64_t s = task / net.parts;
+            Span part = Span{0, net.rows}.part(task % net.parts, net.parts);
+            float *part_sums = sums.get() + task * sum_room;
+            if (by_parameters && net.blocks(part) == 0) std::fill(part_sums, part_sums + sum_room, 0.0f);
+            for (int64_t b = 0; b < net.blocks(part); b++) {
+                Span span = part.part(b, net.blocks(part));
+                float *here = own.get(), *next = here + BLOCK * net.widest;
+                const float *weight = turned.get() + (s + 1) * turned_room;
+                float *sum = part_sums + sum_room;
+                {
+                    int64_t out = net.out(net.layers - 1), width = padded(out);
+                    const float *from = by_outputs->at + s * by_outputs->seed + span.begin * by_outputs->row;
+                    if (width > out) std::fill(here, here + span.size() * width, 0.0f);
+                    copy(span.size(), out, {from, by_outputs->row, by_outputs->column}, here, width, 1);
+                }
+                for (int64_t k = net.layers - 1; k >= 0; k--) {
+                    int64_t in = net.in(k), out = net.out(k), width = padded(out);
+                    if (net.activates(k)) times_slope(here, net.given(k, s, span.begin), span.size() * width, net.tanh);
+                    Matrix read = net.read(k, s, span.begin);
+                    sum -= net.weight_room(k) + width;
+                    if (by_parameters) {
+                        bool add = b > 0;
+                        int64_t depth = span.size(), from = read.row;
+                        if (net.turned(k))
+                            product(out, from, depth, {here, 1, width}, read.at, from, nullptr, add, sum, from);
+                        else
+                            product(in, width, depth, {read.at, 1, from}, here, width, nullptr, add, sum, width);
+                        float *bias = sum + net.weight_room(k);
+                        for (int64_t o = 0; o < width; o += LANES) {
+                            Vec total = add ? vec(bias + o) : Vec{};
+                            for (int64_t r = 0; r < span.size(); r++) total += vec(here + r * width + o);
+                            vec(bias + o) = total;
+                        }
+                    }
+                    weight -= out * padded(in);
+                    if (k == 0 && !by_inputs) continue;
+                    int64_t below = padded(in);
+                    product(span.size(), below, out, {here, width, 1}, weight, below, nullptr, false, next, below);
+                    std::swap(here, next);
+                }
+                if (by_inputs)
+                    copy(span.size(), net.in(0), {here, padded(net.in(0)), 1},
+                         by_inputs + (s * net.rows + span.begin) * net.in(0), net.in(0), 1);
+            }
+        }
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < (by_parameters ? net.seeds : 0); s++)
+            for (int64_t p = 0; p < net.parts; p++) {
+                float *to = by_parameters + s * count;
+                const float *from = sums.get() + (s * net.parts + p) * sum_room;
+                for (int64_t k = 0; k < net.layers; k++) {
+                    int64_t in = net.in(k), out = net.out(k);
+                    int64_t row = net.turned(k) ? 1 : padded(out), column = net.turned(k) ? padded(in) : 1;
+                    for (int64_t i = 0; i < in; i++)
+                        for (int64_t o = 0; o < out; o++, to++) *to = from[i * row + o * column] + (p ? *to : 0.0f);
+                    from += net.weight_room(k);
+                    for (int64_t o = 0; o < out; o++, to++) *to = from[o] + (p ? *to : 0.0f);
+                    from += padded(out);
+                }
+            }
+    }
+}
+
+}

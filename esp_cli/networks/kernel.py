@@ -1,0 +1,142 @@
+"""Perceptrons compiled for the processor at hand: what `perceptron.Pass` does, in one call each way.
+
+The results differ from those of `Pass` by rounding, and so between processors. A seed's do not depend on the seeds
+beside it, nor on the number of threads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from esp_cli.networks.perceptron import Shape
+
+_SOURCE = Path(__file__).with_name("kernel.cpp")
+_OPTIONS = ("-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-std=gnu++17")
+_PADDING = 16
+"""PAD of kernel.cpp."""
+
+
+class _Perceptron(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("seeds", "rows", "layers", "tanh", "activate_output", "threads")),
+        *((name, ctypes.c_void_p) for name in ("widths", "parameters", "strides", "inputs", "hidden")),
+    )
+
+
+class _Outputs(ctypes.Structure):
+    _fields_ = (("at", ctypes.c_void_p), *((name, ctypes.c_int64) for name in ("seed", "row", "column")))
+
+    @classmethod
+    def of(cls, x: Tensor) -> _Outputs:
+        return cls(x.data_ptr(), *x.stride())
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Compile the kernel, which takes two seconds, in a temporary folder, and load it.
+
+    Raises:
+        ValueError: there is no C++ compiler, or it fails.
+    """
+    compiler = shlex.split(os.environ.get("CXX", "")) or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
+    if shutil.which(compiler[0]) is None:
+        raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(folder) / "kernel.so"
+        command = [*compiler, *_OPTIONS, str(_SOURCE), "-o", str(built)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip())
+            raise ValueError(f"{shlex.join(compiler)} does not compile the kernel of network.compiled: {said}")
+        return ctypes.CDLL(str(built))
+
+
+def _with_whole_rows(x: Tensor) -> Tensor:
+    """Return x [S, ., .] with each seed's numbers in a row; views of a learner's buffer are so already."""
+    return x if x.stride(2) == 1 and x.stride(1) == x.shape[2] else x.contiguous()
+
+
+class CompiledPass:
+    """A pass through a perceptron that keeps its activations until its `backward`; see `perceptron.Pass`.
+
+    Args:
+        shape: of precision float32.
+        inputs: [S, B, ...] parts of x, side by side, on the CPU.
+        parameters: W_1, b_1, ..., W_n, b_n.
+        keep: whether there will be a backward.
+
+    Attributes:
+        outputs: y.
+    """
+
+    @torch.no_grad()
+    def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> None:
+        x = (inputs[0] if len(inputs) == 1 else torch.cat([*inputs], -1)).contiguous()
+        self._read = list(pairwise(accumulate((part.shape[-1] for part in inputs), initial=0)))
+        widths = [x.shape[2], *(bias.shape[2] for bias in parameters[1::2])]
+        self._shapes = [p.shape[1:] for p in parameters]
+        activated = widths[1:] if shape.activate_output else widths[1:-1]
+        room = sum(-(-width // _PADDING) * _PADDING for width in activated) if keep else 0
+        given, hidden = [_with_whole_rows(p.detach()) for p in parameters], x.new_empty(x.shape[0] * x.shape[1] * room)
+        tables = (
+            (ctypes.c_int64 * len(widths))(*widths),
+            (ctypes.c_void_p * len(given))(*(p.data_ptr() for p in given)),
+            (ctypes.c_int64 * len(given))(*(p.stride(0) for p in given)),
+        )
+        self._arguments = _Perceptron(
+            x.shape[0],
+            x.shape[1],
+            len(widths) - 1,
+            shape.activation == "tanh",
+            shape.activate_output,
+            torch.get_num_threads(),
+            *(ctypes.addressof(table) for table in tables),
+            x.data_ptr(),
+            hidden.data_ptr() if keep else None,
+        )
+        self._alive = (x, given, hidden, tables)
+        size = (x.shape[0], x.shape[1], widths[-1])
+        columns_first = shape.rows_innermost or widths[-1] < _PADDING
+        self.outputs = x.new_empty(size[0], size[2], size[1]).transpose(1, 2) if columns_first else x.new_empty(size)
+        library().forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
+
+    def backward(self, grad: Tensor) -> list[Tensor]:
+        """Return the gradients by the parameters, of what has the gradient `grad` by the outputs."""
+        grads, _ = self.backward_to(grad, [True] * len(self._shapes), [])
+        return [g for g in grads if g is not None]
+
+    @torch.no_grad()
+    def backward_to(
+        self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
+    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
+        """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
+        x = self._alive[0]
+        found = x.new_empty(x.shape[0], sum(map(torch.Size.numel, self._shapes))) if any(learns) else None
+        below = torch.empty_like(x) if any(asked) else None
+        library().backward(
+            ctypes.byref(self._arguments),
+            ctypes.byref(_Outputs.of(grad)),
+            None if found is None else ctypes.c_void_p(found.data_ptr()),
+            None if below is None else ctypes.c_void_p(below.data_ptr()),
+        )
+        ends = pairwise(accumulate(map(torch.Size.numel, self._shapes), initial=0))
+        grads = [
+            None if found is None or not wanted else found[:, begin:end].unflatten(1, size)
+            for wanted, (begin, end), size in zip(learns, ends, self._shapes, strict=True)
+        ]
+        columns = zip(asked, self._read, strict=False)
+        return grads, [None if below is None or not wanted else below[..., a:b] for wanted, (a, b) in columns]

@@ -1,0 +1,173 @@
+"""The compiled perceptron does what torch's operations do, for each seed by itself, and says when it cannot."""
+
+import math
+import shutil
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from esp_cli.app import app
+from esp_cli.networks import kernel
+from esp_cli.networks.kernel import CompiledPass
+from esp_cli.networks.layers import SeedMLP
+from esp_cli.networks.perceptron import Shape
+from esp_cli.networks.plain import MlpConfig
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_cli.training.loading import load_policy, single_seed
+from tests.networks.gradients import assert_same_gradients
+from tests.networks.test_layers import generators, reference
+
+needs_compiler = pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+
+
+def shape(activation="tanh", activate_output=False, rows_innermost=False):
+    return Shape(activation, activate_output, torch.float32, rows_innermost, compiled=True)
+
+
+@needs_compiler
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize("activate_output", [False, True])
+@pytest.mark.parametrize("sizes", [(14, 64, 64, 5), (43, 64, 161), (7, 30, 17, 1), (3, 1), (5, 150, 40, 3)])
+@pytest.mark.parametrize("rows", [1, 127, 300, 1100])
+def test_outputs_and_gradients_equal_those_of_autograd(activation, activate_output, sizes, rows):
+    mlp = SeedMLP(generators(0, 1, 2), sizes, activation, 1.0, activate_output=activate_output, compiled=True)
+    x, weight = torch.randn(3, rows, sizes[0], requires_grad=True), torch.randn(3, rows, sizes[-1])
+    ours, theirs = mlp(x), reference(mlp, x)
+    assert type(ours.grad_fn).__name__ == "_PerceptronBackward"
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+    assert_same_gradients(ours, theirs, weight, [x, *mlp.parameters()], rtol=1e-4, atol=1e-4)
+    with torch.no_grad():
+        torch.testing.assert_close(mlp(x), ours, rtol=0, atol=0)
+
+
+@needs_compiler
+def test_a_pass_by_hand():
+    """y = 3 tanh(2 x1 - x2 + 0.5) + 1 at x = (1, 2): tanh(0.5) = 0.46212; slope 1 - 0.46212^2 = 0.78645."""
+    x = torch.tensor([[[1.0, 2.0]]])
+    parameters = [
+        torch.tensor([[[2.0], [-1.0]]]),
+        torch.tensor([[[0.5]]]),
+        torch.tensor([[[3.0]]]),
+        torch.ones(1, 1, 1),
+    ]
+    run = CompiledPass(shape(), [x], parameters)
+    assert run.outputs.item() == pytest.approx(3 * 0.46212 + 1, abs=1e-4)
+    grads, (below,) = run.backward_to(torch.full((1, 1, 1), 10.0), [True] * 4, [True])
+    first, bias, second, offset = (g.flatten().tolist() for g in grads)
+    assert second == pytest.approx([4.6212], abs=1e-3)
+    assert offset == [10.0]
+    assert bias == pytest.approx([30 * 0.78645], abs=1e-3)
+    assert first == pytest.approx([30 * 0.78645, 60 * 0.78645], abs=1e-3)
+    assert below.flatten().tolist() == pytest.approx([60 * 0.78645, -30 * 0.78645], abs=1e-3)
+
+
+@needs_compiler
+def test_tanh_is_right_from_end_to_end():
+    x = torch.cat([torch.linspace(-50, 50, 5001), torch.tensor([math.inf, -math.inf, math.nan, 0.0, 1e-30])])
+    one, none = torch.ones(1, 1, 1), torch.zeros(1, 1, 1)
+    y = CompiledPass(shape(activate_output=True), [x.view(1, -1, 1)], [one, none]).outputs.flatten()
+    torch.testing.assert_close(y, torch.tanh(x.double()).float(), rtol=0, atol=3e-7, equal_nan=True)
+
+
+@needs_compiler
+@pytest.mark.parametrize("rows", [50, 1100])
+def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits(rows):
+    torch.manual_seed(0)
+    parameters = [torch.randn(3, *size) for size in ((9, 40), (1, 40), (40, 5), (1, 5))]
+    x, grad = torch.randn(3, rows, 9), torch.randn(3, rows, 5)
+
+    def passed(seeds, threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            run = CompiledPass(shape(), [x[seeds]], [p[seeds] for p in parameters])
+            return [run.outputs, *run.backward(grad[seeds])]
+        finally:
+            torch.set_num_threads(before)
+
+    together = passed(slice(0, 3), 2)
+    for alone in (passed(slice(1, 2), 2), passed(slice(1, 2), 1)):
+        assert all(torch.equal(a, b[1:2]) for a, b in zip(alone, together, strict=True))
+    other = passed(slice(2, 3), 2)
+    assert not torch.equal(other[0], together[0][1:2]), "negative control: the seeds differ"
+
+
+@needs_compiler
+def test_parts_side_by_side_and_frozen_parameters():
+    mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0, compiled=True).requires_grad_(False)
+    fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
+    ours = mlp.of_parts(fixed, moving, rows_innermost=True)
+    theirs = reference(mlp, torch.cat([fixed, moving], -1))
+    assert ours.transpose(1, 2).is_contiguous()
+    torch.testing.assert_close(ours, theirs)
+    assert_same_gradients(ours, theirs, torch.randn(2, 11, 20), [moving])
+
+
+@needs_compiler
+def test_parameters_that_are_no_rows_and_no_rows_at_all():
+    weight = torch.randn(2, 20, 5).transpose(1, 2)
+    x, bias = torch.randn(2, 30, 5), torch.randn(2, 1, 20)
+    run = CompiledPass(shape("relu", activate_output=True), [x], [weight, bias])
+    torch.testing.assert_close(run.outputs, torch.relu(x @ weight + bias))
+    empty = CompiledPass(shape(), [x[:, :0]], [weight, bias])
+    assert empty.outputs.shape == (2, 0, 20)
+    assert all(not g.any() for g in empty.backward(torch.zeros(2, 0, 20)))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("algorithm", "network"), [("mappo", "mlp"), ("mappo", "gru"), ("maddpg", "mlp"), ("qmix", "mlp"), ("qmix", "gru")]
+)
+def test_learners_learn_the_same_up_to_rounding(algorithm, network):
+    def parameters(compiled):
+        settings = {"network.name": network, "network.compiled": compiled}
+        learner = build_learner(resolve_config("navigation", algorithm, seeds=(0, 1), overrides=settings))
+        start = [p.detach().clone() for p in learner.policy.parameters()]
+        learner.iterate(0.0)
+        return start, list(learner.policy.parameters())
+
+    (start, ours), (_, theirs) = parameters(True), parameters(False)
+    moved = max((a - b).abs().max() for a, b in zip(start, theirs, strict=True))
+    apart = max((a - b).abs().max() for a, b in zip(ours, theirs, strict=True))
+    assert 0 < apart < 0.05 * moved
+
+
+@needs_compiler
+def test_a_policy_trained_with_it_needs_no_compiler(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    options = ["--steps", "800", "--set", "network.compiled=true", "--set", "evaluation.episodes=1"]
+    result = CliRunner().invoke(app, ["train", *options, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    monkeypatch.setattr(kernel, "library", without_compiler)
+    assert load_policy(folder).config.network.compiled
+    assert not single_seed(load_policy(folder), 0).config.network.compiled
+
+
+def without_compiler():
+    raise AssertionError("the kernel is asked for")
+
+
+def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
+    kernel.library.cache_clear()
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    result = CliRunner().invoke(app, ["train", "--set", "network.compiled=true", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert "network.compiled needs a C++ compiler" in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
+def test_a_compiler_that_fails_is_named_with_what_it_says(tmp_path, monkeypatch):
+    kernel.library.cache_clear()
+    compiler = tmp_path / "broken"
+    compiler.write_text("#!/bin/sh\necho 'error: no such option' >&2\nexit 1\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(ValueError, match=r"broken does not compile the kernel .*: error: no such option"):
+        kernel.library()
+
+
+def test_bfloat16_and_the_kernel_exclude_each_other():
+    with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
+        MlpConfig(compiled=True, precision="bfloat16")
