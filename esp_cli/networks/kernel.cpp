@@ -162,11 +162,12 @@ struct Span {
 
 struct Perceptron {
     int64_t seeds, rows, layers, tanh, activate_output, threads;
-    const int64_t *widths;                 // layers + 1
-    const float *const *parameters;        // W_1, b_1, ... of the first seed
-    const int64_t *strides;                // of each parameter, from seed to seed
-    const float *inputs;                   // [S, R, widths[0]]
-    float *hidden;                         // what hidden layers give, and an activated output; null: not kept
+    int64_t stride;                  // of the inputs, from seed to seed
+    const int64_t *widths;           // layers + 1
+    const float *const *parameters;  // W_1, b_1, ... of the first seed
+    const int64_t *strides;          // of each parameter, from seed to seed
+    const float *inputs;             // [S, R, widths[0]]
+    float *hidden;                   // what hidden layers give, and an activated output; null: not kept
 };
 
 struct Outputs {
@@ -176,9 +177,11 @@ struct Outputs {
 
 struct Layout : Perceptron {
     int64_t parts, widest;
+    int busy;  // threads with something to do: the others are not woken
 
     explicit Layout(const Perceptron &given) : Perceptron(given), parts(1), widest(PAD) {
         while (parts < MOST_PARTS && parts * PART < rows) parts *= 2;
+        busy = static_cast<int>(std::min(threads, std::max<int64_t>(1, seeds * parts)));
         for (int64_t k = 0; k <= layers; k++) widest = std::max(widest, padded(widths[k]));
     }
     int64_t in(int64_t k) const { return widths[k]; }
@@ -195,7 +198,7 @@ struct Layout : Perceptron {
     }
     // What layer k reads.
     Matrix read(int64_t k, int64_t seed, int64_t row) const {
-        if (k == 0) return {inputs + (seed * rows + row) * in(0), in(0), 1};
+        if (k == 0) return {inputs + seed * stride + row * in(0), in(0), 1};
         return {given(k - 1, seed, row), padded(in(k)), 1};
     }
     // Whether the gradient of a weight is computed as [out, in], so that thin outputs are not filled up.
@@ -211,7 +214,7 @@ void forward(const Perceptron *given, const Outputs *outputs) {
     int64_t room = 0;
     for (int64_t k = 0; k < net.layers; k++) room += (net.in(k) + 1) * padded(net.out(k));
     Scratch packed = scratch(net.seeds * room);
-#pragma omp parallel num_threads(static_cast<int>(net.threads))
+#pragma omp parallel num_threads(net.busy)
     {
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < net.seeds; s++) {
@@ -262,7 +265,7 @@ void backward(const Perceptron *given, const Outputs *by_outputs, float *by_para
     }
     Scratch turned = scratch(net.seeds * turned_room);
     Scratch sums = scratch(by_parameters ? net.seeds * net.parts * sum_room : 0);
-#pragma omp parallel num_threads(static_cast<int>(net.threads))
+#pragma omp parallel num_threads(net.busy)
     {
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < net.seeds; s++) {

@@ -32,7 +32,10 @@ _PADDING = 16
 
 class _Perceptron(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("seeds", "rows", "layers", "tanh", "activate_output", "threads")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("seeds", "rows", "layers", "tanh", "activate_output", "threads", "stride")
+        ),
         *((name, ctypes.c_void_p) for name in ("widths", "parameters", "strides", "inputs", "hidden")),
     )
 
@@ -85,7 +88,7 @@ class CompiledPass:
 
     @torch.no_grad()
     def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> None:
-        x = (inputs[0] if len(inputs) == 1 else torch.cat([*inputs], -1)).contiguous()
+        x = _with_whole_rows(inputs[0] if len(inputs) == 1 else torch.cat([*inputs], -1))
         self._read = list(pairwise(accumulate((part.shape[-1] for part in inputs), initial=0)))
         widths = [x.shape[2], *(bias.shape[2] for bias in parameters[1::2])]
         self._shapes = [p.shape[1:] for p in parameters]
@@ -104,6 +107,7 @@ class CompiledPass:
             shape.activation == "tanh",
             shape.activate_output,
             torch.get_num_threads(),
+            x.stride(0),
             *(ctypes.addressof(table) for table in tables),
             x.data_ptr(),
             hidden.data_ptr() if keep else None,
@@ -126,7 +130,7 @@ class CompiledPass:
         """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
         x = self._alive[0]
         found = x.new_empty(x.shape[0], sum(map(torch.Size.numel, self._shapes))) if any(learns) else None
-        below = torch.empty_like(x) if any(asked) else None
+        below = x.new_empty(x.shape) if any(asked) else None
         library().backward(
             ctypes.byref(self._arguments),
             ctypes.byref(_Outputs.of(grad)),

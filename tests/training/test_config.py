@@ -70,8 +70,13 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
         ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
-        ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision"}),
-        ("predator-prey", "maddpg", {"network.name": "gru", "network.layer_norm": True}, {"network.precision"}),
+        ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision", "network.compiled"}),
+        (
+            "predator-prey",
+            "maddpg",
+            {"network.name": "gru", "network.layer_norm": True},
+            {"network.precision", "network.compiled"},
+        ),
     ],
 )
 def test_task_learner_and_network_name_the_settings_that_do_nothing_beside_the_others(task, algorithm, choice, idle):
