@@ -132,6 +132,18 @@ def restore_generators(generators: Sequence[torch.Generator], states: Tensor) ->
         generator.set_state(state.cpu().clone())
 
 
+def put_back(env: Environment, observation: Observation) -> None:
+    """Put worlds that have reset themselves back to how their episodes ended, for a picture; draws no numbers.
+
+    Args:
+        env: with `set_state`.
+        observation: the last of the episodes.
+    """
+    states = generator_states(env.generators)
+    env.set_state(observation.state)
+    restore_generators(env.generators, states)
+
+
 class TaskSettings(BaseModel):
     """What a user may change of a task; each field has its default, unit and bounds here and nowhere else."""
 

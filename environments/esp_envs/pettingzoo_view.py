@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from esp_envs.base import Observation
+from esp_envs.base import Observation, put_back
 from esp_envs.drawing import draw
 from esp_envs.extras import install
 from esp_envs.registry import make
@@ -103,7 +103,7 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         step = self._env.step(self._joint(actions))
         terminated, truncated = bool(step.terminated[0, 0]), bool(step.truncated[0, 0])
         if (terminated or truncated) and self.render_mode is not None and self._env.has("set_state"):
-            self._env.set_state(step.reached.state)  # the world has reset itself; show how the episode ended
+            put_back(self._env, step.reached)  # the world has reset itself; show how the episode ended
         seen, agents = step.reached, self.agents
         living = self._living(seen, agents)
         reward = dict(zip(self.possible_agents, step.reward[0, 0].tolist(), strict=True))

@@ -75,12 +75,14 @@ def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
     return seeds
 
 
-def chosen_seeds(seeds: tuple[int, ...], named: tuple[int, ...] | None, default: tuple[int, ...]) -> tuple[int, ...]:
+def chosen_seeds(
+    counted: tuple[int, ...] | None, named: tuple[int, ...] | None, default: tuple[int, ...]
+) -> tuple[int, ...]:
     """Return the seeds that `--seeds` and `--seed-list` ask for.
 
     Raises:
         ValueError: both are given.
     """
-    if named is not None and seeds != default:
+    if named is not None and counted is not None:
         raise ValueError("--seeds and --seed-list both say which seeds to train; leave one of them out")
-    return seeds if named is None else named
+    return counted or named or default

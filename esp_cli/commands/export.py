@@ -32,6 +32,7 @@ EPILOG = """Examples:\n
     esp export formation -f webots -o formation-webots\n
     esp export runs/cn-mappo -f policy -o checkpoints"""
 
+EPISODES = 320
 FORMATS = ("onnx", "torch", "c", "numpy", "webots", "ros2", "policy")
 
 
@@ -55,9 +56,15 @@ def export(
     network: OwnNetworkOption = None,
     prior: BundledPriorOption = None,
     episodes: Annotated[
-        int,
-        typer.Option("--episodes", "-e", min=2, help="Per seed, to find the best; as many others evaluate it."),
-    ] = 320,
+        int | None,
+        typer.Option(
+            "--episodes",
+            "-e",
+            min=2,
+            help="Per seed, to find the best; as many others evaluate a bundled policy.",
+            show_default="320",
+        ),
+    ] = None,
     name: Annotated[
         str | None, typer.Option("--name", help="Name of a bundled policy; by default TASK-ALGO-PRIOR.")
     ] = None,
@@ -79,18 +86,20 @@ def export(
         raise ValueError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
     if name is not None and "policy" not in formats:
         raise ValueError("--name is for -f policy alone; leave it out")
+    if seed is not None and episodes is not None and "policy" not in formats:
+        raise ValueError("--episodes finds the best seed, and --seed names one; leave one of them out")
     register_tasks(task)
     register_learners([algo], network or [])
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
     if "policy" in formats:
-        entry = bundle(trained, out, episodes, seed, name)
+        entry = bundle(trained, out, episodes or EPISODES, seed, name, force)
         _announce(entry, out)
         if json is not None:
             console.write_json(json, entry.model_dump(mode="json"))
         return
-    chosen = _best(trained, episodes) if seed is None else seed
+    chosen = _best(trained, episodes or EPISODES) if seed is None else seed
     exported = write(single_seed(trained, chosen), formats, out, force)
     if json != "-":
         _print(exported, f"{policy}, seed {chosen}")

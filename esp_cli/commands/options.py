@@ -195,15 +195,16 @@ StepsOption = Annotated[
     ),
 ]
 if TYPE_CHECKING:
-    SeedsOption = tuple[int, ...]
+    SeedsOption = tuple[int, ...] | None
     SeedListOption = tuple[int, ...] | None
 else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
     SeedsOption = Annotated[
-        tuple,
+        tuple | None,
         typer.Option(
             "--seeds",
             "-s",
             help="How many seeds to train at once: 10 means the seeds 0 to 9.",
+            show_default="1",
             metavar="COUNT",
             parser=_option_parser(parse_seeds, "COUNT"),
         ),

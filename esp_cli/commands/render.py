@@ -96,7 +96,7 @@ def render(
     from esp_cli.drawing.draw import check_target, draw
     from esp_cli.training.loading import transfer
 
-    kind = check_target(out, episodes)
+    kind = check_target(out, episodes, fps)
     register_tasks(task)
     register_learners([algo], network or [])
     changed = parse_task_settings(settings or [], physics)

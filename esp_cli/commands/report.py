@@ -115,11 +115,13 @@ def report(
 
     register_tasks(task)
     register_learners(algo or [], network or [])
+    of_the_picture = reference or y_limits or view
+    of_runs = any((out, films, results, at, threshold, of_the_picture, mode, plot, csv, json))
+    if not runs and (of_runs or fill is None):
+        raise ValueError("there is nothing to report; name a study folder or run folders")
     if fill is not None:
         _fill(fill)
     if not runs:
-        if fill is None:
-            raise ValueError("there is nothing to report; name a study folder or run folders")
         return
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
@@ -133,10 +135,11 @@ def report(
             raise ValueError(
                 "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
             )
-        material = collect.collect(StudyFolder.open(Path(runs[0])), mode, limits)
         out = out or Path(runs[0]) / "report"
+        material = collect.collect(StudyFolder.open(Path(runs[0])), mode, limits)
         document, folders = material.results.document(), material.runs
     else:
+        _refuse_idle(films and out is None, plot is None and bool(of_the_picture))
         command = _command(runs, at or [], limits, mode, out)
         steps, asked = [parse_count(text) for text in at or []], mode or "greedy"
         places = [_labelled(text) for text in runs]
@@ -155,6 +158,18 @@ def report(
         for file in loose.plot(material, plot, lines, y_limits):
             console.note(f"curves -> {file}")
     _write(material, out, films, results)
+
+
+def _refuse_idle(films: bool, of_the_picture: bool) -> None:
+    """Refuse options of what is not written.
+
+    Raises:
+        ValueError: films without a page, or lines and limits without a picture.
+    """
+    if films:
+        raise ValueError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
+    if of_the_picture:
+        raise ValueError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
 
 
 def _limits(given: tuple[float, float] | None, old: tuple[float, float] | None) -> tuple[float, float] | None:

@@ -129,7 +129,7 @@ class StudyChoices:
     tasks: TasksOption = None
     algos: AlgosOption = None
     steps: StudyStepsOption = None
-    seeds: SeedsOption = DEFAULT_SEEDS
+    seeds: Annotated[tuple[int, ...], SeedsOption] = DEFAULT_SEEDS
     out: StudyOutOption = None
     preset: PresetOption = DEFAULT_PRESET
     settings: SetOption = None
@@ -230,6 +230,9 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     own = dict(inspect.signature(command, eval_str=True).parameters)
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
+    counted = copy.copy(get_args(SeedsOption)[1])
+    counted.show_default = str(len(DEFAULT_SEEDS))
+    shared["seeds"] = shared["seeds"].replace(annotation=Annotated[tuple | None, counted], default=None)
     for name, text in helps.items():
         kind, option = get_args(shared[name].annotation)
         option = copy.copy(option)

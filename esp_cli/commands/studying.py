@@ -61,6 +61,7 @@ def run_study(
         jobs = choices.jobs or engine.places(study.cells[0].config.device)
         note_without_effect(without_effect(kind, request))
         if choices.dry_run:
+            StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
             _dry_run(StudyFolder(out, study), others, jobs, choices.json)
             return
         begun = time.monotonic()

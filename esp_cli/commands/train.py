@@ -73,7 +73,7 @@ def train(
         ),
     ] = None,
     steps: StepsOption = DEFAULT_STEPS,
-    seeds: SeedsOption = DEFAULT_SEEDS,
+    seeds: SeedsOption = None,
     seed_list: SeedListOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.", metavar="PATH")

@@ -41,9 +41,14 @@ def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:
 
 
 def bundle(
-    trained: TrainedPolicy, folder: Path, episodes: int, seed: int | None = None, name: str | None = None
+    trained: TrainedPolicy,
+    folder: Path,
+    episodes: int,
+    seed: int | None = None,
+    name: str | None = None,
+    force: bool = False,
 ) -> Entry:
-    """Write one seed's policy and list it in the manifest; an entry of the same name is replaced.
+    """Write one seed's policy and list it in the manifest.
 
     Args:
         trained: a run.
@@ -51,22 +56,27 @@ def bundle(
         episodes: to choose the seed by, and as many others to score it by.
         seed: which one; by default the best.
         name: of the policy; by default from task, algorithm and prior.
+        force: replace a policy of the same name.
 
     Returns:
         Its line in the manifest.
 
     Raises:
-        ValueError: an unknown seed, an invalid name, a damaged manifest, or a file that cannot be written.
+        ValueError: an unknown seed, an invalid name or one that is taken, a damaged manifest, or a file that cannot be
+            written.
     """
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
     if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
         raise ValueError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
+    there = read_bundled(folder)
+    if not force and any(entry.name == name for entry in there):
+        raise ValueError(f"{folder} has {name} already; choose another --name, or replace it with --force")
     alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
     played = play_greedily(alone, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
-    others = tuple(entry for entry in read_bundled(folder) if entry.name != name)
+    others = tuple(entry for entry in there if entry.name != name)
     file = folder / f"{name}.safetensors"
     description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
     write_policy(file, alone.policy.state_dict(), description)

@@ -21,11 +21,16 @@ from esp_cli.deploy.onnx_file import onnx_model
 from esp_cli.deploy.program import Program
 from esp_cli.deploy.torch_file import torch_archive
 from esp_cli.deploy.translate import program_of
+from esp_cli.files.documents import parse_object
+from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.training.loading import TrainedPolicy
 
 STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
 """Of the e-puck2's microcontroller, an STM32F407."""
+
+DESCRIPTION = "policy.json"
+MAX_DESCRIPTION_BYTES = 1 << 26
 
 Files = dict[str, bytes]
 
@@ -153,9 +158,12 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
         force: replace files of an earlier export.
 
     Raises:
-        ValueError: a file exists already, a library is missing, or the format does not support the policy.
+        ValueError: a file exists already, an earlier export has formats that are not written anew, a library is
+            missing, or the format does not support the policy.
     """
     formats = tuple(dict.fromkeys(formats))
+    if force:
+        _refuse_mixture(formats, folder)
     program = replace(program_of(alone.policy), masked=alone.spec.masks)
     sample = take_sample(alone, program)
     description = describe(alone, program, sample)
@@ -167,11 +175,26 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
     results = tuple(_checked(name, files, job) for name, files in written.items())
     sections = [_section(result, job, c) for result in results] + ([epuck.told(description)] if robotic else [])
     beside = {
-        "policy.json": (json.dumps(job.description, indent=2) + "\n").encode(),
+        DESCRIPTION: (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode(),
         "README.md": readme(alone, job.description, sections).encode(),
     }
     _write({name: content for files in written.values() for name, content in files.items()} | beside, folder, force)
     return Exported(results, program.num_parameters, program.flops, c)
+
+
+def _refuse_mixture(formats: Sequence[str], folder: Path) -> None:
+    """Refuse to leave files of an earlier export beside those of another policy."""
+    try:
+        there = parse_object(read_regular(folder / DESCRIPTION, MAX_DESCRIPTION_BYTES) or b"", "a description")
+    except (OSError, ValueError):
+        return
+    known = there.get("formats")
+    left = [name for name in WRITERS if isinstance(known, list) and name in known and name not in formats]
+    if left:
+        again = " ".join(f"-f {name}" for name in left)
+        raise ValueError(
+            f"{folder} holds an export with other formats; write them anew too ({again}), or choose another --out"
+        )
 
 
 def _write(files: Files, folder: Path, force: bool) -> None:

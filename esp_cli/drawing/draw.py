@@ -39,11 +39,11 @@ class Drawing:
     note: str | None
 
 
-def check_target(out: Path, episodes: int | None) -> str:
+def check_target(out: Path, episodes: int | None, fps: float | None = None) -> str:
     """Return the ending of a file that can be drawn into.
 
     Raises:
-        ValueError: another ending, or more episodes than a picture holds.
+        ValueError: another ending, or what a picture does not have: more episodes, or frames per second.
         OSError: the file is a folder.
     """
     kind = out.suffix.lower()
@@ -51,6 +51,8 @@ def check_target(out: Path, episodes: int | None) -> str:
         raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
     if kind == PICTURE and episodes is not None and episodes > 1:
         raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
+    if kind == PICTURE and fps is not None:
+        raise ValueError(f"{out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
     if out.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
     return kind

@@ -11,7 +11,7 @@ from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
-from esp_envs.base import Environment
+from esp_envs.base import Environment, put_back
 from esp_envs.scene import Scene
 
 FILM_SECONDS = 8.0
@@ -84,7 +84,7 @@ def _play(controller: PolicyController, env: Environment, world: tuple[int, int]
         observation = step.next
         ended = bool(step.ended[world])
         if ended and step.final is not None and env.has("set_state"):
-            env.set_state(step.final.state)  # the world has reset itself; show how the episode ended
+            put_back(env, step.final)  # the world has reset itself; show how the episode ended
         scenes.append(scenes[-1] if ended and not env.has("set_state") else env.scene(world))
         returns.append(returns[-1] + float(step.reward.mean(-1)[world]))
         if ended:

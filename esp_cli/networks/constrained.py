@@ -75,8 +75,9 @@ class ConstrainedLinear(nn.Module):
                     part = full[:, row : row + source.width, column : column + target.width]
                     part = part.unflatten(1, (source.copies, -1)).unflatten(3, (target.copies, -1))
                     scale = math.sqrt(source.size * target.size / len(basis))
-                    start = torch.einsum("sminj,kij->smnk", part, basis) * scale
-                    self.weights[f"{a}-{b}"] = nn.Parameter(start.contiguous())
+                    # seed by seed: in one product for all, the rounding would depend on their number
+                    start = torch.stack([torch.einsum("minj,kij->mnk", own, basis) for own in part]) * scale
+                    self.weights[f"{a}-{b}"] = nn.Parameter(start)
                     self.register_buffer(f"basis-{a}-{b}", basis.flatten(1), False)
                 column += target.width
             row += source.width

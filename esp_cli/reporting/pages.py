@@ -26,7 +26,7 @@ def filled(page: Path) -> str:
     """Return the text of a page with every such table recomputed.
 
     Raises:
-        ValueError: the page, a file or a table is not there, or a file is damaged.
+        ValueError: the page, a file or a table is not there, a file is damaged, or the page has no such comments.
     """
     try:
         text = page.read_text(encoding="utf-8")
@@ -41,7 +41,13 @@ def filled(page: Path) -> str:
         content = "Nothing yet." if table is None else table.markdown()
         return f"{match[1]}\n{content}\n\n{match[4]}"
 
-    return _BLOCK.sub(compute, text)
+    page_text, count = _BLOCK.subn(compute, text)
+    if not count:
+        raise ValueError(
+            f"{page} has no table to compute; write '<!-- results: FILE TABLE -->' and '<!-- end of results -->', "
+            "each on a line of its own"
+        )
+    return page_text
 
 
 def files_of(page: Path) -> list[str]:

@@ -131,16 +131,30 @@ class StudyFolder:
     def create(cls, path: Path, study: Study) -> StudyFolder:
         """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
 
-        A cell that it has keeps its run, and may be compared with another one than before.
+        Raises:
+            StudyError: as `planned`.
+        """
+        folder = cls.planned(path, study)
+        cls.make(path)
+        if not cls.is_one(path) or cls.open(path).study != folder.study:
+            reach("study")
+            STUDY_FORMAT.write(path / STUDY, folder.study.model_dump(mode="json"))
+        return folder
+
+    @classmethod
+    def planned(cls, path: Path, study: Study) -> StudyFolder:
+        """Return what `create` makes of a study, without writing anything.
+
+        A cell that the folder has keeps its run, and may be compared with another one than before.
 
         Raises:
             StudyError: the folder holds another study, a run under other rules of its task, or something foreign.
         """
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
-        cls.make(path)
+        cls.refuse_foreign(path)
         if not cls.is_one(path):
-            return cls._written(path, study)
+            return cls(path, study)
         there = cls.open(path).study
         known = {cell.name: cell for cell in there.cells}
         again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
@@ -158,7 +172,7 @@ class StudyFolder:
             return cls(path, there)
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
         merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
-        return cls._written(path, study.model_copy(update=merged))
+        return cls(path, study.model_copy(update=merged))
 
     @classmethod
     def open(cls, path: Path) -> StudyFolder:
@@ -184,15 +198,18 @@ class StudyFolder:
             )
 
     @classmethod
-    def _written(cls, path: Path, study: Study) -> StudyFolder:
-        folder = cls(path, study)
-        reach("study")
-        STUDY_FORMAT.write(path / STUDY, study.model_dump(mode="json"))
-        return folder
-
-    @classmethod
     def make(cls, path: Path) -> None:
         """Make the folder, empty, unless it is there.
+
+        Raises:
+            StudyError: as `refuse_foreign`.
+        """
+        cls.refuse_foreign(path)
+        path.mkdir(parents=True, exist_ok=True)
+
+    @classmethod
+    def refuse_foreign(cls, path: Path) -> None:
+        """Refuse a folder that is neither new nor empty nor one of these.
 
         Raises:
             StudyError: it holds something foreign, or a link where its runs belong.
@@ -206,7 +223,6 @@ class StudyFolder:
             foreign = [name for name in names if name != STUDY_LOCK and not name.startswith(TEMPORARY_PREFIX)]
             if foreign:
                 raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
-        path.mkdir(parents=True, exist_ok=True)
 
     @classmethod
     @contextlib.contextmanager

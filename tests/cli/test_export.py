@@ -110,3 +110,24 @@ def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> 
     esp(*arguments, "--force")
     assert (tmp_path / "policy.py").read_bytes() == before
     assert (tmp_path / "mine.py").exists()
+
+
+def test_no_file_of_another_policy_stays_beside_an_export(finished: Path, tmp_path: Path) -> None:
+    esp("export", finished, "-f", "numpy", "-f", "torch", "-o", tmp_path, "--seed", 3)
+    other = ("export", finished, "-f", "numpy", "-o", tmp_path, "--seed", 7, "--force")
+    assert "holds an export with other formats; write them anew too (-f torch)" in refused(*other)
+    esp(*other, "-f", "torch")
+    assert json.loads((tmp_path / "policy.json").read_text())["formats"] == ["numpy", "torch"]
+
+
+def test_a_bundled_policy_is_replaced_only_by_force(finished: Path, tmp_path: Path) -> None:
+    bundle = ("export", finished, "-f", "policy", "-o", tmp_path, "--episodes", 4)
+    esp(*bundle, "--seed", 3)
+    assert "has navigation-mappo-esp already; choose another --name, or replace it with --force" in refused(*bundle)
+    esp(*bundle, "--seed", 7, "--force")
+    assert [entry.seed for entry in read_bundled(tmp_path)] == [7]
+
+
+def test_episodes_that_choose_nothing_are_refused(finished: Path, tmp_path: Path) -> None:
+    said = refused("export", finished, "-f", "numpy", "-o", tmp_path / "out", "--seed", 3, "--episodes", 4)
+    assert "--episodes finds the best seed, and --seed names one" in said

@@ -95,10 +95,11 @@ def test_what_is_no_list_of_seeds_is_refused(text: str, reason: str) -> None:
 
 
 def test_a_count_and_a_list_of_seeds_exclude_each_other() -> None:
-    assert chosen_seeds((0,), (3, 7), default=(0,)) == (3, 7)
+    assert chosen_seeds(None, (3, 7), default=(0,)) == (3, 7)
+    assert chosen_seeds(None, None, default=(0,)) == (0,)
     assert chosen_seeds((0, 1), None, default=(0,)) == (0, 1)
     with pytest.raises(ValueError, match="leave one of them out"):
-        chosen_seeds((0, 1), (3, 7), default=(0,))
+        chosen_seeds((0,), (3, 7), default=(0,))
 
 
 def test_assignments_are_json_where_they_can_be() -> None:

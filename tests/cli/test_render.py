@@ -47,6 +47,11 @@ def test_speed_seed_and_noise_are_chosen(finished: Path, tmp_path: Path) -> None
     assert film("--view", "top") == greedy, "a flat task has no other view"
 
 
+def test_frames_per_second_of_a_picture_are_refused(finished: Path, tmp_path: Path) -> None:
+    said = refused("render", finished, "-o", tmp_path / "picture.png", "--fps", 10)
+    assert "is a picture without frames; leave out --fps" in said
+
+
 @pytest.mark.parametrize(
     ("options", "frames", "duration"),
     [

@@ -146,6 +146,17 @@ def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Pa
     assert second["returns"]["50"]["difference"]["paired"] is False, "other seeds"
 
 
+def test_options_of_what_is_not_written_are_refused(finished: Path, tmp_path: Path) -> None:
+    for option in (("--reference", "paper=1"), ("--y-limits", "-200", "-100")):
+        assert "are of the picture that --plot draws" in refused("report", finished, *option)
+    assert "add --out FOLDER" in refused("report", finished, "--films")
+    page = tmp_path / "page.md"
+    page.write_text("No comments.\n")
+    assert "there is nothing to report" in refused("report", "--fill", page, "--results", tmp_path / "results.json")
+    assert "has no table to compute" in refused("report", "--fill", page)
+    assert page.read_text() == "No comments.\n"
+
+
 def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Path) -> None:
     renamed = copied.rename(copied.with_name("rate=1e-3"))
     for argument, label in ((renamed, "rate=1e-3"), (f"new={renamed}", "new"), (f"c=0.5={renamed}", "c=0.5")):

@@ -60,6 +60,11 @@ def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
     assert ("the times are unreliable" in told.stderr) == unreliable
 
 
+def test_a_dry_run_refuses_the_folders_that_the_run_refuses(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("")
+    assert "is not empty and no study" in refused(*TINY, *TINY_OPTIONS, "--out", tmp_path, "--dry-run")
+
+
 def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> None:
     out, plan = tmp_path / "s", tmp_path / "plan.json"
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--dry-run", "--jobs", 2, "--json", plan)

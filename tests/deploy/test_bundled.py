@@ -159,7 +159,7 @@ def test_a_folder_of_the_name_goes_before_the_box(small: Path, tmp_path: Path, m
 
 def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
     first = bundle(drawn_policy("choice"), tmp_path, 4)
-    second = bundle(drawn_policy("choice", hidden=(5,)), tmp_path, 4)
+    second = bundle(drawn_policy("choice", hidden=(5,)), tmp_path, 4, force=True)
     assert first.sha256 != second.sha256
     assert read_bundled(tmp_path) == (second,)
     with pytest.raises(ValueError, match=r"'Best one!' is not a valid policy name"):

@@ -77,8 +77,8 @@ def test_those_just_three_cells_away_both_ways_are_not_heard_by_any_of_them(tmp_
     rows = np.random.default_rng(0).standard_normal((3, WIDTH)).astype(np.float32)
     runners = [check.onnx_runner(tmp_path / "policy.onnx"), runner_of(program)]
     if check.compiler():
-        export(alone, ["c"], tmp_path, force=True)
-        runners.append(check.c_runner(tmp_path / "policy.c", program))
+        export(alone, ["c"], tmp_path / "c")
+        runners.append(check.c_runner(tmp_path / "c" / "policy.c", program))
 
     def said(ways: list[float]) -> np.ndarray:
         rows[:, -4:] = ways

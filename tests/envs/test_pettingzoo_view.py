@@ -218,6 +218,23 @@ def test_the_last_picture_is_of_how_the_episode_ended() -> None:
     assert not np.array_equal(last, view.render())
 
 
+def test_pictures_change_no_episode() -> None:
+    """Formation draws the noise of its sensors when it is put into a state."""
+
+    def seen(render_mode: str | None) -> tuple[np.ndarray, np.ndarray]:
+        view = ParallelView("formation", 0, render_mode=render_mode, horizon=2, sensor_noise_m=0.01)
+        still = dict.fromkeys(view.possible_agents, np.zeros(2, np.float32))
+        view.reset()
+        for _ in range(2):
+            view.step(still)
+        first, _ = view.reset()
+        second, *_ = view.step(still)
+        return first["agent_0"], second["agent_0"]
+
+    for without, drawn in zip(seen(None), seen("rgb_array"), strict=True):
+        np.testing.assert_array_equal(without, drawn)
+
+
 def test_unknown_tasks_and_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown task"):
         ParallelView("tag")
