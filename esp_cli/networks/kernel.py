@@ -16,13 +16,9 @@ from collections.abc import Sequence
 from functools import cache
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from esp_cli.networks.perceptron import Shape
 
 _SOURCE = Path(__file__).with_name("kernel.cpp")
 _OPTIONS = ("-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-std=gnu++17")
@@ -77,9 +73,11 @@ class CompiledPass:
     """A pass through a perceptron that keeps its activations until its `backward`; see `perceptron.Pass`.
 
     Args:
-        shape: of precision float32.
         inputs: [S, B, ...] parts of x, side by side, on the CPU.
         parameters: W_1, b_1, ..., W_n, b_n.
+        activation: "relu" or "tanh".
+        activate_output: whether it ends with an activation.
+        rows_innermost: whether the outputs [S, B, out] lie in memory as [S, out, B]; those of thin outputs always do.
         keep: whether there will be a backward.
 
     Attributes:
@@ -87,12 +85,20 @@ class CompiledPass:
     """
 
     @torch.no_grad()
-    def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> None:
+    def __init__(
+        self,
+        inputs: Sequence[Tensor],
+        parameters: Sequence[Tensor],
+        activation: str,
+        activate_output: bool,
+        rows_innermost: bool = False,
+        keep: bool = True,
+    ) -> None:
         x = _with_whole_rows(inputs[0] if len(inputs) == 1 else torch.cat([*inputs], -1))
         self._read = list(pairwise(accumulate((part.shape[-1] for part in inputs), initial=0)))
         widths = [x.shape[2], *(bias.shape[2] for bias in parameters[1::2])]
         self._shapes = [p.shape[1:] for p in parameters]
-        activated = widths[1:] if shape.activate_output else widths[1:-1]
+        activated = widths[1:] if activate_output else widths[1:-1]
         room = sum(-(-width // _PADDING) * _PADDING for width in activated) if keep else 0
         given, hidden = [_with_whole_rows(p.detach()) for p in parameters], x.new_empty(x.shape[0] * x.shape[1] * room)
         tables = (
@@ -104,8 +110,8 @@ class CompiledPass:
             x.shape[0],
             x.shape[1],
             len(widths) - 1,
-            shape.activation == "tanh",
-            shape.activate_output,
+            activation == "tanh",
+            activate_output,
             torch.get_num_threads(),
             x.stride(0),
             *(ctypes.addressof(table) for table in tables),
@@ -114,7 +120,7 @@ class CompiledPass:
         )
         self._alive = (x, given, hidden, tables)
         size = (x.shape[0], x.shape[1], widths[-1])
-        columns_first = shape.rows_innermost or widths[-1] < _PADDING
+        columns_first = rows_innermost or widths[-1] < _PADDING
         self.outputs = x.new_empty(size[0], size[2], size[1]).transpose(1, 2) if columns_first else x.new_empty(size)
         library().forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
 

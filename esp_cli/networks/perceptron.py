@@ -53,7 +53,7 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
     if _runs_compiled(shape, inputs):
-        return CompiledPass(shape, inputs, parameters, keep=False).outputs
+        return _compiled(shape, inputs, parameters, keep=False).outputs
     if shape.precision != torch.float32:
         parameters = [p.to(shape.precision) for p in parameters]
     return _joined([_run(shape, x, parameters)[-1] for x in _pieces(shape, inputs)])
@@ -61,11 +61,15 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
 def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
     """Return a pass with a backward to call by hand; arguments as of `perceptron`."""
-    return (CompiledPass if _runs_compiled(shape, inputs) else Pass)(shape, inputs, parameters)
+    return (_compiled if _runs_compiled(shape, inputs) else Pass)(shape, inputs, parameters)
 
 
 def _runs_compiled(shape: Shape, inputs: Sequence[Tensor]) -> bool:
     return shape.compiled and inputs[0].device.type == "cpu"
+
+
+def _compiled(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> CompiledPass:
+    return CompiledPass(inputs, parameters, shape.activation, shape.activate_output, shape.rows_innermost, keep)
 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:

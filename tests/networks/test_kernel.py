@@ -11,7 +11,6 @@ from esp_cli.app import app
 from esp_cli.networks import kernel
 from esp_cli.networks.kernel import CompiledPass
 from esp_cli.networks.layers import SeedMLP
-from esp_cli.networks.perceptron import Shape
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -20,10 +19,6 @@ from tests.networks.gradients import assert_same_gradients
 from tests.networks.test_layers import generators, reference
 
 needs_compiler = pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
-
-
-def shape(activation="tanh", activate_output=False, rows_innermost=False):
-    return Shape(activation, activate_output, torch.float32, rows_innermost, compiled=True)
 
 
 @needs_compiler
@@ -52,7 +47,7 @@ def test_a_pass_by_hand():
         torch.tensor([[[3.0]]]),
         torch.ones(1, 1, 1),
     ]
-    run = CompiledPass(shape(), [x], parameters)
+    run = CompiledPass([x], parameters, "tanh", False)
     assert run.outputs.item() == pytest.approx(3 * 0.46212 + 1, abs=1e-4)
     grads, (below,) = run.backward_to(torch.full((1, 1, 1), 10.0), [True] * 4, [True])
     first, bias, second, offset = (g.flatten().tolist() for g in grads)
@@ -67,7 +62,7 @@ def test_a_pass_by_hand():
 def test_tanh_is_right_from_end_to_end():
     x = torch.cat([torch.linspace(-50, 50, 5001), torch.tensor([math.inf, -math.inf, math.nan, 0.0, 1e-30])])
     one, none = torch.ones(1, 1, 1), torch.zeros(1, 1, 1)
-    y = CompiledPass(shape(activate_output=True), [x.view(1, -1, 1)], [one, none]).outputs.flatten()
+    y = CompiledPass([x.view(1, -1, 1)], [one, none], "tanh", True).outputs.flatten()
     torch.testing.assert_close(y, torch.tanh(x.double()).float(), rtol=0, atol=3e-7, equal_nan=True)
 
 
@@ -82,7 +77,7 @@ def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits(rows):
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         try:
-            run = CompiledPass(shape(), [x[seeds]], [p[seeds] for p in parameters])
+            run = CompiledPass([x[seeds]], [p[seeds] for p in parameters], "tanh", False)
             return [run.outputs, *run.backward(grad[seeds])]
         finally:
             torch.set_num_threads(before)
@@ -109,9 +104,9 @@ def test_parts_side_by_side_and_frozen_parameters():
 def test_parameters_that_are_no_rows_and_no_rows_at_all():
     weight = torch.randn(2, 20, 5).transpose(1, 2)
     x, bias = torch.randn(2, 30, 5), torch.randn(2, 1, 20)
-    run = CompiledPass(shape("relu", activate_output=True), [x], [weight, bias])
+    run = CompiledPass([x], [weight, bias], "relu", True)
     torch.testing.assert_close(run.outputs, torch.relu(x @ weight + bias))
-    empty = CompiledPass(shape(), [x[:, :0]], [weight, bias])
+    empty = CompiledPass([x[:, :0]], [weight, bias], "tanh", False)
     assert empty.outputs.shape == (2, 0, 20)
     assert all(not g.any() for g in empty.backward(torch.zeros(2, 0, 20)))
 
