@@ -35,7 +35,7 @@ class SeedParameters:
             parameter.data = view
 
     def flat(self, tensors: Sequence[Tensor]) -> Tensor:
-        """Return a new buffer [S, P] of one tensor for each parameter."""
+        """Return a new buffer [S, P] of tensors [S, ...] in the order of the parameters."""
         return torch.cat([*(tensor.flatten(1) for tensor in tensors), self._rest], 1)
 
     def views(self, buffer: Tensor) -> list[Tensor]:

@@ -17,7 +17,7 @@ from esp_cli.networks.io_spec import IoSpec
 ActivationName = Literal["relu", "tanh"]
 
 Pull = Callable[[Tensor], list[Tensor]]
-"""From the gradient by a network's outputs to those by its parameters."""
+"""From the gradient by a network's outputs to those by its parameters, each as it is or side by side [S, P]."""
 
 
 class NetworkConfig(Strict, ABC):

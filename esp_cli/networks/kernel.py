@@ -61,7 +61,9 @@ def library() -> ctypes.CDLL:
         if done.returncode:
             said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip())
             raise ValueError(f"{shlex.join(compiler)} does not compile the kernel of network.compiled: {said}")
-        return ctypes.CDLL(str(built))
+        loaded = ctypes.CDLL(str(built))
+    loaded.backward.argtypes = (ctypes.c_void_p,) * 4  # else addresses would be cut to 32 bits
+    return loaded
 
 
 def _with_whole_rows(x: Tensor) -> Tensor:
@@ -98,6 +100,7 @@ class CompiledPass:
         self._read = list(pairwise(accumulate((part.shape[-1] for part in inputs), initial=0)))
         widths = [x.shape[2], *(bias.shape[2] for bias in parameters[1::2])]
         self._shapes = [p.shape[1:] for p in parameters]
+        self._count = sum((a + 1) * b for a, b in pairwise(widths))
         activated = widths[1:] if activate_output else widths[1:-1]
         room = sum(-(-width // _PADDING) * _PADDING for width in activated) if keep else 0
         given, hidden = [_with_whole_rows(p.detach()) for p in parameters], x.new_empty(x.shape[0] * x.shape[1] * room)
@@ -125,24 +128,15 @@ class CompiledPass:
         library().forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
 
     def backward(self, grad: Tensor) -> list[Tensor]:
-        """Return the gradients by the parameters, of what has the gradient `grad` by the outputs."""
-        grads, _ = self.backward_to(grad, [True] * len(self._shapes), [])
-        return [g for g in grads if g is not None]
+        """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
+        found, _ = self._pulled(grad, True, False)
+        return [] if found is None else [found]
 
-    @torch.no_grad()
     def backward_to(
         self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
         """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
-        x = self._alive[0]
-        found = x.new_empty(x.shape[0], sum(map(torch.Size.numel, self._shapes))) if any(learns) else None
-        below = x.new_empty(x.shape) if any(asked) else None
-        library().backward(
-            ctypes.byref(self._arguments),
-            ctypes.byref(_Outputs.of(grad)),
-            None if found is None else ctypes.c_void_p(found.data_ptr()),
-            None if below is None else ctypes.c_void_p(below.data_ptr()),
-        )
+        found, below = self._pulled(grad, any(learns), any(asked))
         ends = pairwise(accumulate(map(torch.Size.numel, self._shapes), initial=0))
         grads = [
             None if found is None or not wanted else found[:, begin:end].unflatten(1, size)
@@ -150,3 +144,17 @@ class CompiledPass:
         ]
         columns = zip(asked, self._read, strict=False)
         return grads, [None if below is None or not wanted else below[..., a:b] for wanted, (a, b) in columns]
+
+    @torch.no_grad()
+    def _pulled(self, grad: Tensor, learns: bool, asks: bool) -> tuple[Tensor | None, Tensor | None]:
+        """Return the gradients by all parameters [S, P] and by the inputs [S, B, in], where they are wanted."""
+        x = self._alive[0]
+        found = x.new_empty(x.shape[0], self._count) if learns else None
+        below = x.new_empty(x.shape) if asks else None
+        library().backward(
+            ctypes.byref(self._arguments),
+            ctypes.byref(_Outputs.of(grad)),
+            None if found is None else found.data_ptr(),
+            None if below is None else below.data_ptr(),
+        )
+        return found, below
