@@ -189,7 +189,6 @@ struct Layout : Perceptron {
     bool activates(int64_t k) const { return k < layers - 1 || activate_output; }
     const float *weight(int64_t k, int64_t seed) const { return parameters[2 * k] + seed * strides[2 * k]; }
     const float *bias(int64_t k, int64_t seed) const { return parameters[2 * k + 1] + seed * strides[2 * k + 1]; }
-    int64_t blocks(Span part) const { return (part.size() + BLOCK - 1) / BLOCK; }
     // What layer k gives to a row, activated.
     float *given(int64_t k, int64_t seed, int64_t row) const {
         int64_t below = 0;
@@ -204,7 +203,107 @@ struct Layout : Perceptron {
     // Whether the gradient of a weight is computed as [out, in], so that thin outputs are not filled up.
     bool turned(int64_t k) const { return k > 0 && out(k) < PAD; }
     int64_t weight_room(int64_t k) const { return turned(k) ? out(k) * padded(in(k)) : in(k) * padded(out(k)); }
+    // Go through the rows of one part of one seed, block by block.
+    template <class Use>
+    void blocks(int64_t task, Use use) const {
+        Span part = Span{0, rows}.part(task % parts, parts);
+        int64_t count = (part.size() + BLOCK - 1) / BLOCK;
+        for (int64_t b = 0; b < count; b++) use(task / parts, part.part(b, count), b > 0);
+    }
 };
+
+// Copy a seed's weights and biases, layer after layer, as [in + 1, padded(out)].
+static void pack(const Layout &net, int64_t seed, float *to) {
+    for (int64_t k = 0; k < net.layers; k++) {
+        int64_t width = padded(net.out(k));
+        for (int64_t i = 0; i <= net.in(k); i++, to += width) {
+            const float *from = i < net.in(k) ? net.weight(k, seed) + i * net.out(k) : net.bias(k, seed);
+            std::copy(from, from + net.out(k), to);
+            std::fill(to + net.out(k), to + width, 0.0f);
+        }
+    }
+}
+
+// Pass a block of rows through all layers, whose parameters are packed.
+static void pass(const Layout &net, int64_t seed, Span span, const float *weight, const Outputs &outputs, float *own) {
+    Matrix from = net.read(0, seed, span.begin);
+    for (int64_t k = 0; k < net.layers; k++) {
+        int64_t width = padded(net.out(k));
+        bool kept = net.hidden && net.activates(k);
+        float *to = kept ? net.given(k, seed, span.begin) : own + (k % 2) * BLOCK * net.widest;
+        const float *bias = weight + net.in(k) * width;
+        product(span.size(), width, net.in(k), from, weight, width, bias, false, to, width);
+        if (net.activates(k)) activate(to, span.size() * width, net.tanh);
+        from = {to, width, 1};
+        weight = bias + width;
+    }
+    float *to = outputs.at + seed * outputs.seed + span.begin * outputs.row;
+    copy(span.size(), net.out(net.layers - 1), from, to, outputs.row, outputs.column);
+}
+
+// Copy a seed's weights, layer after layer, as [out, padded(in)].
+static void turn(const Layout &net, int64_t seed, float *to) {
+    for (int64_t k = 0; k < net.layers; k++)
+        for (int64_t o = 0; o < net.out(k); o++, to += padded(net.in(k))) {
+            for (int64_t i = 0; i < net.in(k); i++) to[i] = net.weight(k, seed)[i * net.out(k) + o];
+            std::fill(to + net.in(k), to + padded(net.in(k)), 0.0f);
+        }
+}
+
+// Set, or add to, the gradients of a layer's weight and bias from what it reads and the gradient by what it gives.
+static void learn(const Layout &net, int64_t k, Matrix read, const float *here, int64_t rows, bool add, float *sum) {
+    int64_t width = padded(net.out(k));
+    if (net.turned(k))
+        product(net.out(k), read.row, rows, {here, 1, width}, read.at, read.row, nullptr, add, sum, read.row);
+    else
+        product(net.in(k), width, rows, {read.at, 1, read.row}, here, width, nullptr, add, sum, width);
+    float *bias = sum + net.weight_room(k);
+    for (int64_t o = 0; o < width; o += LANES) {
+        Vec total = add ? vec(bias + o) : Vec{};
+        for (int64_t r = 0; r < rows; r++) total += vec(here + r * width + o);
+        vec(bias + o) = total;
+    }
+}
+
+// Pull the gradient by a block of outputs back through all layers; the weights, turned, and the sums end there.
+static void pull(const Layout &net, int64_t seed, Span span, bool add, const Outputs &by_outputs, const float *weight,
+                 float *sum, float *by_inputs, float *own) {
+    float *here = own, *next = own + BLOCK * net.widest;
+    int64_t last = net.out(net.layers - 1);
+    const float *from = by_outputs.at + seed * by_outputs.seed + span.begin * by_outputs.row;
+    if (padded(last) > last) std::fill(here, here + span.size() * padded(last), 0.0f);
+    copy(span.size(), last, {from, by_outputs.row, by_outputs.column}, here, padded(last), 1);
+    for (int64_t k = net.layers - 1; k >= 0; k--) {
+        int64_t below = padded(net.in(k)), width = padded(net.out(k));
+        if (net.activates(k)) times_slope(here, net.given(k, seed, span.begin), span.size() * width, net.tanh);
+        if (sum) {
+            sum -= net.weight_room(k) + width;
+            learn(net, k, net.read(k, seed, span.begin), here, span.size(), add, sum);
+        }
+        weight -= net.out(k) * below;
+        if (k == 0 && !by_inputs) return;
+        product(span.size(), below, net.out(k), {here, width, 1}, weight, below, nullptr, false, next, below);
+        std::swap(here, next);
+    }
+    float *to = by_inputs + (seed * net.rows + span.begin) * net.in(0);
+    copy(span.size(), net.in(0), {here, padded(net.in(0)), 1}, to, net.in(0), 1);
+}
+
+// Add the sums of a seed's parts to its gradients [P].
+static void add_up(const Layout &net, const float *from, float *gradients) {
+    for (int64_t part = 0; part < net.parts; part++) {
+        float *to = gradients;
+        for (int64_t k = 0; k < net.layers; k++) {
+            int64_t in = net.in(k), out = net.out(k);
+            int64_t row = net.turned(k) ? 1 : padded(out), column = net.turned(k) ? padded(in) : 1;
+            for (int64_t i = 0; i < in; i++)
+                for (int64_t o = 0; o < out; o++, to++) *to = from[i * row + o * column] + (part ? *to : 0.0f);
+            from += net.weight_room(k);
+            for (int64_t o = 0; o < out; o++, to++) *to = from[o] + (part ? *to : 0.0f);
+            from += padded(out);
+        }
+    }
+}
 
 extern "C" {
 
@@ -217,40 +316,13 @@ void forward(const Perceptron *given, const Outputs *outputs) {
 #pragma omp parallel num_threads(net.busy)
     {
 #pragma omp for schedule(static)
-        for (int64_t s = 0; s < net.seeds; s++) {
-            float *to = packed.get() + s * room;
-            for (int64_t k = 0; k < net.layers; k++) {
-                int64_t width = padded(net.out(k));
-                for (int64_t i = 0; i <= net.in(k); i++, to += width) {
-                    const float *from = i < net.in(k) ? net.weight(k, s) + i * net.out(k) : net.bias(k, s);
-                    std::copy(from, from + net.out(k), to);
-                    std::fill(to + net.out(k), to + width, 0.0f);
-                }
-            }
-        }
+        for (int64_t s = 0; s < net.seeds; s++) pack(net, s, packed.get() + s * room);
         Scratch own = scratch(2 * BLOCK * net.widest);
 #pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.seeds * net.parts; task++) {
-            int64_t s = task / net.parts;
-            Span part = Span{0, net.rows}.part(task % net.parts, net.parts);
-            for (int64_t b = 0; b < net.blocks(part); b++) {
-                Span span = part.part(b, net.blocks(part));
-                Matrix from = net.read(0, s, span.begin);
-                const float *weight = packed.get() + s * room;
-                for (int64_t k = 0; k < net.layers; k++) {
-                    int64_t width = padded(net.out(k));
-                    bool kept = net.hidden && net.activates(k);
-                    float *to = kept ? net.given(k, s, span.begin) : own.get() + (k % 2) * BLOCK * net.widest;
-                    const float *bias = weight + net.in(k) * width;
-                    product(span.size(), width, net.in(k), from, weight, width, bias, false, to, width);
-                    if (net.activates(k)) activate(to, span.size() * width, net.tanh);
-                    from = {to, width, 1};
-                    weight = bias + width;
-                }
-                float *to = outputs->at + s * outputs->seed + span.begin * outputs->row;
-                copy(span.size(), net.out(net.layers - 1), from, to, outputs->row, outputs->column);
-            }
-        }
+        for (int64_t task = 0; task < net.seeds * net.parts; task++)
+            net.blocks(task, [&](int64_t seed, Span span, bool) {
+                pass(net, seed, span, packed.get() + seed * room, *outputs, own.get());
+            });
     }
 }
 
@@ -263,82 +335,24 @@ void backward(const Perceptron *given, const Outputs *by_outputs, float *by_para
         sum_room += net.weight_room(k) + padded(net.out(k));
         count += (net.in(k) + 1) * net.out(k);
     }
-    Scratch turned = scratch(net.seeds * turned_room);
-    Scratch sums = scratch(by_parameters ? net.seeds * net.parts * sum_room : 0);
+    int64_t sum_count = by_parameters ? net.seeds * net.parts * sum_room : 0;
+    Scratch turned = scratch(net.seeds * turned_room), sums = scratch(sum_count);
+    if (net.rows == 0) std::fill(sums.get(), sums.get() + sum_count, 0.0f);
 #pragma omp parallel num_threads(net.busy)
     {
 #pragma omp for schedule(static)
-        for (int64_t s = 0; s < net.seeds; s++) {
-            float *to = turned.get() + s * turned_room;
-            for (int64_t k = 0; k < net.layers; k++)
-                for (int64_t o = 0; o < net.out(k); o++, to += padded(net.in(k))) {
-                    for (int64_t i = 0; i < net.in(k); i++) to[i] = net.weight(k, s)[i * net.out(k) + o];
-                    std::fill(to + net.in(k), to + padded(net.in(k)), 0.0f);
-                }
-        }
+        for (int64_t s = 0; s < net.seeds; s++) turn(net, s, turned.get() + s * turned_room);
         Scratch own = scratch(2 * BLOCK * net.widest);
 #pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.seeds * net.parts; task++) {
-            int64_t s = task / net.parts;
-            Span part = Span{0, net.rows}.part(task % net.parts, net.parts);
-            float *part_sums = sums.get() + task * sum_room;
-            if (by_parameters && net.blocks(part) == 0) std::fill(part_sums, part_sums + sum_room, 0.0f);
-            for (int64_t b = 0; b < net.blocks(part); b++) {
-                Span span = part.part(b, net.blocks(part));
-                float *here = own.get(), *next = here + BLOCK * net.widest;
-                const float *weight = turned.get() + (s + 1) * turned_room;
-                float *sum = part_sums + sum_room;
-                {
-                    int64_t out = net.out(net.layers - 1), width = padded(out);
-                    const float *from = by_outputs->at + s * by_outputs->seed + span.begin * by_outputs->row;
-                    if (width > out) std::fill(here, here + span.size() * width, 0.0f);
-                    copy(span.size(), out, {from, by_outputs->row, by_outputs->column}, here, width, 1);
-                }
-                for (int64_t k = net.layers - 1; k >= 0; k--) {
-                    int64_t in = net.in(k), out = net.out(k), width = padded(out);
-                    if (net.activates(k)) times_slope(here, net.given(k, s, span.begin), span.size() * width, net.tanh);
-                    Matrix read = net.read(k, s, span.begin);
-                    sum -= net.weight_room(k) + width;
-                    if (by_parameters) {
-                        bool add = b > 0;
-                        int64_t depth = span.size(), from = read.row;
-                        if (net.turned(k))
-                            product(out, from, depth, {here, 1, width}, read.at, from, nullptr, add, sum, from);
-                        else
-                            product(in, width, depth, {read.at, 1, from}, here, width, nullptr, add, sum, width);
-                        float *bias = sum + net.weight_room(k);
-                        for (int64_t o = 0; o < width; o += LANES) {
-                            Vec total = add ? vec(bias + o) : Vec{};
-                            for (int64_t r = 0; r < span.size(); r++) total += vec(here + r * width + o);
-                            vec(bias + o) = total;
-                        }
-                    }
-                    weight -= out * padded(in);
-                    if (k == 0 && !by_inputs) continue;
-                    int64_t below = padded(in);
-                    product(span.size(), below, out, {here, width, 1}, weight, below, nullptr, false, next, below);
-                    std::swap(here, next);
-                }
-                if (by_inputs)
-                    copy(span.size(), net.in(0), {here, padded(net.in(0)), 1},
-                         by_inputs + (s * net.rows + span.begin) * net.in(0), net.in(0), 1);
-            }
-        }
+        for (int64_t task = 0; task < net.seeds * net.parts; task++)
+            net.blocks(task, [&](int64_t seed, Span span, bool add) {
+                float *sum = by_parameters ? sums.get() + (task + 1) * sum_room : nullptr;
+                const float *weight = turned.get() + (seed + 1) * turned_room;
+                pull(net, seed, span, add, *by_outputs, weight, sum, by_inputs, own.get());
+            });
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < (by_parameters ? net.seeds : 0); s++)
-            for (int64_t p = 0; p < net.parts; p++) {
-                float *to = by_parameters + s * count;
-                const float *from = sums.get() + (s * net.parts + p) * sum_room;
-                for (int64_t k = 0; k < net.layers; k++) {
-                    int64_t in = net.in(k), out = net.out(k);
-                    int64_t row = net.turned(k) ? 1 : padded(out), column = net.turned(k) ? padded(in) : 1;
-                    for (int64_t i = 0; i < in; i++)
-                        for (int64_t o = 0; o < out; o++, to++) *to = from[i * row + o * column] + (p ? *to : 0.0f);
-                    from += net.weight_room(k);
-                    for (int64_t o = 0; o < out; o++, to++) *to = from[o] + (p ? *to : 0.0f);
-                    from += padded(out);
-                }
-            }
+            add_up(net, sums.get() + s * net.parts * sum_room, by_parameters + s * count);
     }
 }
 
