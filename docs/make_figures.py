@@ -29,7 +29,7 @@ BREAKING = {
     "breaking-navigation": ("", "-others", "-wind", "-relaxed"),
     "breaking-predator-prey": ("", "-others"),
     "breaking-formation": ("", "-others", "-measured", "-relaxed"),
-    "breaking-formation-1m": ("",),
+    "breaking-formation-1m": ("", "-others"),
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 TUNED = {
