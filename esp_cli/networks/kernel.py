@@ -49,7 +49,7 @@ def library() -> ctypes.CDLL:
     """Compile the kernel, which takes two seconds, in a temporary folder, and load it.
 
     Raises:
-        ValueError: there is no C++ compiler, or it fails.
+        ValueError: there is no C++ compiler, it fails, or what it made cannot be loaded.
     """
     compiler = shlex.split(os.environ.get("CXX", "")) or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
     if shutil.which(compiler[0]) is None:
@@ -61,7 +61,13 @@ def library() -> ctypes.CDLL:
         if done.returncode:
             said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip())
             raise ValueError(f"{shlex.join(compiler)} does not compile the kernel of network.compiled: {said}")
-        loaded = ctypes.CDLL(str(built))
+        try:
+            loaded = ctypes.CDLL(str(built))
+        except OSError as error:
+            raise ValueError(
+                f"the kernel of network.compiled cannot be loaded ({error}); set TMPDIR to a folder from which programs "
+                "may run, or leave it off"
+            ) from None
     loaded.backward.argtypes = (ctypes.c_void_p,) * 4  # else addresses would be cut to 32 bits
     return loaded
 

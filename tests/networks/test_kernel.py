@@ -165,6 +165,16 @@ def test_a_compiler_that_fails_is_named_with_what_it_says(tmp_path, monkeypatch)
         kernel.library()
 
 
+def test_what_is_compiled_but_cannot_be_loaded_is_told(tmp_path, monkeypatch):
+    kernel.library.cache_clear()
+    compiler = tmp_path / "empty"
+    compiler.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho > "$2"\n')
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(ValueError, match=r"cannot be loaded .*; set TMPDIR to a folder"):
+        kernel.library()
+
+
 def test_bfloat16_and_the_kernel_exclude_each_other():
     with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
         MlpConfig(compiled=True, precision="bfloat16")
