@@ -65,8 +65,8 @@ def library() -> ctypes.CDLL:
             loaded = ctypes.CDLL(str(built))
         except OSError as error:
             raise ValueError(
-                f"the kernel of network.compiled cannot be loaded ({error}); set TMPDIR to a folder from which programs "
-                "may run, or leave it off"
+                f"the kernel of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
+                "may run from, or leave it off"
             ) from None
     loaded.backward.argtypes = (ctypes.c_void_p,) * 4  # else addresses would be cut to 32 bits
     return loaded
