@@ -135,14 +135,17 @@ class CompiledPass:
 
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
-        found, _ = self._pulled(grad, True, False)
-        return [] if found is None else [found]
+        found = self._room()
+        self._pull(grad, found, None)
+        return [found]
 
     def backward_to(
         self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
         """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
-        found, below = self._pulled(grad, any(learns), any(asked))
+        x = self._alive[0]
+        found, below = self._room() if any(learns) else None, x.new_empty(x.shape) if any(asked) else None
+        self._pull(grad, found, below)
         ends = pairwise(accumulate(map(torch.Size.numel, self._shapes), initial=0))
         grads = [
             None if found is None or not wanted else found[:, begin:end].unflatten(1, size)
@@ -151,16 +154,16 @@ class CompiledPass:
         columns = zip(asked, self._read, strict=False)
         return grads, [None if below is None or not wanted else below[..., a:b] for wanted, (a, b) in columns]
 
-    @torch.no_grad()
-    def _pulled(self, grad: Tensor, learns: bool, asks: bool) -> tuple[Tensor | None, Tensor | None]:
-        """Return the gradients by all parameters [S, P] and by the inputs [S, B, in], where they are wanted."""
+    def _room(self) -> Tensor:
+        """Return an empty buffer [S, P] for the gradients by all parameters."""
         x = self._alive[0]
-        found = x.new_empty(x.shape[0], self._count) if learns else None
-        below = x.new_empty(x.shape) if asks else None
+        return x.new_empty(x.shape[0], self._count)
+
+    def _pull(self, grad: Tensor, found: Tensor | None, below: Tensor | None) -> None:
+        """Write the gradients by all parameters [S, P] and by the inputs [S, B, in], where there is room for them."""
         library().backward(
             ctypes.byref(self._arguments),
             ctypes.byref(_Outputs.of(grad)),
             None if found is None else found.data_ptr(),
             None if below is None else below.data_ptr(),
         )
-        return found, below

@@ -30,9 +30,9 @@ class PlainConfig(NetworkConfig):
     )
 
     @property
-    def dtype(self) -> torch.dtype:
-        """The precision as torch names it."""
-        return getattr(torch, self.precision)
+    def products(self) -> tuple[torch.dtype, bool]:
+        """How perceptrons compute: the precision as torch names it, and whether they are compiled."""
+        return getattr(torch, self.precision), self.compiled
 
     @model_validator(mode="after")
     def _fits(self) -> PlainConfig:
@@ -84,8 +84,7 @@ class MLP(SeedMLP, Memoryless):
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
-        products = (config.dtype, config.compiled)
-        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *products)
+        super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
 
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return outputs and the way back; see `Network.traced`."""
@@ -110,8 +109,7 @@ class GRU(Network):
         gain = GAINS[config.activation]
         sizes = (inputs, *config.hidden)
         self.memory_width = width
-        products = (config.dtype, config.compiled)
-        self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, *products)
+        self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, *config.products)
         self.gru = SeedGRU(generators, width, width)
         self.norm = SeedLayerNorm(len(generators), width) if config.layer_norm else nn.Identity()
         self.head = SeedLinear(generators, width, outputs, output_gain)

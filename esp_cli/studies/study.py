@@ -134,16 +134,16 @@ class StudyFolder:
         Raises:
             StudyError: as `planned`.
         """
-        folder = cls.planned(path, study)
-        cls.make(path)
-        if not cls.is_one(path) or cls.open(path).study != folder.study:
+        folder, differs = cls.planned(path, study)
+        path.mkdir(parents=True, exist_ok=True)
+        if differs:
             reach("study")
             STUDY_FORMAT.write(path / STUDY, folder.study.model_dump(mode="json"))
         return folder
 
     @classmethod
-    def planned(cls, path: Path, study: Study) -> StudyFolder:
-        """Return what `create` makes of a study, without writing anything.
+    def planned(cls, path: Path, study: Study) -> tuple[StudyFolder, bool]:
+        """Return what `create` makes of a study, and whether that differs from what is there; writes nothing.
 
         A cell that the folder has keeps its run, and may be compared with another one than before.
 
@@ -154,7 +154,7 @@ class StudyFolder:
         study = Study.model_validate_json(study.model_dump_json())
         cls.refuse_foreign(path)
         if not cls.is_one(path):
-            return cls(path, study)
+            return cls(path, study), True
         there = cls.open(path).study
         known = {cell.name: cell for cell in there.cells}
         again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
@@ -169,10 +169,10 @@ class StudyFolder:
         wanted = {cell.name for cell in study.cells}
         rest = tuple(cell for cell in there.cells if cell.name not in wanted)
         if not wanted - set(known) and all(new == old for new, old in again):
-            return cls(path, there)
+            return cls(path, there), False
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
         merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
-        return cls(path, study.model_copy(update=merged))
+        return cls(path, study.model_copy(update=merged)), True
 
     @classmethod
     def open(cls, path: Path) -> StudyFolder:

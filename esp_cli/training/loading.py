@@ -16,7 +16,7 @@ from esp_cli import __version__
 from esp_cli.algorithms.learner import below
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.files.documents import one_sentence, validate
-from esp_cli.networks.plain import PlainConfig
+from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed, resolve_task_settings
@@ -145,14 +145,18 @@ def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
     seeds = trained.config.seeds
     if seed not in seeds:
         raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-    network = trained.config.network
-    if isinstance(network, PlainConfig):
-        network = network.model_copy(update={"precision": "float32", "compiled": False})
+    network = _at_default(trained.config.network, "precision", "compiled")
     config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
     policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
     index = seeds.index(seed)
     policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in trained.policy.state_dict().items()})
     return replace(trained, config=config, policy=policy, stopped=(0,) if index in trained.stopped else ())
+
+
+def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
+    """Return a network's settings with some of them, where it has them, as they are by default."""
+    fields = type(network).model_fields
+    return network.model_copy(update={name: fields[name].default for name in names if name in fields})
 
 
 def _build(
@@ -178,9 +182,8 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise ValueError(f"{misfit} (hidden widths {config.network.hidden})")
-    build, network = ALGORITHMS[config.algorithm].build_policy, config.network
-    if isinstance(network, PlainConfig):  # whoever uses a policy needs no compiler
-        network = network.model_copy(update={"compiled": False})
+    build = ALGORITHMS[config.algorithm].build_policy
+    network = _at_default(config.network, "compiled")  # whoever uses a policy needs no compiler
     policy = build(spec, network, generators(config.seeds, "shape")).to(config.device).eval()
     _fill(policy, tensors, path, misfit)
     return TrainedPolicy(config, policy, spec, step, path, notes, _stopped(meta, len(config.seeds)))

@@ -155,23 +155,20 @@ def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
     assert "Traceback" not in result.output
 
 
-def test_a_compiler_that_fails_is_named_with_what_it_says(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("script", "sentence"),
+    [
+        ("echo 'error: no such option' >&2; exit 1", r"compiler does not compile the kernel .*: error: no such option"),
+        ('while [ "$1" != -o ]; do shift; done; echo > "$2"', r"cannot be loaded .*; set TMPDIR to a folder"),
+    ],
+)
+def test_a_compiler_that_fails_and_one_that_makes_no_library_are_told(tmp_path, monkeypatch, script, sentence):
     kernel.library.cache_clear()
-    compiler = tmp_path / "broken"
-    compiler.write_text("#!/bin/sh\necho 'error: no such option' >&2\nexit 1\n")
+    compiler = tmp_path / "compiler"
+    compiler.write_text(f"#!/bin/sh\n{script}\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
-    with pytest.raises(ValueError, match=r"broken does not compile the kernel .*: error: no such option"):
-        kernel.library()
-
-
-def test_what_is_compiled_but_cannot_be_loaded_is_told(tmp_path, monkeypatch):
-    kernel.library.cache_clear()
-    compiler = tmp_path / "empty"
-    compiler.write_text('#!/bin/sh\nwhile [ "$1" != -o ]; do shift; done\necho > "$2"\n')
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CXX", str(compiler))
-    with pytest.raises(ValueError, match=r"cannot be loaded .*; set TMPDIR to a folder"):
+    with pytest.raises(ValueError, match=sentence):
         kernel.library()
 
 
