@@ -24,6 +24,7 @@ RANKS = {
     "machine": 0,
     "formatting": 0,
     "settings_index": 0,
+    "kernels": 0,
     "console": 0.5,
     "trackers": 0.5,
     "symmetry": 1,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from esp_cli.kernels import policy_gradient as kernels
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
 
@@ -78,6 +79,7 @@ def policy_gradient(
     old_log_prob: Tensor,
     advantage: Tensor,
     weights: Weights,
+    compiled: bool = False,
 ) -> Tensor:
     """Return the gradient, by the logits, of the negative of J_pi + entropy - c S_pi (Eq. 3, 7, 8): as `logits`.
 
@@ -88,17 +90,47 @@ def policy_gradient(
         old_log_prob: [S, B, T, N].
         advantage: [S, B, T, N].
         weights: of the terms.
+        compiled: whether the kernel computes it, on the CPU.
     """
     maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
     action, old_log_prob, advantage = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
     parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1))
-    log_prob = torch.log_softmax(reordered(parts, [m.back for m in maps]), 1)  # [S, A, 1 + K, R]
+    found = _policy_gradient_compiled if compiled and logits.device.type == "cpu" else _policy_gradient
+    gradient = found(parts, maps, action, old_log_prob, advantage, weights)
+    return gradient.flatten(2).transpose(1, 2).view(logits.shape)
+
+
+def _policy_gradient(
+    logits: Tensor, maps: Sequence[Gather], action: Tensor, old_log_prob: Tensor, advantage: Tensor, weights: Weights
+) -> Tensor:
+    """Return the gradient by logits [S, A, 1 + K, R]; rows [S, R] of originals."""
+    log_prob = torch.log_softmax(reordered(logits, [m.back for m in maps]), 1)
     prob = log_prob.exp()
     gradient = _objective_gradient(log_prob, prob, action, old_log_prob, advantage, weights)
     if weights.policy_gap and maps:
         _add_divergence(gradient, log_prob, prob, weights)
     by_logits = torch._log_softmax_backward_data(gradient, log_prob, 1, gradient.dtype)
-    return reordered(by_logits, [m.source for m in maps]).flatten(2).transpose(1, 2).view(logits.shape)
+    return reordered(by_logits, [m.source for m in maps])
+
+
+def _policy_gradient_compiled(
+    logits: Tensor, maps: Sequence[Gather], action: Tensor, old_log_prob: Tensor, advantage: Tensor, weights: Weights
+) -> Tensor:
+    """Return what `_policy_gradient` returns."""
+    num_seeds, num_actions = logits.shape[:2]
+    stays = torch.arange(num_actions).expand(num_seeds, -1)
+    return kernels.policy_gradient(
+        logits,
+        torch.stack([stays, *(m.back.expand(num_seeds, -1) for m in maps)]),
+        action,
+        old_log_prob,
+        advantage,
+        clip_epsilon=weights.clip_epsilon,
+        entropy_coef=weights.entropy_coef,
+        gap=weights.policy_gap,
+        augments=weights.augments,
+        stop_gradient=weights.stop_gradient,
+    )
 
 
 def _objective_gradient(

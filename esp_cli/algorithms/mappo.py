@@ -21,6 +21,7 @@ from esp_cli.algorithms.losses import clipped_surrogate, explained_variance, gae
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
+from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic
 from esp_cli.networks.heads import Categorical
@@ -88,6 +89,7 @@ class Mappo(Learner):
         self.optimisers = {"adam": self.optimiser}
         self.collector = Collector(env, self.policy, self.generators["learner"])
         self._old: tuple[StochasticPolicy, Critic] | None = None
+        _, self._compiled = perceptron(network, "relu").products
         self._closed_form = not (config.clip_value or self.prior.recomputes or spec.masks or spec.agents_end)
 
     @classmethod
@@ -232,7 +234,7 @@ class Mappo(Learner):
         pulled = pull_values(critic_gradient(values, batch.target, weights))
         if isinstance(head, Categorical):
             made = (batch.action, batch.log_prob, batch.advantage)
-            pulled = pull_outputs(policy_gradient(outputs, copies.transforms, *made, weights)) + pulled
+            pulled = pull_outputs(policy_gradient(outputs, copies.transforms, *made, weights, self._compiled)) + pulled
         else:
             mean, log_std = outputs.transpose(2, 3), head.log_deviation(outputs).detach()
             old, advantage = copies.repeated(batch.log_prob), copies.repeated(batch.advantage)

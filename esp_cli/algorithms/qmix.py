@@ -63,7 +63,7 @@ class Qmix(OffPolicyLearner):
         super().build(env, network)
         config, generators = self.config, self.generators["learner"]
         widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
-        compiled = perceptron(network, "relu").compiled
+        _, compiled = perceptron(network, "relu").products
         self.mixer = MonotonicMixer(generators, *widths, compiled).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)

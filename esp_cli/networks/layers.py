@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.kernel import CompiledPass, library
+from esp_cli.kernels.library import library
+from esp_cli.kernels.perceptron import CompiledPass
 from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, passed, perceptron
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
@@ -73,7 +74,7 @@ class SeedMLP(nn.Module):
         layer_norm: normalise the input and every hidden activation, as the MAPPO paper's code does.
         activate_output: end with an activation, for a body on which something else stands.
         precision: of the matrix products; parameters, inputs, outputs and parameter gradients stay float32.
-        compiled: whether passes on the CPU go through the compiled kernel; not with layer normalisation.
+        compiled: whether passes on the CPU go through the compiled kernel; has no effect with layer normalisation.
 
     Raises:
         ValueError: there is no compiler for it.
@@ -99,7 +100,7 @@ class SeedMLP(nn.Module):
         self.activation = activation
         self.activate_output = activate_output
         self.precision = precision
-        self.compiled = compiled and not layer_norm
+        self.compiled = compiled
         if self.compiled:
             library()
         normed = sizes if activate_output else sizes[:-1]

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.functional import elu_
 
+from esp_cli.kernels import mixer
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
 
@@ -54,6 +55,8 @@ class MonotonicMixer(nn.Module):
 
     def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
         """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
+        if self.hypernetwork.compiled and seen.device.type == "cpu":
+            return _CompiledMixed.apply(own.contiguous(), self.hypernetwork(seen), self.width)  # type: ignore[no-untyped-call]
         rows = self.hypernetwork.of_parts(seen, rows_innermost=True)
         return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
 
@@ -89,6 +92,21 @@ class _Mixed(Function):
         by_own = (by_first * first).sum(2)
         by_first.mul_(own.unsqueeze(2))
         return by_own, by_rows, None
+
+
+class _CompiledMixed(Function):
+    """The same by the kernel, of own [S, B, N] and rows [S, B, N M + M + M + 1]."""
+
+    @staticmethod
+    def forward(ctx, own, rows, width):  # type: ignore[no-untyped-def]
+        ctx.save_for_backward(own, rows)
+        ctx.width = width
+        return mixer.mix(own, rows, width)
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        own, rows = ctx.saved_tensors
+        return *mixer.mix_backward(own, rows, ctx.width, grad), None
 
 
 def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

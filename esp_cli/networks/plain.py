@@ -22,7 +22,7 @@ class PlainConfig(NetworkConfig):
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     compiled: bool = Field(
-        False, description="perceptrons compiled for this processor: faster, other rounding; needs a C++ compiler"
+        False, description="kernels compiled for this processor: faster, other rounding; needs a C++ compiler"
     )
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
     separate_parts: bool = Field(
@@ -31,8 +31,8 @@ class PlainConfig(NetworkConfig):
 
     @property
     def products(self) -> tuple[torch.dtype, bool]:
-        """How perceptrons compute: the precision as torch names it, and whether they are compiled."""
-        return getattr(torch, self.precision), self.compiled
+        """How networks compute: the precision as torch names it, and whether by kernels."""
+        return getattr(torch, self.precision), self.compiled and not self.layer_norm
 
     @model_validator(mode="after")
     def _fits(self) -> PlainConfig:
@@ -43,7 +43,7 @@ class PlainConfig(NetworkConfig):
         return self
 
     def without_effect(self) -> frozenset[str]:
-        """Return what concerns perceptrons without layer normalisation where there is one."""
+        """Return what concerns networks without layer normalisation where there is one."""
         return frozenset({"precision", "compiled"}) if self.layer_norm else frozenset()
 
     def least_parameters(self, inputs: int) -> int:
@@ -110,7 +110,7 @@ class GRU(Network):
         sizes = (inputs, *config.hidden)
         self.memory_width = width
         self.body = SeedMLP(generators, sizes, config.activation, gain, config.layer_norm, True, *config.products)
-        self.gru = SeedGRU(generators, width, width)
+        self.gru = SeedGRU(generators, width, width, self.body.compiled)
         self.norm = SeedLayerNorm(len(generators), width) if config.layer_norm else nn.Identity()
         self.head = SeedLinear(generators, width, outputs, output_gain)
 

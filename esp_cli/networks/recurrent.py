@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 
+from esp_cli.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
 from esp_cli.networks.perceptron import activate_
 
@@ -16,11 +17,17 @@ class SeedGRU(nn.Module):
     """A gated recurrent unit (Cho et al., 2014) for S seeds.
 
     r = s(x W_r + h U_r), z = s(x W_z + h U_z), n = tanh(x W_n + r * (h U_n + b_n)), h' = (1 - z) n + z h.
+
+    Args:
+        generators: one per seed; they draw the initial weights.
+        inputs: width of an input row.
+        hidden: H, width of the memory.
+        compiled: whether it is unrolled by the compiled kernel on the CPU.
     """
 
-    def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int) -> None:
+    def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int, compiled: bool = False) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden, self.compiled = hidden, compiled
         self.input = SeedLinear(generators, inputs, 3 * hidden, 1.0)
         self.recurrent = SeedLinear(generators, hidden, 3 * hidden, 1.0)
 
@@ -43,6 +50,10 @@ class SeedGRU(nn.Module):
         gradients through time are cut every `truncation` steps (0: never).
         """
         layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
+        if self.compiled and x.device.type == "cpu":
+            if torch.is_grad_enabled():
+                return _CompiledUnrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
+            return CompiledUnroll(x, layers, truncation, keep=False).memories
         if torch.is_grad_enabled():
             return _Unrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
         return _advanced(x, *layers)[0][:, 1:]
@@ -116,6 +127,22 @@ class _Unrolled(Function):
             else:
                 carry = learned.through_time(d, passed)
         return by_x, None, *learned.gradients()
+
+
+class _CompiledUnrolled(Function):
+    """The same by the kernel."""
+
+    @staticmethod
+    def forward(ctx, x, truncation, *layers):  # type: ignore[no-untyped-def]
+        ctx.run = CompiledUnroll(x, layers, truncation, keep=True)
+        ctx.save_for_backward(x, *layers)  # so that autograd notices a change of them
+        return ctx.run.memories
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        _ = ctx.saved_tensors
+        by_x, found = ctx.run.backward(grad)
+        return by_x, None, *found
 
 
 class _Learned:

@@ -14,6 +14,7 @@ from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
 from tests.algorithms.test_mappo import learner
+from tests.kernels.compiler import needs_compiler
 
 WEIGHTS = Weights(
     clip_epsilon=0.2,
@@ -88,10 +89,10 @@ CHOICES = [
 ]
 
 
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
 @pytest.mark.parametrize("choice", CHOICES)
-def test_the_closed_form_is_the_reference_to_rounding(choice):
-    ours = gradients(learner(**choice), reference=False)
-    theirs = gradients(learner(**choice), reference=True)
+def test_the_closed_form_is_the_reference_to_rounding(choice, compiled):
+    ours, theirs = (gradients(learner(network__compiled=compiled, **choice), by) for by in (False, True))
     assert max(map(gap, ours, theirs)) < 1e-4
 
 
@@ -110,22 +111,25 @@ def test_each_term_of_the_closed_form_moves_the_gradient(change, actions, monkey
     # pi(a) = 1/2; the ratio is 1/2 / old, and the objective's slope by log pi is rho A, or 0 where it is clipped
     [(1.0, 0.5, 1.0), (1.0, 0.25, 0.0), (1.0, 1.0, 0.5), (-1.0, 0.25, -2.0), (-1.0, 1.0, 0.0)],
 )
-def test_the_clipped_objective_by_hand(advantage, old, slope):
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_the_clipped_objective_by_hand(advantage, old, slope, compiled):
     old, advantage = (torch.full((1, 1, 1, 1), number) for number in (old, advantage))
     action = torch.zeros(1, 1, 1, 1, dtype=torch.int64)
-    gradient = policy_gradient(torch.zeros(1, 1, 1, 1, 2), [], action, old.log(), advantage, weights())
+    gradient = policy_gradient(torch.zeros(1, 1, 1, 1, 2), [], action, old.log(), advantage, weights(), compiled)
     # d log pi_0 / d logits = (1 - 1/2, -1/2), and the loss is minus the objective
     torch.testing.assert_close(gradient.flatten(), torch.tensor([-slope / 2, slope / 2]))
 
 
-def test_the_copies_of_a_policy_that_turns_with_the_world_are_left_alone_and_others_are_drawn_to_it():
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_the_copies_of_a_policy_that_turns_with_the_world_are_left_alone_and_others_are_drawn_to_it(compiled):
     (turn,) = transform_set("rot90", SPACES).each()
     here = torch.tensor([0.5, 0.25, 0.125, 0.125]).log()
     ahead = turn.push_outputs(here.view(1, 1, 1, 4)).view(4)
     none = torch.zeros(1, 1, 1, 1)
     for there in (ahead, here):
         logits = torch.stack([here, there]).view(1, 2, 1, 1, 4)
-        ours = policy_gradient(logits, [turn], none.long(), none, none, weights(policy_gap=1.0)).view(2, 4)
+        made = (none.long(), none, none)
+        ours = policy_gradient(logits, [turn], *made, weights(policy_gap=1.0), compiled).view(2, 4)
         original, copy = (x.clone().requires_grad_() for x in (here, there))
         p, q = turn.pull_back(copy.view(1, 1, 1, 4)).view(4).log_softmax(0), original.log_softmax(0)
         divergence = (p.exp() * (p - q)).sum()

@@ -4,134 +4,13 @@
 // [S, R, padded(out)], layer after layer. A seed's gradient is summed over parts of its rows that depend on R alone, so
 // the results depend neither on the other seeds nor on the number of threads.
 
-#include <algorithm>
-#include <cstdint>
-#include <cstdlib>
-#include <cstring>
-#include <memory>
-#include <utility>
+#include "vectors.h"
 
-#if defined(__AVX512F__)
-#include <immintrin.h>
-constexpr int LANES = 16, VECTORS = 4;
-#elif defined(__AVX__)
-constexpr int LANES = 8, VECTORS = 2;
-#else
-constexpr int LANES = 4, VECTORS = 4;
-#endif
-constexpr int TILE = 6;         // rows of a product whose sums stay in registers, VECTORS of them each
-constexpr int64_t PAD = 16;     // widths are filled up with zeros to a multiple of this
-constexpr int64_t BLOCK = 128;  // most rows that go through all layers at once
-constexpr int64_t PART = 256;   // most rows of a seed that one thread works on at a time, while there are few parts
-constexpr int64_t MOST_PARTS = 16;
+constexpr int64_t BLOCK = 128, PART = 256;
 
-typedef float Vec __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
-typedef int32_t Ints __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
-
-static Vec &vec(float *at) { return *reinterpret_cast<Vec *>(at); }
-static const Vec &vec(const float *at) { return *reinterpret_cast<const Vec *>(at); }
-
-static int64_t padded(int64_t width) { return (width + PAD - 1) / PAD * PAD; }
-
-struct Free {
-    void operator()(float *at) const { std::free(at); }
-};
-using Scratch = std::unique_ptr<float[], Free>;
-
-static Scratch scratch(int64_t count) {
-    return Scratch(static_cast<float *>(std::aligned_alloc(64, static_cast<size_t>(padded(count + 1)) * 4)));
-}
-
-// ---- Products
-
-struct Matrix {
-    const float *at;
-    int64_t row, column;  // steps to the next one
-};
-
-template <int M, int N>
-static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add, float *c,
-                        int64_t c_row) {
-    Vec sum[M][N];
-    for (int m = 0; m < M; m++)
-        for (int n = 0; n < N; n++)
-            sum[m][n] = bias ? vec(bias + n * LANES) : add ? vec(c + m * c_row + n * LANES) : Vec{};
-    for (int64_t k = 0; k < depth; k++) {
-        Vec row[N];
-        for (int n = 0; n < N; n++) row[n] = vec(b + k * b_row + n * LANES);
-        for (int m = 0; m < M; m++) {
-            float factor = a.at[m * a.row + k * a.column];
-            for (int n = 0; n < N; n++) sum[m][n] += factor * row[n];
-        }
-    }
-    for (int m = 0; m < M; m++)
-        for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
-}
-
-template <int N>
-static void panel(int64_t rows, int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add,
-                  float *c, int64_t c_row) {
-    for (; rows > 0; rows -= TILE, a.at += TILE * a.row, c += TILE * c_row) {
-        switch (std::min<int64_t>(TILE, rows)) {
-            case 6: tile<6, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 5: tile<5, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 4: tile<4, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 3: tile<3, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 2: tile<2, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            default: tile<1, N>(depth, a, b, b_row, bias, add, c, c_row);
-        }
-    }
-}
-
-// c [rows, columns] = a b, plus a bias or plus c; columns is a multiple of PAD.
-static void product(int64_t rows, int64_t columns, int64_t depth, Matrix a, const float *b, int64_t b_row,
-                    const float *bias, bool add, float *c, int64_t c_row) {
-    int64_t n = 0;
-    for (; n + VECTORS * LANES <= columns; n += VECTORS * LANES)
-        panel<VECTORS>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
-    for (; n < columns; n += LANES)
-        panel<1>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
-}
-
-// Copy a matrix [rows, columns], a few rows at a time, so that both sides go through memory in whole lines.
-static void copy(int64_t rows, int64_t columns, Matrix from, float *to, int64_t to_row, int64_t to_column) {
-    for (int64_t begin = 0; begin < rows; begin += PAD) {
-        int64_t end = std::min(rows, begin + PAD);
-        for (int64_t c = 0; c < columns; c++)
-            for (int64_t r = begin; r < end; r++)
-                to[r * to_row + c * to_column] = from.at[r * from.row + c * from.column];
-    }
-}
+namespace {
 
 // ---- Activations
-
-static inline Vec reciprocal(Vec x) {
-#if defined(__AVX512F__)
-    Vec guess = (Vec)_mm512_maskz_rcp14_ps(0xFFFF, (__m512)x);
-    return guess * (2.0f - x * guess);
-#else
-    return 1.0f / x;
-#endif
-}
-
-static inline Vec tanh_of(Vec x) {  // 1 - 2 / (exp(2 x) + 1), where exp(y) = 2^n exp(r) and |r| <= ln(2) / 2
-    const float most = 40.0f, round = 12582912.0f;  // 1.5 * 2^23: what is added to it becomes an integer
-    Vec y = 2.0f * x;
-    y = y > most ? Vec{} + most : y;
-    y = y < -most ? Vec{} - most : y;
-    Vec n = y * 1.44269504088896341f + round;
-    Ints exponent = (Ints)n << 23;
-    n -= round;
-    Vec r = (y - n * 0.693359375f) + n * 2.12194440e-4f;  // ln(2) in two parts
-    Vec e = 1.0f / 5040 * r + 1.0f / 720;
-    e = e * r + 1.0f / 120;
-    e = e * r + 1.0f / 24;
-    e = e * r + 1.0f / 6;
-    e = e * r + 0.5f;
-    e = e * r + 1.0f;
-    e = e * r + 1.0f;
-    return 1.0f - 2.0f * reciprocal((Vec)((Ints)e + exponent) + 1.0f);
-}
 
 static void activate(float *x, int64_t count, bool tanh) {
     for (int64_t i = 0; i < count; i += LANES) {
@@ -150,15 +29,7 @@ static void times_slope(float *gradient, const float *y, int64_t count, bool tan
 
 // ---- Passes
 
-struct Span {
-    int64_t begin, end;
-    int64_t size() const { return end - begin; }
-    Span part(int64_t k, int64_t parts) const {
-        return {begin + size() * k / parts, begin + size() * (k + 1) / parts};
-    }
-};
-
-// What kernel.py fills in.
+// What perceptron.py fills in.
 
 struct Perceptron {
     int64_t seeds, rows, layers, tanh, activate_output, threads;
@@ -176,12 +47,11 @@ struct Outputs {
 };
 
 struct Layout : Perceptron {
-    int64_t parts, widest;
-    int busy;  // threads with something to do: the others are not woken
+    Shares shares;
+    int64_t widest;
 
-    explicit Layout(const Perceptron &given) : Perceptron(given), parts(1), widest(PAD) {
-        while (parts < MOST_PARTS && parts * PART < rows) parts *= 2;
-        busy = static_cast<int>(std::min(threads, std::max<int64_t>(1, seeds * parts)));
+    explicit Layout(const Perceptron &given)
+        : Perceptron(given), shares(seeds, rows, PART, threads), widest(PAD) {
         for (int64_t k = 0; k <= layers; k++) widest = std::max(widest, padded(widths[k]));
     }
     int64_t in(int64_t k) const { return widths[k]; }
@@ -203,13 +73,6 @@ struct Layout : Perceptron {
     // Whether the gradient of a weight is computed as [out, in], so that thin outputs are not filled up.
     bool turned(int64_t k) const { return k > 0 && out(k) < PAD; }
     int64_t weight_room(int64_t k) const { return turned(k) ? out(k) * padded(in(k)) : in(k) * padded(out(k)); }
-    // Go through the rows of one part of one seed, block by block.
-    template <class Use>
-    void blocks(int64_t task, Use use) const {
-        Span part = Span{0, rows}.part(task % parts, parts);
-        int64_t count = (part.size() + BLOCK - 1) / BLOCK;
-        for (int64_t b = 0; b < count; b++) use(task / parts, part.part(b, count), b > 0);
-    }
 };
 
 // Copy a seed's weights and biases, layer after layer, as [in + 1, padded(out)].
@@ -291,7 +154,7 @@ static void pull(const Layout &net, int64_t seed, Span span, bool add, const Out
 
 // Add the sums of a seed's parts to its gradients [P].
 static void add_up(const Layout &net, const float *from, float *gradients) {
-    for (int64_t part = 0; part < net.parts; part++) {
+    for (int64_t part = 0; part < net.shares.parts; part++) {
         float *to = gradients;
         for (int64_t k = 0; k < net.layers; k++) {
             int64_t in = net.in(k), out = net.out(k);
@@ -305,6 +168,8 @@ static void add_up(const Layout &net, const float *from, float *gradients) {
     }
 }
 
+}  // namespace
+
 extern "C" {
 
 // Compute the outputs, and keep what hidden layers give where there is room for it.
@@ -313,14 +178,14 @@ void forward(const Perceptron *given, const Outputs *outputs) {
     int64_t room = 0;
     for (int64_t k = 0; k < net.layers; k++) room += (net.in(k) + 1) * padded(net.out(k));
     Scratch packed = scratch(net.seeds * room);
-#pragma omp parallel num_threads(net.busy)
+#pragma omp parallel num_threads(net.shares.busy)
     {
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < net.seeds; s++) pack(net, s, packed.get() + s * room);
         Scratch own = scratch(2 * BLOCK * net.widest);
 #pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.seeds * net.parts; task++)
-            net.blocks(task, [&](int64_t seed, Span span, bool) {
+        for (int64_t task = 0; task < net.shares.tasks; task++)
+            net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
                 pass(net, seed, span, packed.get() + seed * room, *outputs, own.get());
             });
     }
@@ -335,24 +200,24 @@ void backward(const Perceptron *given, const Outputs *by_outputs, float *by_para
         sum_room += net.weight_room(k) + padded(net.out(k));
         count += (net.in(k) + 1) * net.out(k);
     }
-    int64_t sum_count = by_parameters ? net.seeds * net.parts * sum_room : 0;
+    int64_t sum_count = by_parameters ? net.shares.tasks * sum_room : 0;
     Scratch turned = scratch(net.seeds * turned_room), sums = scratch(sum_count);
     if (net.rows == 0) std::fill(sums.get(), sums.get() + sum_count, 0.0f);
-#pragma omp parallel num_threads(net.busy)
+#pragma omp parallel num_threads(net.shares.busy)
     {
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < net.seeds; s++) turn(net, s, turned.get() + s * turned_room);
         Scratch own = scratch(2 * BLOCK * net.widest);
 #pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.seeds * net.parts; task++)
-            net.blocks(task, [&](int64_t seed, Span span, bool add) {
+        for (int64_t task = 0; task < net.shares.tasks; task++)
+            net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool add) {
                 float *sum = by_parameters ? sums.get() + (task + 1) * sum_room : nullptr;
                 const float *weight = turned.get() + (seed + 1) * turned_room;
                 pull(net, seed, span, add, *by_outputs, weight, sum, by_inputs, own.get());
             });
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < (by_parameters ? net.seeds : 0); s++)
-            add_up(net, sums.get() + s * net.parts * sum_room, by_parameters + s * count);
+            add_up(net, sums.get() + s * net.shares.parts * sum_room, by_parameters + s * count);
     }
 }
 

@@ -1,29 +1,15 @@
-"""Perceptrons compiled for the processor at hand: what `perceptron.Pass` does, in one call each way.
-
-The results differ from those of `Pass` by rounding, and so between processors. A seed's do not depend on the seeds
-beside it, nor on the number of threads.
-"""
+"""Perceptrons compiled for the processor at hand: what `perceptron.Pass` does, in one call each way."""
 
 from __future__ import annotations
 
 import ctypes
-import os
-import shlex
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Sequence
-from functools import cache
 from itertools import accumulate, pairwise
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-_SOURCE = Path(__file__).with_name("kernel.cpp")
-_OPTIONS = ("-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-std=gnu++17")
-_PADDING = 16
-"""PAD of kernel.cpp."""
+from esp_cli.kernels.library import PADDING, library
 
 
 class _Perceptron(ctypes.Structure):
@@ -42,34 +28,6 @@ class _Outputs(ctypes.Structure):
     @classmethod
     def of(cls, x: Tensor) -> _Outputs:
         return cls(x.data_ptr(), *x.stride())
-
-
-@cache
-def library() -> ctypes.CDLL:
-    """Compile the kernel, which takes two seconds, in a temporary folder, and load it.
-
-    Raises:
-        ValueError: there is no C++ compiler, it fails, or what it made cannot be loaded.
-    """
-    compiler = shlex.split(os.environ.get("CXX", "")) or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
-    if shutil.which(compiler[0]) is None:
-        raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
-    with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "kernel.so"
-        command = [*compiler, *_OPTIONS, str(_SOURCE), "-o", str(built)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            said = next((line for line in done.stderr.splitlines() if "error" in line), done.stderr.strip())
-            raise ValueError(f"{shlex.join(compiler)} does not compile the kernel of network.compiled: {said}")
-        try:
-            loaded = ctypes.CDLL(str(built))
-        except OSError as error:
-            raise ValueError(
-                f"the kernel of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
-                "may run from, or leave it off"
-            ) from None
-    loaded.backward.argtypes = (ctypes.c_void_p,) * 4  # else addresses would be cut to 32 bits
-    return loaded
 
 
 def _with_whole_rows(x: Tensor) -> Tensor:
@@ -108,7 +66,7 @@ class CompiledPass:
         self._shapes = [p.shape[1:] for p in parameters]
         self._count = sum((a + 1) * b for a, b in pairwise(widths))
         activated = widths[1:] if activate_output else widths[1:-1]
-        room = sum(-(-width // _PADDING) * _PADDING for width in activated) if keep else 0
+        room = sum(-(-width // PADDING) * PADDING for width in activated) if keep else 0
         given, hidden = [_with_whole_rows(p.detach()) for p in parameters], x.new_empty(x.shape[0] * x.shape[1] * room)
         tables = (
             (ctypes.c_int64 * len(widths))(*widths),
@@ -129,7 +87,7 @@ class CompiledPass:
         )
         self._alive = (x, given, hidden, tables)
         size = (x.shape[0], x.shape[1], widths[-1])
-        columns_first = rows_innermost or widths[-1] < _PADDING
+        columns_first = rows_innermost or widths[-1] < PADDING
         self.outputs = x.new_empty(size[0], size[2], size[1]).transpose(1, 2) if columns_first else x.new_empty(size)
         library().forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
 

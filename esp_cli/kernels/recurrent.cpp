@@ -1,0 +1,231 @@
+// A gated recurrent unit of S seeds unrolled over T steps: recurrent.py of the networks, a few rows at a time through all
+// steps, so that weights and sums stay in a core's cache.
+//
+// What a step makes of a row lies in four parts, each filled up to padded(H): n, r, z and i = h U_n + b_n. A step's first
+// three parts are sums over its input, its last three over the memory before it.
+
+#include "vectors.h"
+
+constexpr int64_t BLOCK = 64;
+constexpr int64_t GATE[3] = {1, 2, 0};  // where r, z and n of the parameters stand among n, r, z
+constexpr int64_t INNER[3] = {0, 1, 2};  // and among r, z, i
+
+namespace {
+
+// What recurrent.py fills in.
+struct Unit {
+    int64_t seeds, steps, rows, inputs, hidden, truncation, threads;
+    int64_t x_strides[3];         // of seeds, steps and rows
+    const float *x;               // [S, T, R, inputs]
+    const float *parameters[4];   // W [inputs, 3H], b [3H], U [H, 3H], b' [3H] of the first seed, by r, z, n
+    int64_t strides[4];           // from seed to seed
+    float *memories;              // [S, 1 + T, R, padded(H)]
+    float *gates;                 // [S, T, R, 4 padded(H)]; null: not kept
+};
+
+struct Layout : Unit {
+    int64_t width;
+    Shares shares;
+
+    explicit Layout(const Unit &given)
+        : Unit(given), width(padded(hidden)), shares(seeds, rows, BLOCK, threads) {}
+    Matrix input(int64_t seed, int64_t step, int64_t row) const {
+        return {x + seed * x_strides[0] + step * x_strides[1] + row * x_strides[2], x_strides[2], 1};
+    }
+    float *memory(int64_t seed, int64_t step, int64_t row) const {
+        return memories + ((seed * (1 + steps) + step) * rows + row) * width;
+    }
+    float *kept(int64_t seed, int64_t step, int64_t row) const {
+        return gates + ((seed * steps + step) * rows + row) * 4 * width;
+    }
+    const float *parameter(int64_t k, int64_t seed) const { return parameters[k] + seed * strides[k]; }
+};
+
+// Copy a matrix [rows, 3 H], whose parts are r, z and n, to where they stand in [rows, 3 padded(H)]; or back, or turned.
+struct Packing {
+    int64_t hidden, width;
+    const int64_t *place;
+
+    template <class Use>
+    void each(int64_t rows, Use use) const {  // use(row, column there, column here)
+        for (int64_t r = 0; r < rows; r++)
+            for (int64_t gate = 0; gate < 3; gate++)
+                for (int64_t h = 0; h < hidden; h++) use(r, gate * hidden + h, place[gate] * width + h);
+    }
+};
+
+// The parameters of a seed as the products want them.
+struct Weights {
+    float *input, *memory, *bias;  // [inputs, 3 W], [H, 3 W], [4 W]
+
+    static int64_t room(const Layout &unit) { return (unit.inputs + unit.hidden) * 3 * unit.width + 4 * unit.width; }
+    Weights(const Layout &unit, float *at)
+        : input(at), memory(at + unit.inputs * 3 * unit.width), bias(memory + unit.hidden * 3 * unit.width) {}
+};
+
+static void pack(const Layout &unit, int64_t seed, float *at) {
+    Weights to(unit, at);
+    int64_t width = unit.width, row = 3 * width, from_row = 3 * unit.hidden;
+    std::fill(at, at + Weights::room(unit), 0.0f);
+    Packing gates{unit.hidden, width, GATE}, inner{unit.hidden, width, INNER};
+    const float *weight = unit.parameter(0, seed), *bias = unit.parameter(1, seed);
+    const float *recurrent = unit.parameter(2, seed), *inner_bias = unit.parameter(3, seed);
+    gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) { to.input[r * row + k] = weight[r * from_row + c]; });
+    inner.each(unit.hidden, [&](int64_t r, int64_t c, int64_t k) { to.memory[r * row + k] = recurrent[r * from_row + c]; });
+    gates.each(1, [&](int64_t, int64_t c, int64_t k) { to.bias[k] += bias[c]; });
+    inner.each(1, [&](int64_t, int64_t c, int64_t k) { to.bias[width + k] += inner_bias[c]; });
+}
+
+static inline Vec sigmoid_of(Vec x) { return reciprocal(1.0f + exp_of(-x)); }
+
+// Advance rows by one step, from gates that hold their sums to n, r, z, i.
+static void advance(int64_t rows, int64_t width, float *gates, const float *before, float *after) {
+    for (; rows > 0; rows--, gates += 4 * width, before += width, after += width)
+        for (int64_t h = 0; h < width; h += LANES) {
+            Vec r = sigmoid_of(vec(gates + width + h)), z = sigmoid_of(vec(gates + 2 * width + h));
+            Vec n = tanh_of(vec(gates + h) + r * vec(gates + 3 * width + h));
+            vec(gates + h) = n;
+            vec(gates + width + h) = r;
+            vec(gates + 2 * width + h) = z;
+            vec(after + h) = n + z * (vec(before + h) - n);
+        }
+}
+
+// Turn the gates of a step into the gradients by their sums, from that by the memory it gives, of which the part is left
+// that passes the gates by.
+static void pull(int64_t rows, int64_t width, const float *gates, const float *before, float *carry, float *d) {
+    for (; rows > 0; rows--, gates += 4 * width, before += width, carry += width, d += 4 * width)
+        for (int64_t h = 0; h < width; h += LANES) {
+            Vec n = vec(gates + h), r = vec(gates + width + h), z = vec(gates + 2 * width + h);
+            Vec above = vec(carry + h), passed = above * z, by_n = (above - passed) * (1.0f - n * n);
+            vec(d + h) = by_n;
+            vec(d + width + h) = by_n * vec(gates + 3 * width + h) * (r - r * r);
+            vec(d + 2 * width + h) = (vec(before + h) - n) * above * (z - z * z);
+            vec(d + 3 * width + h) = by_n * r;
+            vec(carry + h) = passed;
+        }
+}
+
+// The sums that a part of a seed's rows adds up: gradients by the parameters, as `Weights` lays them out.
+static void learn(const Layout &unit, Weights sum, Matrix x, const float *before, int64_t rows, const float *d) {
+    int64_t width = unit.width, row = 4 * width;
+    product(unit.inputs, 3 * width, rows, {x.at, x.column, x.row}, d, row, nullptr, true, sum.input, 3 * width);
+    product(unit.hidden, 3 * width, rows, {before, 1, width}, d + width, row, nullptr, true, sum.memory, 3 * width);
+    for (int64_t k = 0; k < row; k += LANES) {
+        Vec total = vec(sum.bias + k);
+        for (int64_t r = 0; r < rows; r++) total += vec(d + r * row + k);
+        vec(sum.bias + k) = total;
+    }
+}
+
+}  // namespace
+
+extern "C" {
+
+// Compute every memory, and keep the gates where there is room for them.
+void gru_forward(const Unit *given) {
+    const Layout unit(*given);
+    int64_t width = unit.width, room = Weights::room(unit);
+    Scratch packed = scratch(unit.seeds * room);
+#pragma omp parallel num_threads(unit.shares.busy)
+    {
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < unit.seeds; s++) pack(unit, s, packed.get() + s * room);
+        Scratch own = scratch(BLOCK * 4 * width);
+#pragma omp for schedule(static)
+        for (int64_t task = 0; task < unit.shares.tasks; task++)
+            unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
+                Weights weights(unit, packed.get() + seed * room);
+                int64_t rows = span.size();
+                std::fill(unit.memory(seed, 0, span.begin), unit.memory(seed, 0, span.end), 0.0f);
+                for (int64_t t = 0; t < unit.steps; t++) {
+                    float *gates = unit.gates ? unit.kept(seed, t, span.begin) : own.get();
+                    const float *before = unit.memory(seed, t, span.begin);
+                    product(rows, 3 * width, unit.inputs, unit.input(seed, t, span.begin), weights.input, 3 * width,
+                            weights.bias, false, gates, 4 * width);
+                    for (int64_t r = 0; r < rows; r++)
+                        std::copy(weights.bias + 3 * width, weights.bias + 4 * width, gates + (4 * r + 3) * width);
+                    if (t > 0)
+                        product(rows, 3 * width, unit.hidden, {before, width, 1}, weights.memory, 3 * width, nullptr,
+                                true, gates + width, 4 * width);
+                    advance(rows, width, gates, before, unit.memory(seed, t + 1, span.begin));
+                }
+            });
+    }
+}
+
+// Compute the gradients by the parameters, [S, P] in their order, and by the inputs, [S, T, R, inputs], from that by the
+// memories, [S, T, R, H] with the steps given.
+void gru_backward(const Unit *given, const float *by_memories, const int64_t *by_strides, float *by_parameters,
+                  float *by_inputs) {
+    const Layout unit(*given);
+    int64_t width = unit.width, room = Weights::room(unit), below = padded(unit.inputs);
+    int64_t turned_room = 3 * width * (below + width), tasks = unit.shares.tasks;
+    Scratch turned = scratch(unit.seeds * turned_room), sums = scratch(tasks * room);
+#pragma omp parallel num_threads(unit.shares.busy)
+    {
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < unit.seeds; s++) {
+            float *input = turned.get() + s * turned_room, *memory = input + 3 * width * below;
+            std::fill(input, input + turned_room, 0.0f);
+            const float *weight = unit.parameter(0, s), *recurrent = unit.parameter(2, s);
+            Packing{unit.hidden, width, GATE}.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
+                input[k * below + r] = weight[r * 3 * unit.hidden + c];
+            });
+            Packing{unit.hidden, width, INNER}.each(unit.hidden, [&](int64_t r, int64_t c, int64_t k) {
+                memory[k * width + r] = recurrent[r * 3 * unit.hidden + c];
+            });
+        }
+        Scratch own = scratch(BLOCK * (5 * width + below));
+        float *carry = own.get(), *d = carry + BLOCK * width, *by_x = d + BLOCK * 4 * width;
+#pragma omp for schedule(static)
+        for (int64_t task = 0; task < tasks; task++) {
+            float *sum = sums.get() + task * room;
+            std::fill(sum, sum + room, 0.0f);
+            unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
+                const float *input = turned.get() + seed * turned_room, *memory = input + 3 * width * below;
+                int64_t rows = span.size();
+                std::fill(carry, carry + rows * width, 0.0f);
+                for (int64_t t = unit.steps - 1; t >= 0; t--) {
+                    const float *above =
+                        by_memories + seed * by_strides[0] + t * by_strides[1] + span.begin * by_strides[2];
+                    for (int64_t r = 0; r < rows; r++)
+                        for (int64_t h = 0; h < unit.hidden; h++) carry[r * width + h] += above[r * by_strides[2] + h];
+                    const float *before = unit.memory(seed, t, span.begin);
+                    Matrix x = unit.input(seed, t, span.begin);
+                    pull(rows, width, unit.kept(seed, t, span.begin), before, carry, d);
+                    learn(unit, Weights(unit, sum), x, before, rows, d);
+                    product(rows, below, 3 * width, {d, 4 * width, 1}, input, below, nullptr, false, by_x, below);
+                    float *to = by_inputs + ((seed * unit.steps + t) * unit.rows + span.begin) * unit.inputs;
+                    copy(rows, unit.inputs, {by_x, below, 1}, to, unit.inputs, 1);
+                    if (unit.truncation && t % unit.truncation == 0)
+                        std::fill(carry, carry + rows * width, 0.0f);
+                    else
+                        product(rows, width, 3 * width, {d + width, 4 * width, 1}, memory, width, nullptr, true, carry,
+                                width);
+                }
+            });
+        }
+        int64_t hidden = unit.hidden, count = 3 * hidden * (unit.inputs + hidden + 2);
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < unit.seeds; s++) {
+            float *weight = by_parameters + s * count, *bias = weight + unit.inputs * 3 * hidden;
+            float *recurrent = bias + 3 * hidden, *inner_bias = recurrent + hidden * 3 * hidden;
+            std::fill(weight, weight + count, 0.0f);
+            for (int64_t part = 0; part < unit.shares.parts; part++) {
+                Weights sum(unit, sums.get() + (s * unit.shares.parts + part) * room);
+                Packing gates{hidden, width, GATE}, inner{hidden, width, INNER};
+                gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
+                    weight[r * 3 * hidden + c] += sum.input[r * 3 * width + k];
+                });
+                gates.each(1, [&](int64_t, int64_t c, int64_t k) { bias[c] += sum.bias[k]; });
+                inner.each(hidden, [&](int64_t r, int64_t c, int64_t k) {
+                    recurrent[r * 3 * hidden + c] += sum.memory[r * 3 * width + k];
+                });
+                inner.each(1, [&](int64_t, int64_t c, int64_t k) { inner_bias[c] += sum.bias[width + k]; });
+            }
+        }
+    }
+}
+
+}

@@ -1,0 +1,188 @@
+// Vectors of the processor at hand, and the products and functions that the kernels are made of.
+
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <utility>
+
+#if defined(__AVX512F__)
+#include <immintrin.h>
+constexpr int LANES = 16, VECTORS = 4;
+#elif defined(__AVX__)
+constexpr int LANES = 8, VECTORS = 2;
+#else
+constexpr int LANES = 4, VECTORS = 4;
+#endif
+constexpr int TILE = 6;         // rows of a product whose sums stay in registers, VECTORS of them each
+constexpr int64_t PAD = 16;     // widths are filled up with zeros to a multiple of this
+constexpr int64_t MOST_PARTS = 16;
+
+typedef float Vec __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+typedef int32_t Ints __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
+
+static Vec &vec(float *at) { return *reinterpret_cast<Vec *>(at); }
+static const Vec &vec(const float *at) { return *reinterpret_cast<const Vec *>(at); }
+
+// Read and write fewer numbers than a vector holds; the others are 0.
+static inline Vec load(const float *at, int64_t count) {
+    if (count >= LANES) return vec(at);
+    Vec x = {};
+    for (int64_t i = 0; i < count; i++) x[i] = at[i];
+    return x;
+}
+static inline void store(Vec x, float *at, int64_t count) {
+    if (count >= LANES) vec(at) = x;
+    else
+        for (int64_t i = 0; i < count; i++) at[i] = x[i];
+}
+
+static int64_t padded(int64_t width) { return (width + PAD - 1) / PAD * PAD; }
+
+struct Free {
+    void operator()(float *at) const { std::free(at); }
+};
+using Scratch = std::unique_ptr<float[], Free>;
+
+static Scratch scratch(int64_t count) {
+    return Scratch(static_cast<float *>(std::aligned_alloc(64, static_cast<size_t>(padded(count + 1)) * 4)));
+}
+
+struct Span {
+    int64_t begin, end;
+    int64_t size() const { return end - begin; }
+    Span part(int64_t k, int64_t parts) const {
+        return {begin + size() * k / parts, begin + size() * (k + 1) / parts};
+    }
+};
+
+// The rows of S seeds, shared out among threads: a seed's fall into parts that depend on their number alone.
+struct Shares {
+    int64_t rows, parts, tasks;
+    int busy;  // threads with something to do: the others are not woken
+
+    // most: rows of a task, while there are few parts.
+    Shares(int64_t seeds, int64_t rows, int64_t most, int64_t threads) : rows(rows), parts(1) {
+        while (parts < MOST_PARTS && parts * most < rows) parts *= 2;
+        tasks = seeds * parts;
+        busy = static_cast<int>(std::min(threads, std::max<int64_t>(1, tasks)));
+    }
+    Span of(int64_t task) const { return Span{0, rows}.part(task % parts, parts); }
+    // Go through the rows of a task, block by block: use(seed, rows, whether it is not the first block).
+    template <class Use>
+    void blocks(int64_t task, int64_t block, Use use) const {
+        Span part = of(task);
+        int64_t count = (part.size() + block - 1) / block;
+        for (int64_t b = 0; b < count; b++) use(task / parts, part.part(b, count), b > 0);
+    }
+};
+
+// ---- Products
+
+struct Matrix {
+    const float *at;
+    int64_t row, column;  // steps to the next one
+};
+
+template <int M, int N>
+static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add, float *c,
+                        int64_t c_row) {
+    Vec sum[M][N];
+    for (int m = 0; m < M; m++)
+        for (int n = 0; n < N; n++)
+            sum[m][n] = bias ? vec(bias + n * LANES) : add ? vec(c + m * c_row + n * LANES) : Vec{};
+    for (int64_t k = 0; k < depth; k++) {
+        Vec row[N];
+        for (int n = 0; n < N; n++) row[n] = vec(b + k * b_row + n * LANES);
+        for (int m = 0; m < M; m++) {
+            float factor = a.at[m * a.row + k * a.column];
+            for (int n = 0; n < N; n++) sum[m][n] += factor * row[n];
+        }
+    }
+    for (int m = 0; m < M; m++)
+        for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
+}
+
+template <int N>
+static void panel(int64_t rows, int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add,
+                  float *c, int64_t c_row) {
+    for (; rows > 0; rows -= TILE, a.at += TILE * a.row, c += TILE * c_row) {
+        switch (std::min<int64_t>(TILE, rows)) {
+            case 6: tile<6, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 5: tile<5, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 4: tile<4, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 3: tile<3, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            case 2: tile<2, N>(depth, a, b, b_row, bias, add, c, c_row); break;
+            default: tile<1, N>(depth, a, b, b_row, bias, add, c, c_row);
+        }
+    }
+}
+
+// c [rows, columns] = a b, plus a bias or plus c; columns is a multiple of PAD.
+static inline void product(int64_t rows, int64_t columns, int64_t depth, Matrix a, const float *b, int64_t b_row,
+                    const float *bias, bool add, float *c, int64_t c_row) {
+    int64_t n = 0;
+    for (; n + VECTORS * LANES <= columns; n += VECTORS * LANES)
+        panel<VECTORS>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+    for (; n < columns; n += LANES)
+        panel<1>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+}
+
+// Copy a matrix [rows, columns]: row by row where both sides lie so, else a few rows at a time, so that both go through
+// memory in whole lines.
+static inline void copy(int64_t rows, int64_t columns, Matrix from, float *to, int64_t to_row, int64_t to_column) {
+    bool in_rows = from.column == 1 && to_column == 1;
+    for (int64_t begin = 0; begin < rows; begin += in_rows ? 1 : PAD) {
+        int64_t end = std::min(rows, begin + PAD);
+        const float *row = from.at + begin * from.row;
+        if (in_rows) std::copy(row, row + columns, to + begin * to_row);
+        for (int64_t c = 0; !in_rows && c < columns; c++)
+            for (int64_t r = begin; r < end; r++)
+                to[r * to_row + c * to_column] = from.at[r * from.row + c * from.column];
+    }
+}
+
+// ---- Functions of many numbers at once
+
+static inline Vec reciprocal(Vec x) {
+#if defined(__AVX512F__)
+    Vec guess = (Vec)_mm512_maskz_rcp14_ps(0xFFFF, (__m512)x);
+    return guess * (2.0f - x * guess);
+#else
+    return 1.0f / x;
+#endif
+}
+
+// Return exp(x), where |x| is below `most`, and exp(most) or exp(-most) beyond: 2^n exp(r) with |r| <= ln(2) / 2.
+static inline Vec exp_of(Vec x, float most = 86.0f) {
+    const float round = 12582912.0f;  // 1.5 * 2^23: what is added to it becomes an integer
+    x = x > most ? Vec{} + most : x;
+    x = x < -most ? Vec{} - most : x;
+    Vec n = x * 1.44269504088896341f + round;
+    Ints exponent = (Ints)n << 23;
+    n -= round;
+    Vec r = (x - n * 0.693359375f) + n * 2.12194440e-4f;  // ln(2) in two parts
+    Vec e = 1.0f / 5040 * r + 1.0f / 720;
+    e = e * r + 1.0f / 120;
+    e = e * r + 1.0f / 24;
+    e = e * r + 1.0f / 6;
+    e = e * r + 0.5f;
+    e = e * r + 1.0f;
+    e = e * r + 1.0f;
+    return (Vec)((Ints)e + exponent);
+}
+
+static inline Vec tanh_of(Vec x) { return 1.0f - 2.0f * reciprocal(exp_of(2.0f * x, 40.0f) + 1.0f); }
+
+// Return log(x) of x >= 1: Halley's steps towards exp(y) = x, from a guess that reads the bits of x.
+static inline Vec log_of(Vec x) {
+    Vec y = __builtin_convertvector((Ints)x - 0x3F800000, Vec) * (0.693147181f / 8388608.0f);
+    for (int step = 0; step < 2; step++) {
+        Vec e = exp_of(y);
+        y += 2.0f * (x - e) / (x + e);
+    }
+    return y;
+}

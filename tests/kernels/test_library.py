@@ -1,0 +1,79 @@
+"""Learners learn the same with the kernels, and a missing compiler is told."""
+
+import pytest
+from typer.testing import CliRunner
+
+from esp_cli.app import app
+from esp_cli.kernels import library
+from esp_cli.networks.plain import MlpConfig
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_cli.training.loading import load_policy, single_seed
+from tests.kernels.compiler import needs_compiler
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("algorithm", "network"), [("mappo", "mlp"), ("mappo", "gru"), ("maddpg", "mlp"), ("qmix", "mlp"), ("qmix", "gru")]
+)
+def test_learners_learn_the_same_up_to_rounding(algorithm, network):
+    def parameters(compiled):
+        settings = {"network.name": network, "network.compiled": compiled}
+        learner = build_learner(resolve_config("navigation", algorithm, seeds=(0, 1), overrides=settings))
+        start = [p.detach().clone() for p in learner.policy.parameters()]
+        learner.iterate(0.0)
+        return start, list(learner.policy.parameters())
+
+    (start, ours), (_, theirs) = parameters(True), parameters(False)
+    moved = max((a - b).abs().max() for a, b in zip(start, theirs, strict=True))
+    apart = max((a - b).abs().max() for a, b in zip(ours, theirs, strict=True))
+    assert 0 < apart < 0.05 * moved
+
+
+@needs_compiler
+def test_a_policy_trained_with_it_needs_no_compiler(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    options = ["--steps", "800", "--set", "network.compiled=true", "--set", "evaluation.episodes=1"]
+    result = CliRunner().invoke(app, ["train", *options, "--out", str(folder)])
+    assert result.exit_code == 0, result.output
+    monkeypatch.setattr(library, "library", without_compiler)
+    assert load_policy(folder).config.network.compiled
+    assert not single_seed(load_policy(folder), 0).config.network.compiled
+
+
+def without_compiler():
+    raise AssertionError("the kernel is asked for")
+
+
+def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
+    library.library.cache_clear()
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    result = CliRunner().invoke(app, ["train", "--set", "network.compiled=true", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert "network.compiled needs a C++ compiler" in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(
+    ("script", "sentence"),
+    [
+        (
+            "echo 'error: no such option' >&2; exit 1",
+            r"compiler does not compile the kernels .*: error: no such option",
+        ),
+        ('while [ "$1" != -o ]; do shift; done; echo > "$2"', r"cannot be loaded .*; set TMPDIR to a folder"),
+    ],
+)
+def test_a_compiler_that_fails_and_one_that_makes_no_library_are_told(tmp_path, monkeypatch, script, sentence):
+    library.library.cache_clear()
+    compiler = tmp_path / "compiler"
+    compiler.write_text(f"#!/bin/sh\n{script}\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    with pytest.raises(ValueError, match=sentence):
+        library.library()
+
+
+def test_bfloat16_and_the_kernel_exclude_each_other():
+    with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
+        MlpConfig(compiled=True, precision="bfloat16")
