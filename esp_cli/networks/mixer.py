@@ -49,14 +49,15 @@ class MonotonicMixer(nn.Module):
             values [S, ..., N], state [S, ..., state width] -> [S, ...].
         """
         own, seen = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in (values, state))
+        if self.hypernetwork.compiled and seen.device.type == "cpu":
+            total = _CompiledMixed.apply(own.contiguous(), self.hypernetwork(seen), self.width)  # type: ignore[no-untyped-call]
+            return total.view(values.shape[:-1])
         size = max(1, CACHED_ROWS // values.shape[0])
         pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
         return torch.cat(pieces, 1).view(values.shape[:-1])
 
     def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
         """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
-        if self.hypernetwork.compiled and seen.device.type == "cpu":
-            return _CompiledMixed.apply(own.contiguous(), self.hypernetwork(seen), self.width)  # type: ignore[no-untyped-call]
         rows = self.hypernetwork.of_parts(seen, rows_innermost=True)
         return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
 
