@@ -19,7 +19,7 @@ struct Unit {
     const float *x;               // [S, T, R, inputs]
     const float *parameters[4];   // W [inputs, 3H], b [3H], U [H, 3H], b' [3H] of the first seed, by r, z, n
     int64_t strides[4];           // from seed to seed
-    float *memories;              // [S, 1 + T, R, padded(H)]
+    float *memories;              // [S, T, R, padded(H)] after every step
     float *gates;                 // [S, T, R, 4 padded(H)]; null: not kept
 };
 
@@ -32,11 +32,16 @@ struct Layout : Unit {
     Matrix input(int64_t seed, int64_t step, int64_t row) const {
         return {x + seed * x_strides[0] + step * x_strides[1] + row * x_strides[2], x_strides[2], 1};
     }
+    // What a step leaves.
     float *memory(int64_t seed, int64_t step, int64_t row) const {
-        return memories + ((seed * (1 + steps) + step) * rows + row) * width;
+        return memories + ((seed * steps + step) * rows + row) * width;
     }
     float *kept(int64_t seed, int64_t step, int64_t row) const {
         return gates + ((seed * steps + step) * rows + row) * 4 * width;
+    }
+    // What a step finds; `none` is that before the first.
+    const float *before(int64_t seed, int64_t step, int64_t row, const float *none) const {
+        return step > 0 ? memory(seed, step - 1, row) : none;
     }
     const float *parameter(int64_t k, int64_t seed) const { return parameters[k] + seed * strides[k]; }
 };
@@ -63,7 +68,7 @@ struct Weights {
         : input(at), memory(at + unit.inputs * 3 * unit.width), bias(memory + unit.hidden * 3 * unit.width) {}
 };
 
-static void pack(const Layout &unit, int64_t seed, float *at) {
+void pack(const Layout &unit, int64_t seed, float *at) {
     Weights to(unit, at);
     int64_t width = unit.width, row = 3 * width, from_row = 3 * unit.hidden;
     std::fill(at, at + Weights::room(unit), 0.0f);
@@ -76,10 +81,10 @@ static void pack(const Layout &unit, int64_t seed, float *at) {
     inner.each(1, [&](int64_t, int64_t c, int64_t k) { to.bias[width + k] += inner_bias[c]; });
 }
 
-static inline Vec sigmoid_of(Vec x) { return reciprocal(1.0f + exp_of(-x)); }
+inline Vec sigmoid_of(Vec x) { return reciprocal(1.0f + exp_of(-x)); }
 
 // Advance rows by one step, from gates that hold their sums to n, r, z, i.
-static void advance(int64_t rows, int64_t width, float *gates, const float *before, float *after) {
+void advance(int64_t rows, int64_t width, float *gates, const float *before, float *after) {
     for (; rows > 0; rows--, gates += 4 * width, before += width, after += width)
         for (int64_t h = 0; h < width; h += LANES) {
             Vec r = sigmoid_of(vec(gates + width + h)), z = sigmoid_of(vec(gates + 2 * width + h));
@@ -93,7 +98,7 @@ static void advance(int64_t rows, int64_t width, float *gates, const float *befo
 
 // Turn the gates of a step into the gradients by their sums, from that by the memory it gives, of which the part is left
 // that passes the gates by.
-static void pull(int64_t rows, int64_t width, const float *gates, const float *before, float *carry, float *d) {
+void pull(int64_t rows, int64_t width, const float *gates, const float *before, float *carry, float *d) {
     for (; rows > 0; rows--, gates += 4 * width, before += width, carry += width, d += 4 * width)
         for (int64_t h = 0; h < width; h += LANES) {
             Vec n = vec(gates + h), r = vec(gates + width + h), z = vec(gates + 2 * width + h);
@@ -106,8 +111,25 @@ static void pull(int64_t rows, int64_t width, const float *gates, const float *b
         }
 }
 
-// The sums that a part of a seed's rows adds up: gradients by the parameters, as `Weights` lays them out.
-static void learn(const Layout &unit, Weights sum, Matrix x, const float *before, int64_t rows, const float *d) {
+// Take rows through all steps; `own` has room for the gates of one step, `none` is empty memory.
+void forward_block(const Layout &unit, int64_t seed, Span span, const Weights &weights, float *own, const float *none) {
+    int64_t width = unit.width, rows = span.size();
+    for (int64_t t = 0; t < unit.steps; t++) {
+        float *gates = unit.gates ? unit.kept(seed, t, span.begin) : own;
+        const float *before = unit.before(seed, t, span.begin, none);
+        product(rows, 3 * width, unit.inputs, unit.input(seed, t, span.begin), weights.input, 3 * width, weights.bias,
+                false, gates, 4 * width);
+        for (int64_t r = 0; r < rows; r++)
+            std::copy(weights.bias + 3 * width, weights.bias + 4 * width, gates + (4 * r + 3) * width);
+        if (t > 0)
+            product(rows, 3 * width, unit.hidden, {before, width, 1}, weights.memory, 3 * width, nullptr, true,
+                    gates + width, 4 * width);
+        advance(rows, width, gates, before, unit.memory(seed, t, span.begin));
+    }
+}
+
+// Add the gradients by the parameters, laid out as `Weights`, from those by a step's sums.
+void learn(const Layout &unit, const Weights &sum, Matrix x, const float *before, int64_t rows, const float *d) {
     int64_t width = unit.width, row = 4 * width;
     product(unit.inputs, 3 * width, rows, {x.at, x.column, x.row}, d, row, nullptr, true, sum.input, 3 * width);
     product(unit.hidden, 3 * width, rows, {before, 1, width}, d + width, row, nullptr, true, sum.memory, 3 * width);
@@ -118,6 +140,68 @@ static void learn(const Layout &unit, Weights sum, Matrix x, const float *before
     }
 }
 
+// Turn a seed's weights: W' [3 W, padded(inputs)] and, behind it, U' [3 W, W].
+void turn(const Layout &unit, int64_t seed, float *input) {
+    int64_t width = unit.width, below = padded(unit.inputs), row = 3 * unit.hidden;
+    float *memory = input + 3 * width * below;
+    std::fill(input, memory + 3 * width * width, 0.0f);
+    const float *weight = unit.parameter(0, seed), *recurrent = unit.parameter(2, seed);
+    Packing{unit.hidden, width, GATE}.each(
+        unit.inputs, [&](int64_t r, int64_t c, int64_t k) { input[k * below + r] = weight[r * row + c]; });
+    Packing{unit.hidden, width, INNER}.each(
+        unit.hidden, [&](int64_t r, int64_t c, int64_t k) { memory[k * width + r] = recurrent[r * row + c]; });
+}
+
+struct Gradients {
+    const float *by_memories;  // [S, T, R, H], with its steps
+    const int64_t *strides;
+    float *by_inputs;  // [S, T, R, inputs]
+};
+
+// Pull the gradient by all memories of some rows back; `own` has room for one step, and the weights are turned.
+void backward_block(const Layout &unit, int64_t seed, Span span, const Gradients &gradients, const float *input,
+                    const Weights &sum, float *own, const float *none) {
+    int64_t width = unit.width, rows = span.size(), below = padded(unit.inputs);
+    const float *memory = input + 3 * width * below;
+    const int64_t *strides = gradients.strides;
+    float *carry = own, *d = carry + BLOCK * width, *by_x = d + BLOCK * 4 * width;
+    std::fill(carry, carry + rows * width, 0.0f);
+    for (int64_t t = unit.steps - 1; t >= 0; t--) {
+        const float *above = gradients.by_memories + seed * strides[0] + t * strides[1] + span.begin * strides[2];
+        for (int64_t r = 0; r < rows; r++)
+            for (int64_t h = 0; h < unit.hidden; h++) carry[r * width + h] += above[r * strides[2] + h];
+        const float *before = unit.before(seed, t, span.begin, none);
+        pull(rows, width, unit.kept(seed, t, span.begin), before, carry, d);
+        learn(unit, sum, unit.input(seed, t, span.begin), before, rows, d);
+        product(rows, below, 3 * width, {d, 4 * width, 1}, input, below, nullptr, false, by_x, below);
+        float *to = gradients.by_inputs + ((seed * unit.steps + t) * unit.rows + span.begin) * unit.inputs;
+        copy(rows, unit.inputs, {by_x, below, 1}, to, unit.inputs, 1);
+        if (unit.truncation && t % unit.truncation == 0)
+            std::fill(carry, carry + rows * width, 0.0f);
+        else
+            product(rows, width, 3 * width, {d + width, 4 * width, 1}, memory, width, nullptr, true, carry, width);
+    }
+}
+
+// Add the sums of a seed's parts to its gradients, W, b, U and b' in a row.
+void add_up(const Layout &unit, float *sums, float *weight) {
+    int64_t hidden = unit.hidden, width = unit.width, row = 3 * hidden;
+    float *bias = weight + unit.inputs * row, *recurrent = bias + row, *inner_bias = recurrent + hidden * row;
+    Packing gates{hidden, width, GATE}, inner{hidden, width, INNER};
+    std::fill(weight, inner_bias + row, 0.0f);
+    for (int64_t part = 0; part < unit.shares.parts; part++, sums += Weights::room(unit)) {
+        const Weights sum(unit, sums);
+        gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
+            weight[r * row + c] += sum.input[r * 3 * width + k];
+        });
+        gates.each(1, [&](int64_t, int64_t c, int64_t k) { bias[c] += sum.bias[k]; });
+        inner.each(hidden, [&](int64_t r, int64_t c, int64_t k) {
+            recurrent[r * row + c] += sum.memory[r * 3 * width + k];
+        });
+        inner.each(1, [&](int64_t, int64_t c, int64_t k) { inner_bias[c] += sum.bias[width + k]; });
+    }
+}
+
 }  // namespace
 
 extern "C" {
@@ -125,106 +209,49 @@ extern "C" {
 // Compute every memory, and keep the gates where there is room for them.
 void gru_forward(const Unit *given) {
     const Layout unit(*given);
-    int64_t width = unit.width, room = Weights::room(unit);
+    int64_t room = Weights::room(unit), size = BLOCK * unit.width;
     Scratch packed = scratch(unit.seeds * room);
 #pragma omp parallel num_threads(unit.shares.busy)
     {
 #pragma omp for schedule(static)
         for (int64_t s = 0; s < unit.seeds; s++) pack(unit, s, packed.get() + s * room);
-        Scratch own = scratch(BLOCK * 4 * width);
+        Scratch own = scratch(5 * size);
+        std::fill(own.get(), own.get() + size, 0.0f);
 #pragma omp for schedule(static)
         for (int64_t task = 0; task < unit.shares.tasks; task++)
             unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                Weights weights(unit, packed.get() + seed * room);
-                int64_t rows = span.size();
-                std::fill(unit.memory(seed, 0, span.begin), unit.memory(seed, 0, span.end), 0.0f);
-                for (int64_t t = 0; t < unit.steps; t++) {
-                    float *gates = unit.gates ? unit.kept(seed, t, span.begin) : own.get();
-                    const float *before = unit.memory(seed, t, span.begin);
-                    product(rows, 3 * width, unit.inputs, unit.input(seed, t, span.begin), weights.input, 3 * width,
-                            weights.bias, false, gates, 4 * width);
-                    for (int64_t r = 0; r < rows; r++)
-                        std::copy(weights.bias + 3 * width, weights.bias + 4 * width, gates + (4 * r + 3) * width);
-                    if (t > 0)
-                        product(rows, 3 * width, unit.hidden, {before, width, 1}, weights.memory, 3 * width, nullptr,
-                                true, gates + width, 4 * width);
-                    advance(rows, width, gates, before, unit.memory(seed, t + 1, span.begin));
-                }
+                forward_block(unit, seed, span, Weights(unit, packed.get() + seed * room), own.get() + size, own.get());
             });
     }
 }
 
 // Compute the gradients by the parameters, [S, P] in their order, and by the inputs, [S, T, R, inputs], from that by the
-// memories, [S, T, R, H] with the steps given.
-void gru_backward(const Unit *given, const float *by_memories, const int64_t *by_strides, float *by_parameters,
+// memories.
+void gru_backward(const Unit *given, const float *by_memories, const int64_t *strides, float *by_parameters,
                   float *by_inputs) {
     const Layout unit(*given);
-    int64_t width = unit.width, room = Weights::room(unit), below = padded(unit.inputs);
-    int64_t turned_room = 3 * width * (below + width), tasks = unit.shares.tasks;
-    Scratch turned = scratch(unit.seeds * turned_room), sums = scratch(tasks * room);
+    const Gradients gradients{by_memories, strides, by_inputs};
+    int64_t width = unit.width, room = Weights::room(unit), below = padded(unit.inputs), size = BLOCK * width;
+    int64_t turned_room = 3 * width * (below + width), count = 3 * unit.hidden * (unit.inputs + unit.hidden + 2);
+    Scratch turned = scratch(unit.seeds * turned_room), sums = scratch(unit.shares.tasks * room);
 #pragma omp parallel num_threads(unit.shares.busy)
     {
 #pragma omp for schedule(static)
-        for (int64_t s = 0; s < unit.seeds; s++) {
-            float *input = turned.get() + s * turned_room, *memory = input + 3 * width * below;
-            std::fill(input, input + turned_room, 0.0f);
-            const float *weight = unit.parameter(0, s), *recurrent = unit.parameter(2, s);
-            Packing{unit.hidden, width, GATE}.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
-                input[k * below + r] = weight[r * 3 * unit.hidden + c];
-            });
-            Packing{unit.hidden, width, INNER}.each(unit.hidden, [&](int64_t r, int64_t c, int64_t k) {
-                memory[k * width + r] = recurrent[r * 3 * unit.hidden + c];
-            });
-        }
-        Scratch own = scratch(BLOCK * (5 * width + below));
-        float *carry = own.get(), *d = carry + BLOCK * width, *by_x = d + BLOCK * 4 * width;
+        for (int64_t s = 0; s < unit.seeds; s++) turn(unit, s, turned.get() + s * turned_room);
+        Scratch own = scratch(6 * size + BLOCK * below);
+        std::fill(own.get(), own.get() + size, 0.0f);
 #pragma omp for schedule(static)
-        for (int64_t task = 0; task < tasks; task++) {
+        for (int64_t task = 0; task < unit.shares.tasks; task++) {
             float *sum = sums.get() + task * room;
             std::fill(sum, sum + room, 0.0f);
             unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                const float *input = turned.get() + seed * turned_room, *memory = input + 3 * width * below;
-                int64_t rows = span.size();
-                std::fill(carry, carry + rows * width, 0.0f);
-                for (int64_t t = unit.steps - 1; t >= 0; t--) {
-                    const float *above =
-                        by_memories + seed * by_strides[0] + t * by_strides[1] + span.begin * by_strides[2];
-                    for (int64_t r = 0; r < rows; r++)
-                        for (int64_t h = 0; h < unit.hidden; h++) carry[r * width + h] += above[r * by_strides[2] + h];
-                    const float *before = unit.memory(seed, t, span.begin);
-                    Matrix x = unit.input(seed, t, span.begin);
-                    pull(rows, width, unit.kept(seed, t, span.begin), before, carry, d);
-                    learn(unit, Weights(unit, sum), x, before, rows, d);
-                    product(rows, below, 3 * width, {d, 4 * width, 1}, input, below, nullptr, false, by_x, below);
-                    float *to = by_inputs + ((seed * unit.steps + t) * unit.rows + span.begin) * unit.inputs;
-                    copy(rows, unit.inputs, {by_x, below, 1}, to, unit.inputs, 1);
-                    if (unit.truncation && t % unit.truncation == 0)
-                        std::fill(carry, carry + rows * width, 0.0f);
-                    else
-                        product(rows, width, 3 * width, {d + width, 4 * width, 1}, memory, width, nullptr, true, carry,
-                                width);
-                }
+                backward_block(unit, seed, span, gradients, turned.get() + seed * turned_room, Weights(unit, sum),
+                               own.get() + size, own.get());
             });
         }
-        int64_t hidden = unit.hidden, count = 3 * hidden * (unit.inputs + hidden + 2);
 #pragma omp for schedule(static)
-        for (int64_t s = 0; s < unit.seeds; s++) {
-            float *weight = by_parameters + s * count, *bias = weight + unit.inputs * 3 * hidden;
-            float *recurrent = bias + 3 * hidden, *inner_bias = recurrent + hidden * 3 * hidden;
-            std::fill(weight, weight + count, 0.0f);
-            for (int64_t part = 0; part < unit.shares.parts; part++) {
-                Weights sum(unit, sums.get() + (s * unit.shares.parts + part) * room);
-                Packing gates{hidden, width, GATE}, inner{hidden, width, INNER};
-                gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
-                    weight[r * 3 * hidden + c] += sum.input[r * 3 * width + k];
-                });
-                gates.each(1, [&](int64_t, int64_t c, int64_t k) { bias[c] += sum.bias[k]; });
-                inner.each(hidden, [&](int64_t r, int64_t c, int64_t k) {
-                    recurrent[r * 3 * hidden + c] += sum.memory[r * 3 * width + k];
-                });
-                inner.each(1, [&](int64_t, int64_t c, int64_t k) { inner_bias[c] += sum.bias[width + k]; });
-            }
-        }
+        for (int64_t s = 0; s < unit.seeds; s++)
+            add_up(unit, sums.get() + s * unit.shares.parts * room, by_parameters + s * count);
     }
 }
 

@@ -43,7 +43,7 @@ class CompiledUnroll:
         num_seeds, num_steps, num_rows, num_inputs = x.shape
         hidden = given[2].shape[1]
         width = -(-hidden // PADDING) * PADDING
-        memories = x.new_empty(num_seeds, 1 + num_steps, num_rows, width)
+        memories = x.new_empty(num_seeds, num_steps, num_rows, width)
         gates = x.new_empty(num_seeds, num_steps, num_rows, 4 * width) if keep else None
         self._arguments = _Unit(
             num_seeds,
@@ -62,7 +62,7 @@ class CompiledUnroll:
         )
         self._alive, self._shapes = (x, given, memories, gates), [p.shape[1:] for p in parameters]
         library().gru_forward(ctypes.byref(self._arguments))
-        self.memories = memories[:, 1:, :, :hidden]
+        self.memories = memories[..., :hidden]
 
     def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return the gradients by x and by the parameters of what has this gradient by the memories."""

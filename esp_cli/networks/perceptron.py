@@ -154,7 +154,7 @@ class _Perceptron(Function):
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
         ctx.num_inputs, ctx.run = num_inputs, passed(shape, tensors[:num_inputs], tensors[num_inputs:])
         ctx.save_for_backward(*tensors[num_inputs:])  # so that autograd notices a change of them
-        return ctx.run.outputs
+        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]

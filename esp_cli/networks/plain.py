@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig, Pull
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 
 
@@ -124,4 +125,10 @@ class GRU(Network):
         batch, num_steps = x.shape[1:3]
         in_time_order = x.transpose(1, 2).flatten(1, 2)
         rows = self.gru.unroll(self.body(in_time_order).unflatten(1, (num_steps, batch)), truncation).flatten(1, 2)
-        return self.head(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
+        return self._said(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
+
+    def _said(self, rows: Tensor) -> Tensor:
+        """Return the outputs for memories [S, B, H]."""
+        if not self.gru.compiled:
+            return self.head(rows)
+        return perceptron(Shape("relu", False, torch.float32, compiled=True), [rows], [*self.head.parameters()])

@@ -136,7 +136,7 @@ class _CompiledUnrolled(Function):
     def forward(ctx, x, truncation, *layers):  # type: ignore[no-untyped-def]
         ctx.run = CompiledUnroll(x, layers, truncation, keep=True)
         ctx.save_for_backward(x, *layers)  # so that autograd notices a change of them
-        return ctx.run.memories
+        return ctx.run.memories.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]

@@ -1,15 +1,22 @@
 """Learners learn the same with the kernels, and a missing compiler is told."""
 
+import gc
+import weakref
+
 import pytest
+import torch
 from typer.testing import CliRunner
 
 from esp_cli.app import app
 from esp_cli.kernels import library
+from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.plain import MlpConfig
+from esp_cli.networks.recurrent import SeedGRU
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_cli.training.loading import load_policy, single_seed
 from tests.kernels.compiler import needs_compiler
+from tests.networks.test_layers import generators
 
 
 @needs_compiler
@@ -77,3 +84,22 @@ def test_a_compiler_that_fails_and_one_that_makes_no_library_are_told(tmp_path, 
 def test_bfloat16_and_the_kernel_exclude_each_other():
     with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
         MlpConfig(compiled=True, precision="bfloat16")
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("kind", ["perceptron", "recurrent"])
+def test_what_a_pass_keeps_goes_with_its_outputs(kind, compiled):
+    """Not with the next visit of the garbage collector: until then a learner would fill gigabytes."""
+    x = torch.randn(1, 8, 5, 4, requires_grad=True)
+    perceptron = SeedMLP(generators(0), (4, 6, 3), "relu", 1.0, activate_output=True, compiled=compiled)
+    unit = SeedGRU(generators(0), 4, 6, compiled)
+    gc.collect()
+    gc.disable()
+    try:
+        outputs = perceptron(x.flatten(1, 2)) if kind == "perceptron" else unit.unroll(x)
+        kept = weakref.ref(outputs.grad_fn)
+        assert kept() is not None
+        del outputs
+        assert kept() is None
+    finally:
+        gc.enable()
