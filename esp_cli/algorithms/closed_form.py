@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.kernels import policy_gradient as kernels
+from esp_cli.kernels.library import computes
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
 
@@ -95,7 +96,7 @@ def policy_gradient(
     maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
     action, old_log_prob, advantage = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
     parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1))
-    found = _policy_gradient_compiled if compiled and logits.device.type == "cpu" else _policy_gradient
+    found = _policy_gradient_compiled if computes(compiled, logits) else _policy_gradient
     gradient = found(parts, maps, action, old_log_prob, advantage, weights)
     return gradient.flatten(2).transpose(1, 2).view(logits.shape)
 

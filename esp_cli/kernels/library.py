@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
+from torch import Tensor
+
 _SOURCES = sorted(Path(__file__).parent.glob("*.cpp"))
 _OPTIONS = ("-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-std=gnu++17")
 _ARGUMENTS = {
@@ -26,6 +28,11 @@ _ARGUMENTS = {
 
 PADDING = 16
 """PAD of vectors.h."""
+
+
+def computes(compiled: bool, x: Tensor) -> bool:
+    """Return whether kernels compute what begins with x, where they are chosen: on the CPU."""
+    return compiled and x.device.type == "cpu"
 
 
 @cache

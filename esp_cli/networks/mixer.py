@@ -10,6 +10,7 @@ from torch.autograd import Function
 from torch.nn.functional import elu_
 
 from esp_cli.kernels import mixer
+from esp_cli.kernels.library import computes
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
 
@@ -49,7 +50,7 @@ class MonotonicMixer(nn.Module):
             values [S, ..., N], state [S, ..., state width] -> [S, ...].
         """
         own, seen = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in (values, state))
-        if self.hypernetwork.compiled and seen.device.type == "cpu":
+        if computes(self.hypernetwork.compiled, seen):
             total = _CompiledMixed.apply(own.contiguous(), self.hypernetwork(seen), self.width)  # type: ignore[no-untyped-call]
             return total.view(values.shape[:-1])
         size = max(1, CACHED_ROWS // values.shape[0])

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from esp_cli.kernels.library import computes
 from esp_cli.kernels.perceptron import CompiledPass
 
 CACHED_ROWS = 4096
@@ -52,7 +53,7 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
-    if _runs_compiled(shape, inputs):
+    if computes(shape.compiled, inputs[0]):
         return _compiled(shape, inputs, parameters, keep=False).outputs
     if shape.precision != torch.float32:
         parameters = [p.to(shape.precision) for p in parameters]
@@ -61,11 +62,7 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
 def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
     """Return a pass with a backward to call by hand; arguments as of `perceptron`."""
-    return (_compiled if _runs_compiled(shape, inputs) else Pass)(shape, inputs, parameters)
-
-
-def _runs_compiled(shape: Shape, inputs: Sequence[Tensor]) -> bool:
-    return shape.compiled and inputs[0].device.type == "cpu"
+    return (_compiled if computes(shape.compiled, inputs[0]) else Pass)(shape, inputs, parameters)
 
 
 def _compiled(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> CompiledPass:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 
+from esp_cli.kernels.library import computes
 from esp_cli.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
 from esp_cli.networks.perceptron import activate_
@@ -50,7 +51,7 @@ class SeedGRU(nn.Module):
         gradients through time are cut every `truncation` steps (0: never).
         """
         layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
-        if self.compiled and x.device.type == "cpu":
+        if computes(self.compiled, x):
             if torch.is_grad_enabled():
                 return _CompiledUnrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
             return CompiledUnroll(x, layers, truncation, keep=False).memories
