@@ -30,6 +30,11 @@ PADDING = 16
 """PAD of vectors.h."""
 
 
+def fields(kind: type, *names: str) -> list[tuple[str, type]]:
+    """Return fields of a structure that are all of one kind."""
+    return [(name, kind) for name in names]
+
+
 def computes(compiled: bool, x: Tensor) -> bool:
     """Return whether kernels compute what begins with x, where they are chosen: on the CPU."""
     return compiled and x.device.type == "cpu"

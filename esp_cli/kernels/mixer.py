@@ -7,13 +7,13 @@ import ctypes
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import library
+from esp_cli.kernels.library import fields, library
 
 
 class _Mixer(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("seeds", "rows", "agents", "width", "threads")),
-        *((name, ctypes.c_void_p) for name in ("own", "weights")),
+        *fields(ctypes.c_int64, "seeds", "rows", "agents", "width", "threads"),
+        *fields(ctypes.c_void_p, "own", "weights"),
     )
 
     @classmethod

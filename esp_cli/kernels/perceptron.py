@@ -9,21 +9,18 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import PADDING, library
+from esp_cli.kernels.library import PADDING, fields, library
 
 
 class _Perceptron(ctypes.Structure):
     _fields_ = (
-        *(
-            (name, ctypes.c_int64)
-            for name in ("seeds", "rows", "layers", "tanh", "activate_output", "threads", "stride")
-        ),
-        *((name, ctypes.c_void_p) for name in ("widths", "parameters", "strides", "inputs", "hidden")),
+        *fields(ctypes.c_int64, "seeds", "rows", "layers", "tanh", "activate_output", "threads", "stride"),
+        *fields(ctypes.c_void_p, "widths", "parameters", "strides", "inputs", "hidden"),
     )
 
 
 class _Outputs(ctypes.Structure):
-    _fields_ = (("at", ctypes.c_void_p), *((name, ctypes.c_int64) for name in ("seed", "row", "column")))
+    _fields_ = (("at", ctypes.c_void_p), *fields(ctypes.c_int64, "seed", "row", "column"))
 
     @classmethod
     def of(cls, x: Tensor) -> _Outputs:

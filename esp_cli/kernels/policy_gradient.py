@@ -7,26 +7,15 @@ import ctypes
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import library
+from esp_cli.kernels.library import fields, library
 
 
 class _Policy(ctypes.Structure):
     _fields_ = (
-        *(
-            (name, ctypes.c_int64)
-            for name in (
-                "seeds",
-                "rows",
-                "parts",
-                "actions",
-                "threads",
-                "augments",
-                "moves_originals",
-                "moves_copies",
-            )
-        ),
-        *((name, ctypes.c_float) for name in ("clip_epsilon", "entropy_coef", "gap")),
-        *((name, ctypes.c_void_p) for name in ("logits", "orders", "action", "old_log_prob", "advantage", "gradient")),
+        *fields(ctypes.c_int64, "seeds", "rows", "parts", "actions", "threads"),
+        *fields(ctypes.c_int64, "augments", "moves_originals", "moves_copies"),
+        *fields(ctypes.c_float, "clip_epsilon", "entropy_coef", "gap"),
+        *fields(ctypes.c_void_p, "logits", "orders", "action", "old_log_prob", "advantage", "gradient"),
     )
 
 

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import PADDING, library
+from esp_cli.kernels.library import PADDING, fields, library
 
 
 class _Unit(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("seeds", "steps", "rows", "inputs", "hidden", "truncation", "threads")),
+        *fields(ctypes.c_int64, "seeds", "steps", "rows", "inputs", "hidden", "truncation", "threads"),
         ("x_strides", ctypes.c_int64 * 3),
         ("x", ctypes.c_void_p),
         ("parameters", ctypes.c_void_p * 4),
