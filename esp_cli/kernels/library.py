@@ -30,6 +30,11 @@ PADDING = 16
 """PAD of vectors.h."""
 
 
+def padded(width: int) -> int:
+    """Return a width filled up to a multiple of PADDING."""
+    return -(-width // PADDING) * PADDING
+
+
 def fields(kind: type, *names: str) -> list[tuple[str, type]]:
     """Return fields of a structure that are all of one kind."""
     return [(name, kind) for name in names]

@@ -12,7 +12,7 @@ namespace {
 
 // ---- Activations
 
-static void activate(float *x, int64_t count, bool tanh) {
+void activate(float *x, int64_t count, bool tanh) {
     for (int64_t i = 0; i < count; i += LANES) {
         Vec v = vec(x + i);
         vec(x + i) = tanh ? tanh_of(v) : v < 0.0f ? Vec{} : v;
@@ -20,7 +20,7 @@ static void activate(float *x, int64_t count, bool tanh) {
 }
 
 // Multiply a gradient by the slope of the activation, read off its output y.
-static void times_slope(float *gradient, const float *y, int64_t count, bool tanh) {
+void times_slope(float *gradient, const float *y, int64_t count, bool tanh) {
     for (int64_t i = 0; i < count; i += LANES) {
         Vec g = vec(gradient + i), v = vec(y + i);
         vec(gradient + i) = tanh ? g - g * v * v : v <= 0.0f ? Vec{} : g;
@@ -76,7 +76,7 @@ struct Layout : Perceptron {
 };
 
 // Copy a seed's weights and biases, layer after layer, as [in + 1, padded(out)].
-static void pack(const Layout &net, int64_t seed, float *to) {
+void pack(const Layout &net, int64_t seed, float *to) {
     for (int64_t k = 0; k < net.layers; k++) {
         int64_t width = padded(net.out(k));
         for (int64_t i = 0; i <= net.in(k); i++, to += width) {
@@ -88,7 +88,7 @@ static void pack(const Layout &net, int64_t seed, float *to) {
 }
 
 // Pass a block of rows through all layers, whose parameters are packed.
-static void pass(const Layout &net, int64_t seed, Span span, const float *weight, const Outputs &outputs, float *own) {
+void pass(const Layout &net, int64_t seed, Span span, const float *weight, const Outputs &outputs, float *own) {
     Matrix from = net.read(0, seed, span.begin);
     for (int64_t k = 0; k < net.layers; k++) {
         int64_t width = padded(net.out(k));
@@ -105,7 +105,7 @@ static void pass(const Layout &net, int64_t seed, Span span, const float *weight
 }
 
 // Copy a seed's weights, layer after layer, as [out, padded(in)].
-static void turn(const Layout &net, int64_t seed, float *to) {
+void turn(const Layout &net, int64_t seed, float *to) {
     for (int64_t k = 0; k < net.layers; k++)
         for (int64_t o = 0; o < net.out(k); o++, to += padded(net.in(k))) {
             for (int64_t i = 0; i < net.in(k); i++) to[i] = net.weight(k, seed)[i * net.out(k) + o];
@@ -114,7 +114,7 @@ static void turn(const Layout &net, int64_t seed, float *to) {
 }
 
 // Set, or add to, the gradients of a layer's weight and bias from what it reads and the gradient by what it gives.
-static void learn(const Layout &net, int64_t k, Matrix read, const float *here, int64_t rows, bool add, float *sum) {
+void learn(const Layout &net, int64_t k, Matrix read, const float *here, int64_t rows, bool add, float *sum) {
     int64_t width = padded(net.out(k));
     if (net.turned(k))
         product(net.out(k), read.row, rows, {here, 1, width}, read.at, read.row, nullptr, add, sum, read.row);
@@ -129,7 +129,7 @@ static void learn(const Layout &net, int64_t k, Matrix read, const float *here, 
 }
 
 // Pull the gradient by a block of outputs back through all layers; the weights, turned, and the sums end there.
-static void pull(const Layout &net, int64_t seed, Span span, bool add, const Outputs &by_outputs, const float *weight,
+void pull(const Layout &net, int64_t seed, Span span, bool add, const Outputs &by_outputs, const float *weight,
                  float *sum, float *by_inputs, float *own) {
     float *here = own, *next = own + BLOCK * net.widest;
     int64_t last = net.out(net.layers - 1);
@@ -153,7 +153,7 @@ static void pull(const Layout &net, int64_t seed, Span span, bool add, const Out
 }
 
 // Add the sums of a seed's parts to its gradients [P].
-static void add_up(const Layout &net, const float *from, float *gradients) {
+void add_up(const Layout &net, const float *from, float *gradients) {
     for (int64_t part = 0; part < net.shares.parts; part++) {
         float *to = gradients;
         for (int64_t k = 0; k < net.layers; k++) {
@@ -178,17 +178,14 @@ void forward(const Perceptron *given, const Outputs *outputs) {
     int64_t room = 0;
     for (int64_t k = 0; k < net.layers; k++) room += (net.in(k) + 1) * padded(net.out(k));
     Scratch packed = scratch(net.seeds * room);
-#pragma omp parallel num_threads(net.shares.busy)
-    {
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < net.seeds; s++) pack(net, s, packed.get() + s * room);
-        Scratch own = scratch(2 * BLOCK * net.widest);
-#pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.shares.tasks; task++)
+    share_out(
+        net.shares, 0, 2 * BLOCK * net.widest, [&](int64_t s) { pack(net, s, packed.get() + s * room); },
+        [&](int64_t task, float *own) {
             net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                pass(net, seed, span, packed.get() + seed * room, *outputs, own.get());
+                pass(net, seed, span, packed.get() + seed * room, *outputs, own);
             });
-    }
+        },
+        [](int64_t) {});
 }
 
 // Compute the gradients by the parameters, [S, P] in their order, and by the inputs, [S, R, in], unless they are null.
@@ -203,22 +200,18 @@ void backward(const Perceptron *given, const Outputs *by_outputs, float *by_para
     int64_t sum_count = by_parameters ? net.shares.tasks * sum_room : 0;
     Scratch turned = scratch(net.seeds * turned_room), sums = scratch(sum_count);
     if (net.rows == 0) std::fill(sums.get(), sums.get() + sum_count, 0.0f);
-#pragma omp parallel num_threads(net.shares.busy)
-    {
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < net.seeds; s++) turn(net, s, turned.get() + s * turned_room);
-        Scratch own = scratch(2 * BLOCK * net.widest);
-#pragma omp for schedule(static)
-        for (int64_t task = 0; task < net.shares.tasks; task++)
+    share_out(
+        net.shares, 0, 2 * BLOCK * net.widest, [&](int64_t s) { turn(net, s, turned.get() + s * turned_room); },
+        [&](int64_t task, float *own) {
             net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool add) {
                 float *sum = by_parameters ? sums.get() + (task + 1) * sum_room : nullptr;
                 const float *weight = turned.get() + (seed + 1) * turned_room;
-                pull(net, seed, span, add, *by_outputs, weight, sum, by_inputs, own.get());
+                pull(net, seed, span, add, *by_outputs, weight, sum, by_inputs, own);
             });
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < (by_parameters ? net.seeds : 0); s++)
-            add_up(net, sums.get() + s * net.shares.parts * sum_room, by_parameters + s * count);
-    }
+        },
+        [&](int64_t s) {
+            if (by_parameters) add_up(net, sums.get() + s * net.shares.parts * sum_room, by_parameters + s * count);
+        });
 }
 
 }

@@ -9,7 +9,7 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import PADDING, fields, library
+from esp_cli.kernels.library import PADDING, fields, library, padded
 
 
 class _Perceptron(ctypes.Structure):
@@ -63,7 +63,7 @@ class CompiledPass:
         self._shapes = [p.shape[1:] for p in parameters]
         self._count = sum((a + 1) * b for a, b in pairwise(widths))
         activated = widths[1:] if activate_output else widths[1:-1]
-        room = sum(-(-width // PADDING) * PADDING for width in activated) if keep else 0
+        room = sum(map(padded, activated)) if keep else 0
         given, hidden = [_with_whole_rows(p.detach()) for p in parameters], x.new_empty(x.shape[0] * x.shape[1] * room)
         tables = (
             (ctypes.c_int64 * len(widths))(*widths),

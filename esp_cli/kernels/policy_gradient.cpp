@@ -32,7 +32,7 @@ struct Rows {
 };
 
 // Set log_prob [A] and prob [A] of a part.
-static void softmax(const Rows &rows, int64_t part, Vec *log_prob, Vec *prob) {
+void softmax(const Rows &rows, int64_t part, Vec *log_prob, Vec *prob) {
     int64_t actions = rows.policy.actions;
     Vec most = load(rows.policy.logits + rows.at(part, 0), rows.count), sum = {};
     for (int64_t a = 0; a < actions; a++) {
@@ -52,7 +52,7 @@ static void softmax(const Rows &rows, int64_t part, Vec *log_prob, Vec *prob) {
 }
 
 // Return the slope of PPO's objective by the log-probability of what was done.
-static Vec surrogate_slope(const Rows &rows, Vec log_prob) {
+Vec surrogate_slope(const Rows &rows, Vec log_prob) {
     const Policy &policy = rows.policy;
     Vec ratio = exp_of(log_prob - rows.data(policy.old_log_prob)), advantage = rows.data(policy.advantage);
     Vec gain = ratio * advantage;
@@ -62,7 +62,7 @@ static Vec surrogate_slope(const Rows &rows, Vec log_prob) {
 }
 
 // Set the gradient by the log-probabilities of a part, and pull it back to its logits; log_prob and prob are [P, A].
-static void pull(const Rows &rows, int64_t part, const Vec *log_prob, const Vec *prob, Vec *gradient) {
+void pull(const Rows &rows, int64_t part, const Vec *log_prob, const Vec *prob, Vec *gradient) {
     const Policy &policy = rows.policy;
     int64_t actions = policy.actions;
     const Vec *own = log_prob + part * actions, *likely = prob + part * actions;

@@ -211,18 +211,14 @@ void gru_forward(const Unit *given) {
     const Layout unit(*given);
     int64_t room = Weights::room(unit), size = BLOCK * unit.width;
     Scratch packed = scratch(unit.seeds * room);
-#pragma omp parallel num_threads(unit.shares.busy)
-    {
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < unit.seeds; s++) pack(unit, s, packed.get() + s * room);
-        Scratch own = scratch(5 * size);
-        std::fill(own.get(), own.get() + size, 0.0f);
-#pragma omp for schedule(static)
-        for (int64_t task = 0; task < unit.shares.tasks; task++)
+    share_out(
+        unit.shares, size, 4 * size, [&](int64_t s) { pack(unit, s, packed.get() + s * room); },
+        [&](int64_t task, float *own) {
             unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                forward_block(unit, seed, span, Weights(unit, packed.get() + seed * room), own.get() + size, own.get());
+                forward_block(unit, seed, span, Weights(unit, packed.get() + seed * room), own + size, own);
             });
-    }
+        },
+        [](int64_t) {});
 }
 
 // Compute the gradients by the parameters, [S, P] in their order, and by the inputs, [S, T, R, inputs], from that by the
@@ -234,25 +230,18 @@ void gru_backward(const Unit *given, const float *by_memories, const int64_t *st
     int64_t width = unit.width, room = Weights::room(unit), below = padded(unit.inputs), size = BLOCK * width;
     int64_t turned_room = 3 * width * (below + width), count = 3 * unit.hidden * (unit.inputs + unit.hidden + 2);
     Scratch turned = scratch(unit.seeds * turned_room), sums = scratch(unit.shares.tasks * room);
-#pragma omp parallel num_threads(unit.shares.busy)
-    {
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < unit.seeds; s++) turn(unit, s, turned.get() + s * turned_room);
-        Scratch own = scratch(6 * size + BLOCK * below);
-        std::fill(own.get(), own.get() + size, 0.0f);
-#pragma omp for schedule(static)
-        for (int64_t task = 0; task < unit.shares.tasks; task++) {
+    share_out(
+        unit.shares, size, 5 * size + BLOCK * below,
+        [&](int64_t s) { turn(unit, s, turned.get() + s * turned_room); },
+        [&](int64_t task, float *own) {
             float *sum = sums.get() + task * room;
             std::fill(sum, sum + room, 0.0f);
             unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                backward_block(unit, seed, span, gradients, turned.get() + seed * turned_room, Weights(unit, sum),
-                               own.get() + size, own.get());
+                const float *input = turned.get() + seed * turned_room;
+                backward_block(unit, seed, span, gradients, input, Weights(unit, sum), own + size, own);
             });
-        }
-#pragma omp for schedule(static)
-        for (int64_t s = 0; s < unit.seeds; s++)
-            add_up(unit, sums.get() + s * unit.shares.parts * room, by_parameters + s * count);
-    }
+        },
+        [&](int64_t s) { add_up(unit, sums.get() + s * unit.shares.parts * room, by_parameters + s * count); });
 }
 
 }

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import PADDING, fields, library
+from esp_cli.kernels.library import fields, library, padded
 
 
 class _Unit(ctypes.Structure):
@@ -42,7 +42,7 @@ class CompiledUnroll:
         given = [p.detach() if p[0].is_contiguous() else p.detach().contiguous() for p in parameters]
         num_seeds, num_steps, num_rows, num_inputs = x.shape
         hidden = given[2].shape[1]
-        width = -(-hidden // PADDING) * PADDING
+        width = padded(hidden)
         memories = x.new_empty(num_seeds, num_steps, num_rows, width)
         gates = x.new_empty(num_seeds, num_steps, num_rows, 4 * width) if keep else None
         self._arguments = _Unit(

@@ -5,7 +5,6 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
-#include <cstring>
 #include <memory>
 #include <utility>
 
@@ -17,8 +16,8 @@ constexpr int LANES = 8, VECTORS = 2;
 #else
 constexpr int LANES = 4, VECTORS = 4;
 #endif
-constexpr int TILE = 6;         // rows of a product whose sums stay in registers, VECTORS of them each
-constexpr int64_t PAD = 16;     // widths are filled up with zeros to a multiple of this
+constexpr int TILE = 6;      // rows of a product whose sums stay in registers, VECTORS of them each
+constexpr int64_t PAD = 16;  // widths are filled up with zeros to a multiple of this
 constexpr int64_t MOST_PARTS = 16;
 
 typedef float Vec __attribute__((vector_size(LANES * 4), aligned(4), may_alias));
@@ -79,6 +78,24 @@ struct Shares {
         for (int64_t b = 0; b < count; b++) use(task / parts, part.part(b, count), b > 0);
     }
 };
+
+// Let threads do something for each seed, work on each task with scratch of their own, whose first `zeros` numbers are
+// 0, and do something for each seed again.
+template <class Before, class Work, class After>
+static void share_out(const Shares &shares, int64_t zeros, int64_t room, Before before, Work work, After after) {
+    int64_t seeds = shares.tasks / shares.parts;
+#pragma omp parallel num_threads(shares.busy)
+    {
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < seeds; s++) before(s);
+        Scratch own = scratch(zeros + room);
+        std::fill(own.get(), own.get() + zeros, 0.0f);
+#pragma omp for schedule(static)
+        for (int64_t task = 0; task < shares.tasks; task++) work(task, own.get());
+#pragma omp for schedule(static)
+        for (int64_t s = 0; s < seeds; s++) after(s);
+    }
+}
 
 // ---- Products
 

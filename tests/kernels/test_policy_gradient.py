@@ -8,17 +8,8 @@ import torch
 
 from esp_cli.algorithms.closed_form import Weights, policy_gradient
 from esp_cli.symmetry import transform_set
-from esp_envs import Field, Kind, Spaces, layout
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
+from tests.algorithms.test_closed_form import SPACES
 from tests.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
-
-SPACES = Spaces(
-    num_agents=2,
-    observation=layout(Field("velocity", Kind.VECTOR)),
-    state=layout(Field("velocity", Kind.VECTOR)),
-    action=Discrete(Kind.VECTOR, (RIGHT, UP, LEFT, DOWN), ("right", "up", "left", "down")),
-    symmetry="d4",
-)
 
 
 def rows(num_seeds, count, transforms, spread=1.0):
