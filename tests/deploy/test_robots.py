@@ -34,12 +34,12 @@ class Team:
         self.start = self.env.reset()
         settings = self.env.settings
         robots = (1, settings.num_agents)
-        pose = torch.cat([self.env._position, self.env._heading.unsqueeze(-1)], -1).numpy()
-        self.pillars = self.env._pillars.numpy()
+        pose = np.concatenate([self.env._position, self.env._heading[..., None]], -1)
+        self.pillars = self.env._pillars
         self.physics = make_physics(settings.physics, settings.arena, 1, settings.control_period_s)
         ones = np.ones(robots)
         self.physics.place(Bodies(pose, np.zeros_like(pose), self.pillars, ones, ones))
-        self.goals = self.env._goals[0].numpy()
+        self.goals = self.env._goals[0]
 
     @property
     def poses(self) -> np.ndarray:
@@ -110,7 +110,7 @@ def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: 
         assert np.allclose(seen, team.env._seen().obs[0, 0].numpy(), atol=1e-6)
         wheels = pilot.wheels(team.poses, team.goals, team.pillars[0])
         action = alone.policy.act(team.env._seen().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
-        expected = team.env._wheel_speeds(action)[0].numpy()
+        expected = team.env._wheel_speeds(action)[0]
         assert np.allclose(wheels, expected, atol=1e-4)
         assert np.abs(wheels).max() <= MAX_WHEEL_SPEED + 1e-6
         assert np.allclose(pilot.twist(wheels), np.stack(drive(wheels), -1))

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,8 +18,8 @@ from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, format
 from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
-from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED
-from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, nearest, nearness, within
+from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
+from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
 
@@ -92,93 +93,91 @@ class Formation(LockstepTask):
             settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
         )
         robots = (self.num_worlds, settings.num_agents)
-        self._pairs = torch.tensor(WHEEL_PAIRS.points, dtype=torch.float64)
-        posts = torch.from_numpy(self.arena.posts()).expand(*robots, 2)
-        self._goals = -posts
-        self._pillars = torch.from_numpy(self.arena.pillars()).repeat(self.num_worlds, 1, 1)
-        self._mass = self._friction = torch.ones(robots, dtype=torch.float64)
-        self._wheel_factor = torch.ones(*robots, 2, dtype=torch.float64)
-        self._pending = torch.zeros(settings.action_delay, *robots, 2, dtype=torch.float64)
-        self._arrived = torch.zeros(robots, dtype=torch.bool)
-        others = settings.num_agents + settings.num_obstacles
-        self._own = torch.eye(settings.num_agents, others, dtype=torch.bool)
+        self._posts = np.broadcast_to(self.arena.posts(), (*robots, 2))
+        self._pairs = np.array(WHEEL_PAIRS.points)
+        self._goals, self._pillars = -self._posts, self._pillars_of_the_arena()
+        self._mass = self._friction = np.ones(robots)
+        self._wheel_factor = np.ones((*robots, 2))
+        self._pending = np.zeros((settings.action_delay, *robots, 2))
+        self._arrived = np.zeros(robots, bool)
+        bodies = settings.num_agents + settings.num_obstacles
+        self._own = np.eye(settings.num_agents, bodies, dtype=bool)
         radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
-        self._reach = torch.tensor(radii, dtype=torch.float64) + BODY_RADIUS_M
+        self._reach = np.array(radii) + BODY_RADIUS_M
         self._contact = self._reach + CONTACT_GAP_M
-        pose = torch.cat([posts, torch.zeros(*robots, 1, dtype=torch.float64)], -1)
-        self._place(pose, torch.zeros_like(pose))
+        pose = np.concatenate([self._posts, np.zeros((*robots, 1))], -1)
+        self._place(pose, np.zeros_like(pose))
+
+    def _pillars_of_the_arena(self) -> Array:
+        return np.tile(self.arena.pillars(), (self.num_worlds, 1, 1))
 
     def _begin(self) -> None:
         settings = self.settings
-        posts = torch.from_numpy(self.arena.posts())
         draws = [self._draw_episode(generator) for generator in self.generators]
-        noise, heading, factor, mass, friction = (torch.cat(parts) for parts in zip(*draws, strict=True))
-        self._goals = (-posts).repeat(self.num_worlds, 1, 1)
-        self._pillars = torch.from_numpy(self.arena.pillars()).repeat(self.num_worlds, 1, 1)
+        noise, heading, factor, mass, friction = (np.concatenate(parts) for parts in zip(*draws, strict=True))
+        self._goals, self._pillars = -self._posts, self._pillars_of_the_arena()
         self._wheel_factor = 1 + settings.wheel_mismatch * factor
         self._mass = 1 + settings.mass_spread * mass
         self._friction = 1 + settings.friction_spread * friction
-        pose = torch.cat([posts + settings.start_noise_m * noise, math.pi * heading.unsqueeze(-1)], -1)
-        self._place(pose, torch.zeros_like(pose))
+        pose = np.concatenate([self._posts + settings.start_noise_m * noise, math.pi * heading[..., None]], -1)
+        self._place(pose, np.zeros_like(pose))
 
-    def _draw_episode(self, generator: torch.Generator) -> tuple[Tensor, ...]:
+    def _draw_episode(self, generator: torch.Generator) -> tuple[Array, ...]:
         """Draw all random numbers of the starts of one seed: uniform in [-1, 1], wheel factors normal."""
         robots = (self.num_envs, self.settings.num_agents)
 
-        def uniform(*shape: int) -> Tensor:
+        def uniform(*shape: int) -> Array:
             drawn = torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device)
-            return drawn.cpu() * 2 - 1
+            return (drawn * 2 - 1).cpu().numpy()
 
         start, heading = uniform(2), uniform()
-        factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu()
+        factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu().numpy()
         return start, heading, factor, uniform(), uniform()
 
-    def _place(self, pose: Tensor, velocity: Tensor) -> None:
+    def _place(self, pose: Array, velocity: Array) -> None:
         """Begin an episode with the robots here."""
-        self._pending.zero_()
-        parts = (pose, velocity, self._pillars, self._mass, self._friction)
-        self.physics.place(Bodies(*(part.numpy() for part in parts)))
-        self._arrived.zero_()
+        self._pending[:], self._arrived[:] = 0, False
+        self.physics.place(Bodies(pose, velocity, self._pillars, self._mass, self._friction))
         self._look()
         self._touching = self._apart < self._contact
 
     def _play(self, action: Tensor) -> Outcome:
         before, distance_before = self._position, self._distance
-        self.physics.advance(self._wheel_speeds(action).numpy())
+        self.physics.advance(self._wheel_speeds(action))
         self._look()
         reward = step_reward(self.settings, distance_before - self._distance, self._apart)
         ended = self._time + 1 == self.spec.horizon
-        metrics = self._measure((self._position - before).norm(dim=-1), ended)
-        return self._per_world(reward), {name: self._per_world(value) for name, value in metrics.items()}
+        metrics = self._measure(length(self._position - before), ended)
+        values = torch.from_numpy(np.array([*metrics.values()], np.float32))
+        values = values.view(-1, self.num_seeds, self.num_envs).to(self.device)
+        return self._per_world(reward), dict(zip(metrics, values, strict=True))
 
-    def _wheel_speeds(self, action: Tensor) -> Tensor:
+    def _wheel_speeds(self, action: Tensor) -> Array:
         """Return what the wheels really do [W, N, 2], rad/s."""
-        if self.settings.actions == "discrete":
-            chosen = self._pairs[action.cpu().reshape(self.num_worlds, -1)]
-        else:
-            chosen = action.double().cpu().reshape(self.num_worlds, -1, 2).clamp(-1, 1)
+        rows = action.cpu().numpy().reshape(self.num_worlds, self.settings.num_agents, -1)
+        chosen = self._pairs[rows[..., 0]] if self.settings.actions == "discrete" else np.clip(rows, -1, 1, dtype=float)
         if self.settings.action_delay:
-            waiting = torch.cat([self._pending, chosen.unsqueeze(0)])
+            waiting = np.concatenate([self._pending, chosen[None]])
             chosen, self._pending = waiting[0], waiting[1:]
         speeds = chosen * self._wheel_factor * MAX_WHEEL_SPEED
         if self.settings.slope:
-            speeds = speeds * (1 - self.settings.slope * self._heading.cos().unsqueeze(-1) * speeds.sign())
+            speeds *= 1 - self.settings.slope * self._direction[..., :1] * np.sign(speeds)
         if self.settings.lame_wheel:
             speeds[:, 0, 0] *= 1 - self.settings.lame_wheel
         return speeds
 
     def _look(self) -> None:
         """Measure where everything is: distances to goals, ways and distances between bodies."""
-        pose = torch.from_numpy(self.physics.pose)
-        self._position, self._heading = pose[..., :2].contiguous(), pose[..., 2]
+        pose = self.physics.pose
+        self._position, self._heading = pose[..., :2], pose[..., 2]
+        self._direction = _direction(self._heading)
         self._to_goal = self._goals - self._position
-        self._distance = self._to_goal.norm(dim=-1)
-        bodies = torch.cat([self._position, self._pillars], 1)
-        self._ways = bodies.unsqueeze(1) - self._position.unsqueeze(2)
-        # hypot: MKL's square root wakes threads for a handful of numbers and took a third of a step
-        self._apart = torch.hypot(*self._ways.unbind(-1)).masked_fill_(self._own, torch.inf)
+        self._distance = length(self._to_goal)
+        self._ways = np.concatenate([self._position, self._pillars], 1)[:, None] - self._position[:, :, None]
+        self._apart = length(self._ways)
+        self._apart[:, self._own] = np.inf
 
-    def _measure(self, way: Tensor, ended: bool) -> dict[str, Tensor]:
+    def _measure(self, way: Array, ended: bool) -> dict[str, Array]:
         """Return the metrics of the step just made, each [W]; `way` [W, N] is what every robot drove in it, m."""
         here = self._distance < self.settings.arrival_radius_m
         new, self._arrived = here & ~self._arrived, here | self._arrived
@@ -189,73 +188,73 @@ class Formation(LockstepTask):
 
     def _seen(self) -> Observation:
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
-        heading, offsets = self._heading, [self._to_goal.unsqueeze(2)]
+        offsets = [self._to_goal[:, :, None]]
         if pillars:
             offsets.append(nearest(self._apart[..., robots:], self._ways[:, :, robots:], 1))
         if self.settings.seen_robots:
             offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
-        seen = torch.cat(offsets, 2)
+        seen, direction = np.concatenate(offsets, 2), self._direction
         blind = self.settings.blind_sector_rad
         hidden = in_sector(seen[:, :, 1:], blind) if blind else None
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
-            heading, seen = self._disturbed(heading, seen)
+            heading, seen = self._disturbed(seen)
+            direction = _direction(heading + self.settings.heading_offset_rad)
+        elif self.settings.heading_offset_rad:
+            direction = _direction(self._heading + self.settings.heading_offset_rad)
         if hidden is not None:
-            seen[:, :, 1:] = seen[:, :, 1:].masked_fill(hidden, 0.0)
-        if self.settings.heading_offset_rad:
-            heading = heading + self.settings.heading_offset_rad
-        direction = torch.stack([heading.cos(), heading.sin()], -1)
-        goal, pillar, others = seen.split([1, min(pillars, 1), self.settings.seen_robots], 2)
+            seen[:, :, 1:][hidden] = 0
+        goal, pillar, others = np.split(seen, [1, 1 + min(pillars, 1)], 2)
         if self.settings.goal_sight_m is not None:
             goal = within(goal, self.settings.goal_sight_m)
         if self.settings.seen_as == "nearness":
             pillar = nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
             others = nearness(others, 2 * BODY_RADIUS_M)
-        obs = torch.cat([direction, pillar.flatten(2), goal.flatten(2), others.flatten(2)], -1)
-        return Observation(self._per_world(obs), self._per_world(self._state()))
+        obs = np.concatenate([direction[:, :, None], pillar, goal, others], 2)
+        return Observation(self._per_world(obs).flatten(3), self._per_world(self._state()))
 
-    def _state(self) -> Tensor:
+    def _state(self) -> Array:
         """Return the global state [W, state width]."""
-        heading, velocity = self._heading, torch.from_numpy(self.physics.velocity)
-        direction = torch.stack([heading.cos(), heading.sin()], -1)
-        rows = (direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
-        return torch.cat([part.flatten(1) for part in rows], 1)
+        velocity = self.physics.velocity
+        rows = (self._direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
+        return np.concatenate([part.reshape(self.num_worlds, -1) for part in rows], 1)
 
-    def _disturbed(self, heading: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
+    def _disturbed(self, seen: Array) -> tuple[Array, Array]:
         """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
         shape = (self.num_envs, self.settings.num_agents, 1 + 2 * seen.shape[2])
         draws = (torch.randn(shape, generator=g, dtype=torch.float64, device=self.device) for g in self.generators)
-        noise = torch.cat([drawn.cpu() for drawn in draws])
-        offsets = noise[..., 1:].unflatten(-1, (-1, 2)) * self.settings.sensor_noise_m
-        return heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
+        noise = np.concatenate([drawn.cpu().numpy() for drawn in draws])
+        offsets = noise[..., 1:].reshape(seen.shape) * self.settings.sensor_noise_m
+        return self._heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
 
-    def _per_world(self, values: Tensor) -> Tensor:
+    def _per_world(self, values: Array) -> Tensor:
         """Return float32 [S, E, ...] on the task's device from [W, ...]."""
-        shaped = values.float().view(self.num_seeds, self.num_envs, *values.shape[1:])
-        return shaped.contiguous().to(self.device)
+        shaped = torch.from_numpy(values.astype(np.float32)).view(self.num_seeds, self.num_envs, *values.shape[1:])
+        return shaped.to(self.device)
 
     def _put(self, state: Tensor) -> None:
         """Write a state, with nominal masses, grip and wheels."""
-        rows = state.double().cpu().reshape(self.num_worlds, -1)
+        rows = state.double().cpu().numpy().reshape(self.num_worlds, -1)
         where = self.spec.state.slices()
 
-        def items(name: str) -> Tensor:
-            return rows[:, where[name]].unflatten(1, (-1, 2))
+        def items(name: str) -> Array:
+            return rows[:, where[name]].reshape(self.num_worlds, -1, 2).copy()
 
         heading = items("heading")
-        pose = torch.cat([items("position"), torch.atan2(heading[..., 1], heading[..., 0]).unsqueeze(-1)], -1)
-        velocity = torch.cat([items("velocity"), rows[:, where["spin"]].unsqueeze(-1)], -1)
-        self._goals = items("goals").clone()
+        pose = np.concatenate([items("position"), np.arctan2(heading[..., 1:], heading[..., :1])], -1)
+        velocity = np.concatenate([items("velocity"), rows[:, where["spin"], None]], -1)
+        self._goals = items("goals")
         if self.settings.num_obstacles:
-            self._pillars = items("obstacles").clone()
-        self._mass = self._friction = torch.ones_like(self._mass)
-        self._wheel_factor = torch.ones_like(self._wheel_factor)
+            self._pillars = items("obstacles")
+        self._mass = self._friction = np.ones_like(self._mass)
+        self._wheel_factor = np.ones_like(self._wheel_factor)
         self._place(pose, velocity)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return physics, clock, memory of the metrics, what this episode drew, and generators."""
-        own = {name: getattr(self, f"_{name}").clone() for name in _REMEMBERED}
-        physics = {f"physics.{name}": torch.from_numpy(array) for name, array in self.physics.state_dict().items()}
-        return own | physics | {"time": torch.tensor(self._time), "generators": generator_states(self.generators)}
+        arrays = {name: getattr(self, f"_{name}").copy() for name in _REMEMBERED}
+        arrays |= {f"physics.{name}": array for name, array in self.physics.state_dict().items()}
+        own = {name: torch.from_numpy(array) for name, array in arrays.items()}
+        return own | {"time": torch.tensor(self._time), "generators": generator_states(self.generators)}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned.
@@ -268,7 +267,7 @@ class Formation(LockstepTask):
         if {k: v.shape for k, v in tensors.items()} != {k: v.shape for k, v in own.items()}:
             raise ValueError(OTHER_SIZE)
         for name in _REMEMBERED:
-            setattr(self, f"_{name}", tensors[name].clone())
+            setattr(self, f"_{name}", tensors[name].numpy().copy())
         self.physics.load_state_dict(physics)
         self._time = int(tensors["time"])
         restore_generators(self.generators, tensors["generators"])
@@ -283,8 +282,8 @@ class Formation(LockstepTask):
         wheels = steering.towards(wish, self._heading, self.settings.control_period_s)
         lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
         if self.settings.actions == "discrete":
-            return nearest_pair(wheels).view(lead).to(self.device)
-        return wheels.float().view(*lead, 2).to(self.device)
+            return nearest_pair(torch.from_numpy(wheels)).view(lead).to(self.device)
+        return self._per_world(wheels)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return goals, pillars and robots of one world (seed index, world index)."""
@@ -294,3 +293,8 @@ class Formation(LockstepTask):
     def painter(self, size: int) -> AbstractContextManager[Painter]:
         """Open the view in space, with pictures `size` pixels wide."""
         return open_painter(size)
+
+
+def _direction(heading: Array) -> Array:
+    """Return unit vectors [..., 2] in the direction of headings [...]."""
+    return np.stack([np.cos(heading), np.sin(heading)], -1)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
 from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.robot import BODY_RADIUS_M
+from esp_envs.epuck.robot import BODY_RADIUS_M, Array
+
+Flags = NDArray[np.bool_]
 
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""
@@ -13,7 +16,7 @@ CONTACT_GAP_M = 0.001
 """Gap below which two bodies count as touching."""
 
 
-def step_reward(settings: FormationSettings, progress: Tensor, apart: Tensor) -> Tensor:
+def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> Array:
     """Return g_i + c_i: [W, N].
 
     Args:
@@ -22,19 +25,19 @@ def step_reward(settings: FormationSettings, progress: Tensor, apart: Tensor) ->
         apart: [W, N, N + M] distances of the centres to all robots and pillars, m.
     """
     near = apart < settings.radius
-    count = near.any(-1).double() if settings.penalty_counts == "any" else near.sum(-1).double()
+    count = near.any(-1) if settings.penalty_counts == "any" else near.sum(-1)
     return settings.progress_weight * progress - settings.penalty * count
 
 
 def step_metrics(
     settings: FormationSettings,
-    new: Tensor,
-    arrived: Tensor,
-    begun: Tensor,
-    apart: Tensor,
-    way: Tensor,
-    final_distance: Tensor,
-) -> dict[str, Tensor]:
+    new: Flags,
+    arrived: Flags,
+    begun: Flags,
+    apart: Array,
+    way: Array,
+    final_distance: Array,
+) -> dict[str, Array]:
     """Return the metrics of a step, each [W].
 
     Args:
@@ -49,10 +52,10 @@ def step_metrics(
     robots = settings.num_agents
     risky = apart[..., :robots] < RISKY_GAP_M + 2 * BODY_RADIUS_M
     return {
-        "arrival_rate": new.double().mean(-1),
-        "time_to_arrival_s": (~arrived).double().mean(-1) * settings.control_period_s,
+        "arrival_rate": new.mean(-1),
+        "time_to_arrival_s": (~arrived).mean(-1) * settings.control_period_s,
         "collisions": begun[..., :robots].sum((1, 2)) / 2 + begun[..., robots:].sum((1, 2)),
-        "risky_rate": risky.any(-1).any(-1).double(),
+        "risky_rate": risky.any((1, 2)),
         "path_length_m": way.mean(-1),
         "final_distance_m": final_distance.mean(-1),
     }

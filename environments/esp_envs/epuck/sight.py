@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.robot import BODY_RADIUS_M
+from esp_envs.epuck.measures import Flags
+from esp_envs.epuck.robot import BODY_RADIUS_M, Array
 from esp_envs.scene import COLORS, Body, Scene
 
 FADING_M = 0.2
@@ -14,7 +14,12 @@ FADING_M = 0.2
 _PILLAR_COLOR = "#707070"
 
 
-def nearest(apart: Tensor, ways: Tensor, count: int) -> Tensor:
+def length(offset: Array) -> Array:
+    """Return the lengths [...] of offsets [..., 2]."""
+    return np.hypot(offset[..., 0], offset[..., 1])
+
+
+def nearest(apart: Array, ways: Array, count: int) -> Array:
     """Return the offsets [W, N, count, 2] of the nearest bodies, nearest first.
 
     Args:
@@ -22,33 +27,34 @@ def nearest(apart: Tensor, ways: Tensor, count: int) -> Tensor:
         ways: [W, N, B, 2] offsets of the centres, m.
         count: of bodies.
     """
-    index = apart.argmin(-1, keepdim=True) if count == 1 else apart.argsort(dim=-1, stable=True)[..., :count]
-    return ways.gather(2, index.unsqueeze(-1).expand(*index.shape, 2))
+    index = apart.argmin(-1)[..., None] if count == 1 else np.argsort(apart, -1, kind="stable")[..., :count]
+    worlds, robots = np.arange(len(apart))[:, None, None], np.arange(apart.shape[1])[:, None]
+    return ways[worlds, robots, index]
 
 
-def nearness(offset: Tensor, reach_m: float) -> Tensor:
+def nearness(offset: Array, reach_m: float) -> Array:
     """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
 
     Args:
         offset: [..., 2] between the centres, m.
         reach_m: distance of the centres where the bodies touch.
     """
-    distance = offset.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    return offset / distance * torch.exp(-(distance - reach_m).clamp(min=0) / FADING_M)
+    distance = np.maximum(length(offset), 1e-9)[..., None]
+    return offset / distance * np.exp(-np.maximum(distance - reach_m, 0) / FADING_M)
 
 
-def in_sector(offset: Tensor, width_rad: float) -> Tensor:
-    """Return which offsets [..., 2] lie in the sector of this width around the direction of x, [..., 1]."""
-    return torch.atan2(offset[..., 1:], offset[..., :1]).abs() < width_rad / 2
+def in_sector(offset: Array, width_rad: float) -> Flags:
+    """Return which offsets [..., 2] lie in the sector of this width around the direction of x, [...]."""
+    return np.abs(np.arctan2(offset[..., 1], offset[..., 0])) < width_rad / 2
 
 
-def within(offset: Tensor, unit_m: float) -> Tensor:
+def within(offset: Array, unit_m: float) -> Array:
     """Return offsets [..., 2] in a unit of length, those that are longer than one cut to one."""
-    return offset / offset.norm(dim=-1, keepdim=True).clamp_min(unit_m)
+    return offset / np.maximum(length(offset), unit_m)[..., None]
 
 
 def formation_scene(
-    settings: FormationSettings, goals: Tensor, pillars: Tensor, position: Tensor, heading: Tensor
+    settings: FormationSettings, goals: Array, pillars: Array, position: Array, heading: Array
 ) -> Scene:
     """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
     bodies = []

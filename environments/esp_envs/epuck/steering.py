@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import math
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from esp_envs.epuck.robot import MAX_SPEED_M_S, MAX_SPIN_RAD_S
+from esp_envs.epuck.robot import MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array
+from esp_envs.epuck.sight import length
 
 SIGHT_M = 0.25
 """Gap between bodies below which one gives way to the other; this and the weights below were found by search."""
@@ -20,7 +20,7 @@ SWERVE = 1.5
 """Weight of passing a near body on the right."""
 
 
-def towards(wish: Tensor, heading: Tensor, control_period_s: float) -> Tensor:
+def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
     """Return wheel speeds that turn to a wished way and drive along it.
 
     Args:
@@ -31,16 +31,16 @@ def towards(wish: Tensor, heading: Tensor, control_period_s: float) -> Tensor:
     Returns:
         [W, N, 2] left and right in [-1, 1].
     """
-    error = torch.atan2(wish[..., 1], wish[..., 0]) - heading
-    error = torch.remainder(error + math.pi, 2 * math.pi) - math.pi
-    length = wish.norm(dim=-1) / (MAX_SPEED_M_S * control_period_s)
-    moves = length > 0.1
-    turn = (error / (MAX_SPIN_RAD_S * control_period_s)).clamp(-1, 1) * moves
-    speed = length.clamp(max=1) * error.cos().clamp(min=0) * (1 - turn.abs()) * moves
-    return torch.stack([speed - turn, speed + turn], -1)
+    error = np.arctan2(wish[..., 1], wish[..., 0]) - heading
+    error = np.remainder(error + math.pi, 2 * math.pi) - math.pi
+    reach = length(wish) / (MAX_SPEED_M_S * control_period_s)
+    moves = reach > 0.1
+    turn = np.clip(error / (MAX_SPIN_RAD_S * control_period_s), -1, 1) * moves
+    speed = np.minimum(reach, 1) * np.maximum(np.cos(error), 0) * (1 - np.abs(turn)) * moves
+    return np.stack([speed - turn, speed + turn], -1)
 
 
-def give_way(to_goal: Tensor, to_bodies: Tensor, gaps: Tensor) -> Tensor:
+def give_way(to_goal: Array, to_bodies: Array, gaps: Array) -> Array:
     """Return the way [W, N, 2] that keeps clear of near bodies: away from them, and past them on the right.
 
     Args:
@@ -48,15 +48,14 @@ def give_way(to_goal: Tensor, to_bodies: Tensor, gaps: Tensor) -> Tensor:
         to_bodies: [W, N, B, 2] from each robot's centre to the centre of every other body, m.
         gaps: [W, N, B] between their surfaces, m; infinite for a robot and itself.
     """
-    nearness = (1 - gaps.clamp(min=0) / SIGHT_M).clamp(min=0)
-    away = -to_bodies / to_bodies.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    distance = to_goal.norm(dim=-1, keepdim=True)
-    ahead = to_goal / distance.clamp_min(1e-9)
+    nearness = np.maximum(1 - np.maximum(gaps, 0) / SIGHT_M, 0)
+    away = -to_bodies / np.maximum(length(to_bodies), 1e-9)[..., None]
+    distance = length(to_goal)[..., None]
+    ahead = to_goal / np.maximum(distance, 1e-9)
     # Only what lies ahead has to be passed; what lies behind is left by driving on.
-    facing = (-(away * ahead.unsqueeze(-2)).sum(-1)).clamp(min=0)
-    right = torch.stack([-away[..., 1], away[..., 0]], -1)
-    push = PUSH * (nearness.square().unsqueeze(-1) * away).sum(-2)
-    swerve = SWERVE * ((nearness * facing).unsqueeze(-1) * right).sum(-2)
-    pull = ahead * (distance / SIGHT_M).clamp(max=1)
-    wish = pull + push + swerve * (distance / SIGHT_M).clamp(max=1)
-    return wish * SIGHT_M
+    facing = np.maximum(-(away * ahead[:, :, None]).sum(-1), 0)
+    right = np.stack([-away[..., 1], away[..., 0]], -1)
+    push = PUSH * (np.square(nearness)[..., None] * away).sum(-2)
+    swerve = SWERVE * ((nearness * facing)[..., None] * right).sum(-2)
+    here = np.minimum(distance / SIGHT_M, 1)
+    return (ahead * here + push + swerve * here) * SIGHT_M
