@@ -1,4 +1,4 @@
-"""The kernels, compiled for the processor at hand and loaded."""
+"""Kernels, compiled for the processor at hand and loaded."""
 
 from __future__ import annotations
 
@@ -8,22 +8,17 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 from torch import Tensor
 
-_SOURCES = sorted(Path(__file__).parent.glob("*.cpp"))
-_OPTIONS = ("-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-std=gnu++17")
+_OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
 _ARGUMENTS = {
-    "forward": 2,
-    "backward": 4,
-    "gru_forward": 1,
-    "gru_backward": 5,
-    "mix_forward": 2,
-    "mix_backward": 4,
-    "policy_gradient": 1,
+    "perceptron": {"forward": 2, "backward": 4},
+    "recurrent": {"gru_forward": 1, "gru_backward": 5},
+    "mixer": {"mix_forward": 2, "mix_backward": 4},
+    "policy_gradient": {"policy_gradient": 1},
 }
 
 PADDING = 16
@@ -46,8 +41,8 @@ def computes(compiled: bool, x: Tensor) -> bool:
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """Compile the kernels, which takes two seconds, in a temporary folder, and load them.
+def library(name: str) -> ctypes.CDLL:
+    """Compile a kernel, which takes up to a second, in a temporary folder, and load it.
 
     Raises:
         ValueError: there is no C++ compiler, it fails, or what it made cannot be loaded.
@@ -56,11 +51,13 @@ def library() -> ctypes.CDLL:
     if shutil.which(compiler[0]) is None:
         raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
     with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / "kernels.so"
-        objects = [str(built.with_name(f"{source.stem}.o")) for source in _SOURCES]
-        each = [("-c", str(source), "-o", to) for source, to in zip(_SOURCES, objects, strict=True)]
-        _run(*([*compiler, *_OPTIONS, *options] for options in each))
-        _run([*compiler, *_OPTIONS, "-shared", *objects, "-o", str(built)])
+        built = Path(folder) / f"{name}.so"
+        command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(built)]
+        compiling = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
+        if compiling.returncode:
+            said = compiling.stderr
+            line = next((line for line in said.splitlines() if "error" in line), said.strip())
+            raise ValueError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
         try:
             loaded = ctypes.CDLL(str(built))
         except OSError as error:
@@ -68,20 +65,6 @@ def library() -> ctypes.CDLL:
                 f"the kernels of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
                 "may run from, or leave it off"
             ) from None
-    for name, count in _ARGUMENTS.items():
-        getattr(loaded, name).argtypes = (ctypes.c_void_p,) * count  # else addresses would be cut to 32 bits
+    for function, count in _ARGUMENTS[name].items():
+        getattr(loaded, function).argtypes = (ctypes.c_void_p,) * count  # else addresses would be cut to 32 bits
     return loaded
-
-
-def _run(*commands: Sequence[str]) -> None:
-    """Run commands of the compiler side by side.
-
-    Raises:
-        ValueError: one fails.
-    """
-    running = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for command in commands]
-    errors = [process.communicate()[1] for process in running]
-    for command, process, said in zip(commands, running, errors, strict=True):
-        if process.returncode:
-            line = next((line for line in said.splitlines() if "error" in line), said.strip())
-            raise ValueError(f"{command[0]} does not compile the kernels of network.compiled: {line}")

@@ -30,7 +30,7 @@ def mix(own: Tensor, weights: Tensor, width: int) -> Tensor:
         width: M, hidden units.
     """
     total = own.new_empty(own.shape[:2])
-    library().mix_forward(ctypes.byref(_Mixer.of(own, weights, width)), total.data_ptr())
+    library("mixer").mix_forward(ctypes.byref(_Mixer.of(own, weights, width)), total.data_ptr())
     return total
 
 
@@ -38,5 +38,5 @@ def mix_backward(own: Tensor, weights: Tensor, width: int, grad: Tensor) -> tupl
     """Return the gradients by the agents' values and by the weights of what has this gradient by the team's values."""
     by_own, by_weights, grad = torch.empty_like(own), torch.empty_like(weights), grad.contiguous()
     pointers = (grad.data_ptr(), by_own.data_ptr(), by_weights.data_ptr())
-    library().mix_backward(ctypes.byref(_Mixer.of(own, weights, width)), *pointers)
+    library("mixer").mix_backward(ctypes.byref(_Mixer.of(own, weights, width)), *pointers)
     return by_own, by_weights

@@ -86,7 +86,7 @@ class CompiledPass:
         size = (x.shape[0], x.shape[1], widths[-1])
         columns_first = rows_innermost or widths[-1] < PADDING
         self.outputs = x.new_empty(size[0], size[2], size[1]).transpose(1, 2) if columns_first else x.new_empty(size)
-        library().forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
+        library("perceptron").forward(ctypes.byref(self._arguments), ctypes.byref(_Outputs.of(self.outputs)))
 
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
@@ -116,7 +116,7 @@ class CompiledPass:
 
     def _pull(self, grad: Tensor, found: Tensor | None, below: Tensor | None) -> None:
         """Write the gradients by all parameters [S, P] and by the inputs [S, B, in], where there is room for them."""
-        library().backward(
+        library("perceptron").backward(
             ctypes.byref(self._arguments),
             ctypes.byref(_Outputs.of(grad)),
             None if found is None else found.data_ptr(),

@@ -63,5 +63,5 @@ def policy_gradient(
         gap,
         *(x.data_ptr() for x in (*data, gradient)),
     )
-    library().policy_gradient(ctypes.byref(arguments))
+    library("policy_gradient").policy_gradient(ctypes.byref(arguments))
     return gradient

@@ -61,7 +61,7 @@ class CompiledUnroll:
             None if gates is None else gates.data_ptr(),
         )
         self._alive, self._shapes = (x, given, memories, gates), [p.shape[1:] for p in parameters]
-        library().gru_forward(ctypes.byref(self._arguments))
+        library("recurrent").gru_forward(ctypes.byref(self._arguments))
         self.memories = memories[..., :hidden]
 
     def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -71,7 +71,7 @@ class CompiledUnroll:
         sizes = [size.numel() for size in self._shapes]
         by_x, found = x.new_empty(x.shape), x.new_empty(x.shape[0], sum(sizes))
         strides = (ctypes.c_int64 * 3)(*grad.stride()[:3])
-        library().gru_backward(
+        library("recurrent").gru_backward(
             ctypes.byref(self._arguments), grad.data_ptr(), strides, found.data_ptr(), by_x.data_ptr()
         )
         parts = found.split(sizes, 1)

@@ -104,23 +104,26 @@ struct Matrix {
     int64_t row, column;  // steps to the next one
 };
 
+// Loops whose numbers have to stay in registers.
+#define UNROLLED _Pragma("GCC unroll 8")
+
 template <int M, int N>
 static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add, float *c,
                         int64_t c_row) {
     Vec sum[M][N];
-    for (int m = 0; m < M; m++)
-        for (int n = 0; n < N; n++)
+    UNROLLED for (int m = 0; m < M; m++)
+        UNROLLED for (int n = 0; n < N; n++)
             sum[m][n] = bias ? vec(bias + n * LANES) : add ? vec(c + m * c_row + n * LANES) : Vec{};
     for (int64_t k = 0; k < depth; k++) {
         Vec row[N];
-        for (int n = 0; n < N; n++) row[n] = vec(b + k * b_row + n * LANES);
-        for (int m = 0; m < M; m++) {
+        UNROLLED for (int n = 0; n < N; n++) row[n] = vec(b + k * b_row + n * LANES);
+        UNROLLED for (int m = 0; m < M; m++) {
             float factor = a.at[m * a.row + k * a.column];
-            for (int n = 0; n < N; n++) sum[m][n] += factor * row[n];
+            UNROLLED for (int n = 0; n < N; n++) sum[m][n] += factor * row[n];
         }
     }
-    for (int m = 0; m < M; m++)
-        for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
+    UNROLLED for (int m = 0; m < M; m++)
+        UNROLLED for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
 }
 
 template <int N>

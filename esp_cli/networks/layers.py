@@ -102,7 +102,7 @@ class SeedMLP(nn.Module):
         self.precision = precision
         self.compiled = compiled
         if self.compiled:
-            library()
+            library("perceptron")
         normed = sizes if activate_output else sizes[:-1]
         self.norms = nn.ModuleList(SeedLayerNorm(len(generators), w) for w in normed) if layer_norm else None
 
