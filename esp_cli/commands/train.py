@@ -116,6 +116,7 @@ def train(
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     from esp_cli.library.run import Run, begin, plan
+    from esp_cli.machine import resolve_device
     from esp_cli.trackers import require
     from esp_cli.training.config import resolve_config
     from esp_cli.training.initial import OwnCopy
@@ -155,15 +156,16 @@ def train(
         choices, overrides, said = with_file(context, config, choices, overrides)
     init_from = choices.pop("init_from")
     kept = init_from if isinstance(init_from, OwnCopy) else None
-    idle = said & resolve_config(**choices | {"device": "cpu"}, overrides=overrides).without_effect()
+    choices["device"] = resolve_device(choices["device"])
+    idle = said & resolve_config(**choices, overrides=overrides).without_effect()
     init_from = None if kept else init_from
     resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
     if kept is not None:
         resolved, weights = kept.start(resolved)
+    note_without_effect(idle)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    note_without_effect(idle)
     _train(begin(resolved, weights, out), trackers)
 
 

@@ -77,7 +77,7 @@ class RunConfig(Strict):
         idle = {
             "task": task.without_effect(),
             "prior": self.prior.without_effect() | of_others,
-            "network": self.network.without_effect(),
+            "network": self.network.without_effect() | ({"compiled"} if self.device == "cuda" else set()),
             self.algorithm: settings.without_effect(self.network, self._spec),
         }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)

@@ -84,6 +84,12 @@ def test_task_learner_and_network_name_the_settings_that_do_nothing_beside_the_o
     assert {name for name in config.without_effect() if not name.startswith("prior.")} == idle
 
 
+def test_kernels_for_the_processor_change_nothing_on_a_gpu():
+    config = resolve_config("navigation", "mappo")
+    assert "network.compiled" not in config.without_effect()
+    assert "network.compiled" in config.model_copy(update={"device": "cuda"}).without_effect()
+
+
 @pytest.mark.parametrize("kind", ["esp", "consistency"])
 def test_a_consistency_loss_of_the_policy_alone_is_refused_where_there_is_no_policy_to_compare(kind):
     asked = {"prior.terms": "policy", "prior.kind": kind}
