@@ -19,7 +19,7 @@ from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.folder_names import METRICS, TUNING
-from esp_cli.training.metrics import MetricsError, column, elapsed_s, read_metrics
+from esp_cli.training.metrics import column, elapsed_s, read_metrics
 
 Goal = Literal["return", "steps", "seconds"]
 SMOOTHED = 3
@@ -234,12 +234,16 @@ class TuningFolder(StudyFolder):
         return self.is_trained(cell)
 
     def curve(self, cell: Cell) -> list[Point]:
-        """Return the evaluations of a trial; none before it has begun."""
-        try:
-            rows = [row for row in read_metrics(self.run_path(cell) / METRICS) if "eval/return_greedy" in row]
-            steps, returns = column(rows, "eval/return_greedy")
-        except MetricsError:
+        """Return the evaluations of a trial; none before it has begun.
+
+        Raises:
+            MetricsError: its metrics are damaged.
+        """
+        path = self.run_path(cell) / METRICS
+        rows = [row for row in read_metrics(path) if "eval/return_greedy" in row] if path.exists() else []
+        if not rows:
             return []
+        steps, returns = column(rows, "eval/return_greedy")
         means = returns.mean(1).tolist()
         seconds = [elapsed_s(row) for row in rows]
         return [

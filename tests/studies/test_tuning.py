@@ -14,6 +14,7 @@ from esp_cli.studies.cost import Cost
 from esp_cli.studies.study import StudyError
 from esp_cli.studies.tuning import Point, Tuning, TuningFolder, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
+from esp_cli.training.metrics import MetricsError
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
@@ -190,6 +191,9 @@ def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
     assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
     assert [point.seconds for point in found] == [0.0, 1.0, 2.0, 3.0, 0.0], "a list is no number of seconds"
     assert folder.curve(folder.cell("esp", 4, {})) == []
+    (path / "metrics.jsonl").write_text('{"step": 0}\nno row\n{"step": 1}\n')
+    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2"):
+        folder.curve(cell)
 
 
 def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
