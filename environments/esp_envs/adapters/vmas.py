@@ -134,7 +134,7 @@ class VmasTask(Environment):
             ValueError: the action has another shape than [S, E, N, 2].
         """
         require_shape("joint action", action, self.action_shape)
-        force = action / action.norm(dim=-1, keepdim=True).clamp_min(1.0) * self._range.unsqueeze(-1)
+        force = self.spec.action.admissible(action) * self._range.unsqueeze(-1)
         reached, following, rewards, ends, measured = [], [], [], [], []
         self._time += 1
         due = self._time == self.spec.horizon

@@ -203,9 +203,8 @@ class ParticleTask(LockstepTask):
             chosen = (self._moves == self._directions).view(torch.int8)
             self._learner_control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
         else:
-            force = action.reshape(worlds, learners, 2)
-            length = force.norm(dim=-1, keepdim=True).clamp_min(1.0)
-            self._learner_control[:, :, :worlds] = (force / length).permute(1, 2, 0)
+            force = self.spec.action.admissible(action).reshape(worlds, learners, 2)
+            self._learner_control[:, :, :worlds] = force.permute(1, 2, 0)
         if self.settings.action_turn_rad:
             self._learner_control.copy_(_turned(self._learner_control, self.settings.action_turn_rad))
 
