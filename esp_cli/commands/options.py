@@ -59,7 +59,7 @@ def note_without_effect(names: Iterable[str]) -> None:
 def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dict[str, object]:
     """Read settings of the task alone, written as "task.name=value", and the shorthand `--physics`.
 
-    ["task.sensor_noise_m=0.005"], "pymunk" -> {"sensor_noise_m": 0.005, "physics": "pymunk"}.
+    ["task.sensor_noise_m=0.005"], "pymunk" -> {"sensor_noise_m": 0.005, "physics": "pymunk"}; a setting goes before it.
 
     Raises:
         ValueError: as `parse_assignments`, or a setting that is not the task's.

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from esp_cli.commands.counts import MAX_SEEDS, chosen_seeds, parse_count, parse_seed_list, parse_seeds
-from esp_cli.commands.options import parse_assignments
+from esp_cli.commands.options import parse_assignments, parse_task_settings
 from esp_cli.console import format_count
 
 
@@ -121,3 +121,10 @@ def test_assignments_are_json_where_they_can_be() -> None:
 def test_what_is_no_assignment_is_refused(items: list[str], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         parse_assignments(items)
+
+
+def test_settings_of_a_task_have_the_last_word_over_its_shorthand() -> None:
+    assert parse_task_settings(["task.wind=0.5"], "pymunk") == {"physics": "pymunk", "wind": 0.5}
+    assert parse_task_settings(["task.physics=mujoco-3d"], "pymunk") == {"physics": "mujoco-3d"}
+    with pytest.raises(ValueError, match=r"mappo\.gamma is not a setting of the task"):
+        parse_task_settings(["mappo.gamma=0.9"])

@@ -60,6 +60,8 @@ def test_drawn_actions_follow_their_generator() -> None:
     assert np.array_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0], drawn[2])
     assert len(np.unique(policy.act(obs))) == 1
+    with pytest.raises(ValueError, match="rng is 3; give a generator"):
+        policy.act(obs, 3)
 
 
 @pytest.mark.parametrize(
