@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from esp_cli.reporting.page import draw_over_strength
-from esp_cli.reporting.plots import Group, dots
+from esp_cli.reporting.plots import Group, appearance, dots
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.summary import floats
 
@@ -152,10 +156,32 @@ def draw_results() -> None:
             svg.unlink()
 
 
+def draw_peers() -> None:
+    """Draw the returns of training over steps and over seconds, each point the mean over 6000 steps."""
+    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
+    both = figure.subplots(1, 2, sharey=True)
+    runs = json.loads((MEASURED / "peers-spread.json").read_text(encoding="utf-8"))
+    for k, (name, rows) in enumerate(runs.items()):
+        points = np.array([np.mean([*block], 0) for _, block in groupby(rows, lambda row: (row[0] - 1) // 6000)])
+        colour, dashes = appearance(k)
+        for ax, x in zip(both, points.T, strict=False):
+            ax.plot(x, points[:, 2], color=colour, linestyle=dashes, label=name)
+    for ax, label in zip(both, ("environment steps", "seconds"), strict=True):
+        ax.set_xlabel(label)
+        ax.grid(alpha=0.4)
+        ax.spines[["top", "right"]].set_visible(False)
+    both[0].set_ylabel("return in training")
+    both[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+    both[1].set_xscale("log")
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))
+    figure.savefig(MEASURED / "peers-spread.png", dpi=150, metadata={"Software": None})
+
+
 def main() -> None:
     """Draw every figure."""
     draw_results()
     mpl.rcParams.update({"font.size": 9, "svg.hashsalt": "esp"})
+    draw_peers()
     for name, panels in FIGURES.items():
         heights = [len(table(panel)) + 2 for panel in panels]
         figure = Figure(figsize=(8.0, 0.25 * sum(heights)), layout="constrained")

@@ -6,14 +6,17 @@ The packages need an environment of their own:
     peers/bin/pip install --no-deps benchmarl==1.5.2
     peers/bin/pip install torch==2.13.0 torchrl==0.11.1 tensordict==0.11.0 "pettingzoo[mpe]==1.24.3" gymnasium==1.2.0 \
         hydra-core tqdm pyyaml
-    peers/bin/python tests/benchmarks/peers/benchmarl_spread.py --frames 300000 --seeds 0 1 2 --json spread.json
+    peers/bin/python tests/benchmarks/peers/benchmarl_spread.py --frames 300000 --seeds 0 --json spread.json
 
-The same task and the same convention here, for comparison:
+The same task and the same convention here, and both in one file:
 
-    esp train --algo mappo --task navigation --set task.convention=pettingzoo --steps 300k --seeds 3
+    OMP_NUM_THREADS=1 esp train --task navigation --set task.convention=pettingzoo --steps 300k --out runs/spread-esp
+    peers/bin/python tests/benchmarks/peers/benchmarl_spread.py --seeds 0 --json spread.json \
+        --beside MAPPO-ESP=runs/spread-esp
 
-Writes for each seed rows of frames, seconds since the start and the mean return of the training episodes: the sum of
-rewards over an episode, as the mean over agents. Goes on where it was when started again.
+Writes for each run rows of frames, seconds since the start and the mean return of the training episodes: the sum of
+rewards over an episode, as the mean over agents. Prints the mean over the last 6000 frames, which are one row of
+BenchMARL. Goes on where it was when started again.
 """
 
 from __future__ import annotations
@@ -67,20 +70,33 @@ def run(seed: int, frames: int) -> list[Row]:
     return record.rows
 
 
+def run_of_esp(folder: Path) -> list[Row]:
+    """Return the rows of a run folder of one seed."""
+    found = map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())
+    rows = [(row["step"], row["time/elapsed_s"], row["train/return"][0]) for row in found if "train/return" in row]
+    return [row for row in rows if row[2] is not None]
+
+
 def main() -> None:
-    """Run the seeds that are missing in the file, and print the last row of each."""
+    """Run the seeds that are missing in the file, and print how each run ends."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=300_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--beside", nargs="+", default=[], metavar="LABEL=RUN")
     parser.add_argument("--json", type=Path, default=Path("spread.json"))
     given = parser.parse_args()
     found: dict[str, list[Row]] = json.loads(given.json.read_text()) if given.json.exists() else {}
     for seed in given.seeds:
-        if str(seed) not in found:
-            found[str(seed)] = run(seed, given.frames)
+        name = f"BenchMARL, seed {seed}"
+        if name not in found:
+            found[name] = run(seed, given.frames)
             given.json.write_text(json.dumps(found))
-        frames, seconds, returns = found[str(seed)][-1]
-        print(f"seed {seed}: {returns:.2f} after {frames} frames and {seconds:.0f} s, {frames / seconds:.0f} frames/s")
+    found |= {label: run_of_esp(Path(folder)) for label, folder in (item.split("=", 1) for item in given.beside)}
+    given.json.write_text(json.dumps(found))
+    for name, rows in found.items():
+        frames, seconds, _ = rows[-1]
+        last = [row[2] for row in rows if row[0] > frames - 6000]
+        print(f"{name}: {sum(last) / len(last):.2f} after {frames} frames and {seconds:.1f} s")
 
 
 if __name__ == "__main__":
