@@ -193,16 +193,16 @@ class Formation(LockstepTask):
             offsets.append(nearest(self._apart[..., robots:], self._ways[:, :, robots:], 1))
         if self.settings.seen_robots:
             offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
-        seen, direction = np.concatenate(offsets, 2), self._direction
+        seen, heading = np.concatenate(offsets, 2), self._heading
         blind = self.settings.blind_sector_rad
         hidden = in_sector(seen[:, :, 1:], blind) if blind else None
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(seen)
-            direction = _direction(heading + self.settings.heading_offset_rad)
-        elif self.settings.heading_offset_rad:
-            direction = _direction(self._heading + self.settings.heading_offset_rad)
         if hidden is not None:
             seen[:, :, 1:][hidden] = 0
+        if self.settings.heading_offset_rad:
+            heading = heading + self.settings.heading_offset_rad
+        direction = self._direction if heading is self._heading else _direction(heading)
         goal, pillar, others = np.split(seen, [1, 1 + min(pillars, 1)], 2)
         if self.settings.goal_sight_m is not None:
             goal = within(goal, self.settings.goal_sight_m)
