@@ -95,7 +95,7 @@ class Formation(LockstepTask):
         robots = (self.num_worlds, settings.num_agents)
         self._posts = np.broadcast_to(self.arena.posts(), (*robots, 2))
         self._pairs = np.array(WHEEL_PAIRS.points)
-        self._goals, self._pillars = -self._posts, self._pillars_of_the_arena()
+        self._furnish()
         self._mass = self._friction = np.ones(robots)
         self._wheel_factor = np.ones((*robots, 2))
         self._pending = np.zeros((settings.action_delay, *robots, 2))
@@ -108,14 +108,15 @@ class Formation(LockstepTask):
         pose = np.concatenate([self._posts, np.zeros((*robots, 1))], -1)
         self._place(pose, np.zeros_like(pose))
 
-    def _pillars_of_the_arena(self) -> Array:
-        return np.tile(self.arena.pillars(), (self.num_worlds, 1, 1))
+    def _furnish(self) -> None:
+        """Put goals and pillars where the arena has them."""
+        self._goals, self._pillars = -self._posts, np.tile(self.arena.pillars(), (self.num_worlds, 1, 1))
 
     def _begin(self) -> None:
         settings = self.settings
         draws = [self._draw_episode(generator) for generator in self.generators]
         noise, heading, factor, mass, friction = (np.concatenate(parts) for parts in zip(*draws, strict=True))
-        self._goals, self._pillars = -self._posts, self._pillars_of_the_arena()
+        self._furnish()
         self._wheel_factor = 1 + settings.wheel_mismatch * factor
         self._mass = 1 + settings.mass_spread * mass
         self._friction = 1 + settings.friction_spread * friction

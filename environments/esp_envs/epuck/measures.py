@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.robot import BODY_RADIUS_M, Array
-
-Flags = NDArray[np.bool_]
+from esp_envs.epuck.robot import BODY_RADIUS_M, Array, Flags
 
 RISKY_GAP_M = 0.05
 """Gap between two robots below which a state is risky (supplement of the paper)."""

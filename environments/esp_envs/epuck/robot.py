@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 BODY_RADIUS_M = 0.037
 BODY_HEIGHT_M = 0.045

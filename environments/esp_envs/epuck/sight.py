@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.measures import Flags
-from esp_envs.epuck.robot import BODY_RADIUS_M, Array
+from esp_envs.epuck.robot import BODY_RADIUS_M, Array, Flags
 from esp_envs.scene import COLORS, Body, Scene
 
 FADING_M = 0.2

@@ -26,6 +26,7 @@ import json
 import tempfile
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -86,13 +87,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=Path("spread.json"))
     given = parser.parse_args()
     found: dict[str, list[Row]] = json.loads(given.json.read_text()) if given.json.exists() else {}
-    for seed in given.seeds:
-        name = f"BenchMARL, seed {seed}"
+    wanted = {f"BenchMARL, seed {seed}": partial(run, seed, given.frames) for seed in given.seeds}
+    wanted |= {name: partial(run_of_esp, Path(folder)) for name, folder in (x.split("=", 1) for x in given.beside)}
+    for name, rows in wanted.items():
         if name not in found:
-            found[name] = run(seed, given.frames)
-            given.json.write_text(json.dumps(found))
-    found |= {label: run_of_esp(Path(folder)) for label, folder in (item.split("=", 1) for item in given.beside)}
-    given.json.write_text(json.dumps(found))
+            found[name] = [(frames, round(seconds, 2), round(returns, 3)) for frames, seconds, returns in rows()]
+            given.json.write_text(json.dumps(found) + "\n")
     for name, rows in found.items():
         frames, seconds, _ = rows[-1]
         last = [row[2] for row in rows if row[0] > frames - 6000]
