@@ -175,8 +175,8 @@ class Maddpg(OffPolicyLearner):
         """Return what `reference_gradient` returns, by fewer operations; rows lie agent by agent, then part by part."""
         config, prior = self.config, self.prior.config
         obs = copies.rows.obs[:, :, :-1].permute(0, 3, 1, 2, 4)  # [S, N, B (1 + copies), T, D]
-        outputs, pull = self.policy.actor.traced(obs.flatten(1, 2))  # [S, N B (1 + copies), T, A]
-        parts = outputs.flatten(1, 2).transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
+        outputs, pull = self.policy.actor.traced(obs)  # [S, N, B (1 + copies), T, A]
+        parts = outputs.flatten(1, 3).transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
         learned = parts if copies.augments else parts[:, :, :, :1]
         drawn = draw(learned, noise)
 

@@ -17,7 +17,7 @@ _OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "
 _ARGUMENTS = {
     "perceptron": {"forward": 2, "backward": 4},
     "recurrent": {"gru_forward": 1, "gru_backward": 5},
-    "mixer": {"mix_forward": 2, "mix_backward": 4},
+    "mixer": {"mix_forward": 3, "mix_backward": 5},
     "policy_gradient": {"policy_gradient": 1},
 }
 

@@ -1,18 +1,16 @@
-// QMIX's mixer: mixer.py of the networks, one row after the other.
+// QMIX's mixer and its hypernetwork: mixer.py of the networks. The weights that the hypernetwork gives are used while
+// they are in a core's cache, and computed again on the way back.
 //
-// A row of weights is W_1 [N, M], b_1 [M], w_2 [M] and b_2, as the hypernetwork gives them.
+// A row of weights is W_1 [N, M], b_1 [M], w_2 [M] and b_2.
 
-#include "vectors.h"
-
-constexpr int64_t ROWS = 128;
+#include "perceptron.h"
 
 namespace {
 
 // What mixer.py fills in.
 struct Mixer {
-    int64_t seeds, rows, agents, width, threads;
-    const float *own;      // [S, R, N]
-    const float *weights;  // [S, R, N M + 2 M + 1]
+    int64_t agents, width;
+    const float *own;  // [S, R, N]
 };
 
 inline Vec size(Vec x) { return x < 0.0f ? -x : x; }
@@ -43,16 +41,31 @@ struct Units {
     }
 };
 
-template <class Use>
-void each_row(const Mixer &mixer, Use use) {  // use(row of all seeds', its values, its weights)
-    const Shares shares(mixer.seeds, mixer.rows, ROWS, mixer.threads);
-    int64_t each = (mixer.agents + 2) * mixer.width + 1;
-#pragma omp parallel for schedule(static) num_threads(shares.busy)
-    for (int64_t task = 0; task < shares.tasks; task++)
-        for (Span left = shares.of(task); left.size() > 0; left.begin++) {
-            int64_t row = task / shares.parts * mixer.rows + left.begin;
-            use(row, mixer.own + row * mixer.agents, mixer.weights + row * each, row * each);
+float mixed(const Mixer &mixer, const float *own, const float *weights) {
+    Vec parts = {};
+    for (int64_t m = 0; m < mixer.width; m += LANES) {
+        Units units{mixer, own, weights, m, std::min<int64_t>(LANES, mixer.width - m)};
+        parts += units.hidden() * size(units.at(units.second()));
+    }
+    return sum(parts) + weights[(mixer.agents + 2) * mixer.width];
+}
+
+// Put the gradient by the weights of a row in their place, and write that by the agents' values.
+void unmix(const Mixer &mixer, const float *own, float *weights, float above, float *by_own) {
+    std::fill(by_own, by_own + mixer.agents, 0.0f);
+    for (int64_t m = 0; m < mixer.width; m += LANES) {
+        Units units{mixer, own, weights, m, std::min<int64_t>(LANES, mixer.width - m)};
+        Vec hidden = units.hidden(), second = units.at(units.second());
+        Vec inner = size(second) * above * (hidden > 0.0f ? Vec{} + 1.0f : hidden + 1.0f);
+        store(sign(second) * above * hidden, weights + units.second(), units.count);
+        store(inner, weights + units.bias(), units.count);
+        for (int64_t n = 0; n < mixer.agents; n++) {
+            Vec first = units.at(units.first(n));
+            store(sign(first) * inner * own[n], weights + units.first(n), units.count);
+            by_own[n] += sum(size(first) * inner);
         }
+    }
+    weights[(mixer.agents + 2) * mixer.width] = above;
 }
 
 }  // namespace
@@ -60,36 +73,31 @@ void each_row(const Mixer &mixer, Use use) {  // use(row of all seeds', its valu
 extern "C" {
 
 // Compute the team's values [S, R].
-void mix_forward(const Mixer *mixer, float *total) {
-    each_row(*mixer, [=](int64_t row, const float *own, const float *weights, int64_t) {
-        Vec parts = {};
-        for (int64_t m = 0; m < mixer->width; m += LANES) {
-            Units units{*mixer, own, weights, m, std::min<int64_t>(LANES, mixer->width - m)};
-            parts += units.hidden() * size(units.at(units.second()));
+void mix_forward(const Perceptron *hypernetwork, const Mixer *mixer, float *total) {
+    const Layout net(*hypernetwork);
+    pass(net, [&](int64_t seed, Span span, Matrix weights) {
+        for (int64_t r = 0; r < span.size(); r++) {
+            int64_t row = seed * net.rows + span.begin + r;
+            total[row] = mixed(*mixer, mixer->own + row * mixer->agents, weights.at + r * weights.row);
         }
-        total[row] = sum(parts) + weights[(mixer->agents + 2) * mixer->width];
     });
 }
 
-// Compute the gradients by the agents' values and by the weights, of their shapes, from that by the team's values.
-void mix_backward(const Mixer *mixer, const float *by_total, float *by_own, float *by_weights) {
-    each_row(*mixer, [=](int64_t row, const float *own, const float *weights, int64_t at) {
-        float above = by_total[row], *by = by_weights + at, *by_value = by_own + row * mixer->agents;
-        std::fill(by_value, by_value + mixer->agents, 0.0f);
-        for (int64_t m = 0; m < mixer->width; m += LANES) {
-            Units units{*mixer, own, weights, m, std::min<int64_t>(LANES, mixer->width - m)};
-            Vec hidden = units.hidden(), second = units.at(units.second());
-            Vec inner = size(second) * above * (hidden > 0.0f ? Vec{} + 1.0f : hidden + 1.0f);
-            store(sign(second) * above * hidden, by + units.second(), units.count);
-            store(inner, by + units.bias(), units.count);
-            for (int64_t n = 0; n < mixer->agents; n++) {
-                Vec first = units.at(units.first(n));
-                store(sign(first) * inner * own[n], by + units.first(n), units.count);
-                by_value[n] += sum(size(first) * inner);
-            }
+// Compute the gradients by the hypernetwork's parameters and by the agents' values [S, R, N], from that by the team's.
+void mix_backward(const Perceptron *hypernetwork, const Mixer *mixer, const float *by_total, float *by_parameters,
+                  float *by_own) {
+    const Layout net(*hypernetwork);
+    const int64_t last = net.layers - 1, width = padded(net.out(last)), room = net.packed_room();
+    Scratch packed = scratch(net.seeds * room);
+    auto fill = [&](int64_t seed, Span span, float *to) {
+        const float *weight = packed.get() + (seed + 1) * room - (net.in(last) + 1) * width;
+        apply(net, last, span.size(), net.kept(last, seed, span.begin), weight, to);
+        for (int64_t r = 0; r < span.size(); r++) {
+            int64_t row = seed * net.rows + span.begin + r, first = row * mixer->agents;
+            unmix(*mixer, mixer->own + first, to + r * width, by_total[row], by_own + first);
         }
-        by[(mixer->agents + 2) * mixer->width] = above;
-    });
+    };
+    pull(net, by_parameters, Below{}, [&](int64_t s) { pack(net, s, packed.get() + s * room); }, fill);
 }
 
 }

@@ -1,42 +1,50 @@
-"""QMIX's mixer, compiled; see `networks.mixer`."""
+"""QMIX's mixer with its hypernetwork, compiled; see `networks.mixer`."""
 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from esp_cli.kernels.library import fields, library
+from esp_cli.kernels.perceptron import CompiledPass
 
 
 class _Mixer(ctypes.Structure):
-    _fields_ = (
-        *fields(ctypes.c_int64, "seeds", "rows", "agents", "width", "threads"),
-        *fields(ctypes.c_void_p, "own", "weights"),
-    )
-
-    @classmethod
-    def of(cls, own: Tensor, weights: Tensor, width: int) -> _Mixer:
-        return cls(*own.shape, width, torch.get_num_threads(), own.data_ptr(), weights.data_ptr())
+    _fields_ = (*fields(ctypes.c_int64, "agents", "width"), ("own", ctypes.c_void_p))
 
 
-def mix(own: Tensor, weights: Tensor, width: int) -> Tensor:
-    """Return the team's values [S, B].
+class CompiledMixer(CompiledPass):
+    """A pass through hypernetwork and mixer that keeps what its `unmix` needs.
 
     Args:
         own: [S, B, N] contiguous values of the agents.
-        weights: [S, B, N M + M + M + 1] contiguous W_1, b_1, w_2 and b_2 in every state.
+        inputs: parts of what the hypernetwork sees; see `CompiledPass`.
+        parameters: of the hypernetwork, two layers or more, whose outputs are W_1 [N M], b_1 [M], w_2 [M] and b_2.
         width: M, hidden units.
+        keep: whether there will be an `unmix`.
+
+    Attributes:
+        outputs: the team's values [S, B].
     """
-    total = own.new_empty(own.shape[:2])
-    library("mixer").mix_forward(ctypes.byref(_Mixer.of(own, weights, width)), total.data_ptr())
-    return total
 
+    def __init__(
+        self, own: Tensor, inputs: Sequence[Tensor], parameters: Sequence[Tensor], width: int, keep: bool
+    ) -> None:
+        self._own = own.detach()
+        self._mixer = _Mixer(own.shape[2], width, own.data_ptr())
+        super().__init__(inputs, parameters, "relu", False, keep=keep)
 
-def mix_backward(own: Tensor, weights: Tensor, width: int, grad: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the gradients by the agents' values and by the weights of what has this gradient by the team's values."""
-    by_own, by_weights, grad = torch.empty_like(own), torch.empty_like(weights), grad.contiguous()
-    pointers = (grad.data_ptr(), by_own.data_ptr(), by_weights.data_ptr())
-    library("mixer").mix_backward(ctypes.byref(_Mixer.of(own, weights, width)), *pointers)
-    return by_own, by_weights
+    def unmix(self, grad: Tensor, learns: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
+        """Return the gradients by the agents' values and by the parameters that learn."""
+        by_own, found, grad = torch.empty_like(self._own), self._room(grad), grad.contiguous()
+        pointers = (grad.data_ptr(), found.data_ptr(), by_own.data_ptr())
+        library("mixer").mix_backward(ctypes.byref(self._arguments), ctypes.byref(self._mixer), *pointers)
+        return by_own, self._split(found, learns)
+
+    def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
+        total = like.new_empty(self._size)
+        library("mixer").mix_forward(ctypes.byref(self._arguments), ctypes.byref(self._mixer), total.data_ptr())
+        return total

@@ -195,14 +195,14 @@ class Equivariant(Memoryless):
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return outputs and the way back; see `Network.traced`."""
         plain = self._plain()
-        run = Pass(self._shape, [x.flatten(1, 2)], plain)
+        run = Pass(self._shape, [x], plain)
 
         def pull(gradient: Tensor) -> list[Tensor]:
-            made = zip(plain, run.backward(gradient.flatten(1, 2)), strict=True)
+            made = zip(plain, run.backward(gradient.flatten(1, -2)), strict=True)
             learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
             return [*torch.autograd.grad(learned, [*self.parameters()], by_learned)]
 
-        return run.outputs.unflatten(1, x.shape[1:3]), pull
+        return run.outputs.unflatten(1, x.shape[1:-1]), pull
 
     def _plain(self) -> list[Tensor]:
         """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""

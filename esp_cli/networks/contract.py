@@ -99,11 +99,11 @@ class Network(nn.Module, ABC):
         """Run over whole episodes, which begin with empty memory.
 
         Args:
-            x: [S, B, T, in].
+            x: [S, ..., T, in], episodes along any axes; the agents of a world are along the last one before T.
             truncation: steps after which the gradient through time is cut; 0 never cuts it.
 
         Returns:
-            y: [S, B, T, out].
+            y: [S, ..., T, out].
         """
 
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
@@ -129,4 +129,4 @@ class Memoryless(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once."""
-        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])
+        return self(x.flatten(1, -2)).unflatten(1, x.shape[1:-1])

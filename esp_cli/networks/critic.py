@@ -41,27 +41,23 @@ class Critic(nn.Module):
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
-        return self._values(self.network.unroll(self._rows(obs, state), truncation), obs)
+        return self._values(self.network.unroll(self._rows(obs, state), truncation))
 
     def traced(self, obs: Tensor, state: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return what `unroll` does, and a function from the gradient by it to those by the parameters."""
         values, pull = self.network.traced(self._rows(obs, state), truncation)
 
         def pull_values(gradient: Tensor) -> list[Tensor]:
-            if self.reads == "own":
-                gradient = gradient.transpose(2, 3).flatten(1, 2).unsqueeze(-1)
-            return pull(gradient)
+            return pull(gradient.transpose(2, 3).unsqueeze(-1) if self.reads == "own" else gradient)
 
-        return self._values(values, obs), pull_values
+        return self._values(values), pull_values
 
     def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
-        """Return what the network reads, [S, B, T, width] or agent by agent [S, B N, T, width]."""
+        """Return what the network reads, [S, B, T, width] or agent by agent [S, B, N, T, width]."""
         if self.reads == "state":
             return state
-        return obs.flatten(-2) if self.reads == "observations" else obs.transpose(2, 3).flatten(1, 2)
+        return obs.flatten(-2) if self.reads == "observations" else obs.transpose(2, 3)
 
-    def _values(self, outputs: Tensor, obs: Tensor) -> Tensor:
+    def _values(self, outputs: Tensor) -> Tensor:
         """Return the values [S, B, T, C] that are in the network's outputs."""
-        if self.reads != "own":
-            return outputs
-        return outputs.unflatten(1, (obs.shape[1], obs.shape[3])).squeeze(-1).transpose(2, 3)
+        return outputs.squeeze(-1).transpose(2, 3) if self.reads == "own" else outputs

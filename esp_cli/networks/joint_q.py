@@ -46,9 +46,7 @@ class OneValue:
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
-        return critic.of_parts(seen.flatten(1, -2), self.joint_action(action).flatten(1, -2)).unflatten(
-            1, seen.shape[1:-1]
-        )
+        return critic.of_parts(seen, self.joint_action(action)).unflatten(1, seen.shape[1:-1])
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q for its other actions, with the actions of all others fixed.

@@ -111,13 +111,13 @@ class SeedMLP(nn.Module):
         return self.of_parts(x)
 
     def of_parts(self, *parts: Tensor, rows_innermost: bool = False) -> Tensor:
-        """Map rows whose numbers, side by side, are parts [S, B, ...]; see `Shape` for how the outputs may lie."""
+        """Map rows whose numbers, side by side, are parts [S, ..., d], to [S, B, out]; see `Shape`."""
         if self.norms is not None:
-            return self._forward_normed(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
+            return self._forward_normed((parts[0] if len(parts) == 1 else torch.cat(parts, -1)).flatten(1, -2))
         return self._from_layer(0, parts, rows_innermost)
 
     def passed(self, x: Tensor) -> Pass | CompiledPass:
-        """Map [S, B, in] as `forward` does, with a backward to call by hand; not with layer normalisation."""
+        """Map [S, ..., in] as `of_parts` does, with a backward to call by hand; not with layer normalisation."""
         return passed(self._shape(), [x], self._from(0))
 
     def from_first_sums(self, sums: Tensor) -> Tensor:

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.functional import elu_
 
-from esp_cli.kernels import mixer
 from esp_cli.kernels.library import computes
+from esp_cli.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
 
@@ -49,11 +49,11 @@ class MonotonicMixer(nn.Module):
         Shape:
             values [S, ..., N], state [S, ..., state width] -> [S, ...].
         """
-        own, seen = (x.reshape(x.shape[0], -1, x.shape[-1]) for x in (values, state))
-        if computes(self.hypernetwork.compiled, seen):
-            total = _CompiledMixed.apply(own.contiguous(), self.hypernetwork(seen), self.width)  # type: ignore[no-untyped-call]
-            return total.view(values.shape[:-1])
-        size = max(1, CACHED_ROWS // values.shape[0])
+        own = values.reshape(values.shape[0], -1, values.shape[-1])
+        if computes(self.hypernetwork.compiled, state):
+            layers = self.hypernetwork.parameters()
+            return _CompiledMixed.apply(own.contiguous(), state, self.width, *layers).view(values.shape[:-1])  # type: ignore[no-untyped-call]
+        seen, size = state.flatten(1, -2), max(1, CACHED_ROWS // values.shape[0])
         pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
         return torch.cat(pieces, 1).view(values.shape[:-1])
 
@@ -97,18 +97,19 @@ class _Mixed(Function):
 
 
 class _CompiledMixed(Function):
-    """The same by the kernel, of own [S, B, N] and rows [S, B, N M + M + M + 1]."""
+    """The same by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
 
     @staticmethod
-    def forward(ctx, own, rows, width):  # type: ignore[no-untyped-def]
-        ctx.save_for_backward(own, rows)
-        ctx.width = width
-        return mixer.mix(own, rows, width)
+    def forward(ctx, own, state, width, *parameters):  # type: ignore[no-untyped-def]
+        ctx.run = CompiledMixer(own, [state], parameters, width, keep=any(ctx.needs_input_grad))
+        ctx.save_for_backward(own, *parameters)  # so that autograd notices a change of them
+        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        own, rows = ctx.saved_tensors
-        return *mixer.mix_backward(own, rows, ctx.width, grad), None
+        _ = ctx.saved_tensors
+        by_own, grads = ctx.run.unmix(grad, ctx.needs_input_grad[3:])
+        return by_own, None, None, *grads
 
 
 def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

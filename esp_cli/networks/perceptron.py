@@ -48,8 +48,11 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
     Args:
         shape: see there.
-        inputs: [S, B, ...] parts of x, side by side; gradients flow to those that ask for them.
+        inputs: [S, ..., d] parts of x, side by side; gradients flow to those that ask for them.
         parameters: W_1, b_1, ..., W_n, b_n.
+
+    Returns:
+        [S, B, out], the rows in the order of the inputs' axes.
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
@@ -57,7 +60,7 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
         return _compiled(shape, inputs, parameters, keep=False).outputs
     if shape.precision != torch.float32:
         parameters = [p.to(shape.precision) for p in parameters]
-    return _joined([_run(shape, x, parameters)[-1] for x in _pieces(shape, inputs)])
+    return _joined([_run(shape, x, parameters)[-1] for x in _pieces(shape, _flat(inputs))])
 
 
 def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
@@ -67,6 +70,10 @@ def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor])
 
 def _compiled(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> CompiledPass:
     return CompiledPass(inputs, parameters, shape.activation, shape.activate_output, shape.rows_innermost, keep)
+
+
+def _flat(inputs: Sequence[Tensor]) -> list[Tensor]:
+    return [x.flatten(1, -2) for x in inputs]
 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
@@ -115,7 +122,7 @@ class Pass:
 
     @torch.no_grad()
     def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> None:
-        parameters = [p.detach().to(shape.precision) for p in parameters]
+        parameters, inputs = [p.detach().to(shape.precision) for p in parameters], _flat(inputs)
         self._shape, self._size, self._weights = shape, _size(inputs[0]), parameters[::2]
         self._runs = [_run(shape, piece, parameters) for piece in _pieces(shape, inputs)]
         self._widths = [x.shape[-1] for x in inputs]
@@ -149,15 +156,17 @@ class _Perceptron(Function):
 
     @staticmethod
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
-        ctx.num_inputs, ctx.run = num_inputs, passed(shape, tensors[:num_inputs], tensors[num_inputs:])
+        inputs = tensors[:num_inputs]
+        ctx.sizes, ctx.run = [x.shape[1:-1] for x in inputs], passed(shape, inputs, tensors[num_inputs:])
         ctx.save_for_backward(*tensors[num_inputs:])  # so that autograd notices a change of them
         return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         _ = ctx.saved_tensors
-        asked, learns = ctx.needs_input_grad[2 : 2 + ctx.num_inputs], ctx.needs_input_grad[2 + ctx.num_inputs :]
-        grads, below = ctx.run.backward_to(grad, learns, asked)
+        first = 2 + len(ctx.sizes)
+        grads, below = ctx.run.backward_to(grad, ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first])
+        below = [None if x is None else x.unflatten(1, size) for x, size in zip(below, ctx.sizes, strict=True)]
         return None, None, *below, *grads
 
 

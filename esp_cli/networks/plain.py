@@ -87,16 +87,20 @@ class MLP(SeedMLP, Memoryless):
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
 
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps at once, wherever they lie in memory."""
+        return self.of_parts(x).unflatten(1, x.shape[1:-1])
+
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return outputs and the way back; see `Network.traced`."""
         if self.norms is not None:
             return super().traced(x, truncation)
-        run = self.passed(x.flatten(1, 2))
+        run = self.passed(x)
 
         def pull(gradient: Tensor) -> list[Tensor]:
-            return run.backward(gradient.flatten(1, 2))
+            return run.backward(gradient.flatten(1, -2))
 
-        return run.outputs.unflatten(1, x.shape[1:3]), pull
+        return run.outputs.unflatten(1, x.shape[1:-1]), pull
 
 
 class GRU(Network):
@@ -122,10 +126,10 @@ class GRU(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
-        batch, num_steps = x.shape[1:3]
-        in_time_order = x.transpose(1, 2).flatten(1, 2)
-        rows = self.gru.unroll(self.body(in_time_order).unflatten(1, (num_steps, batch)), truncation).flatten(1, 2)
-        return self._said(self.norm(rows)).unflatten(1, (num_steps, batch)).transpose(1, 2)
+        x, batch = x.flatten(1, -3), x.shape[1:-2]
+        size = (x.shape[2], x.shape[1])
+        memories = self.gru.unroll(self.body.of_parts(x.transpose(1, 2)).unflatten(1, size), truncation).flatten(1, 2)
+        return self._said(self.norm(memories)).unflatten(1, size).transpose(1, 2).unflatten(1, batch)
 
     def _said(self, rows: Tensor) -> Tensor:
         """Return the outputs for memories [S, B, H]."""

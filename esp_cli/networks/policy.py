@@ -97,13 +97,11 @@ class StochasticPolicy(Policy):
 
     def rows(self, obs: Tensor, truncation: int = 0) -> Tensor:
         """Return the actor's outputs as they are, agent by agent: [S, B, N, T, outputs]; see `unroll`."""
-        outputs = self.actor.unroll(obs.transpose(2, 3).flatten(1, 2), truncation)
-        return outputs.unflatten(1, (obs.shape[1], obs.shape[3]))
+        return self.actor.unroll(obs.transpose(2, 3), truncation)
 
     def traced(self, obs: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return what `rows` does, and a function from the gradient by it to those by the actor's parameters."""
-        outputs, pull = self.actor.traced(obs.transpose(2, 3).flatten(1, 2), truncation)
-        return outputs.unflatten(1, (obs.shape[1], obs.shape[3])), lambda gradient: pull(gradient.flatten(1, 2))
+        return self.actor.traced(obs.transpose(2, 3), truncation)
 
 
 class HistoryPolicy(Policy):
@@ -165,11 +163,10 @@ class HistoryPolicy(Policy):
         Returns:
             [S, B, T + 1, N, outputs], one row for each row of `obs`.
         """
-        rows = obs.transpose(2, 3).flatten(1, 2)
+        rows = obs.transpose(2, 3)
         if self.recurrent:
             done = self.head.encode(action)
             previous = torch.cat([torch.zeros_like(done[:, :, :1]), done], 2)[:, :, : obs.shape[2]]
-            rows = torch.cat([rows, previous.transpose(2, 3).flatten(1, 2)], -1)
-        outputs = self.actor.unroll(rows).unflatten(1, (obs.shape[1], obs.shape[3]))
+            rows = torch.cat([rows, previous.transpose(2, 3)], -1)
         allowed = None if action_mask is None else action_mask[:, :, : obs.shape[2]]
-        return self._normalised(outputs.transpose(2, 3), allowed)
+        return self._normalised(self.actor.unroll(rows).transpose(2, 3), allowed)

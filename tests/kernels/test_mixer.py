@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from esp_cli.kernels.mixer import mix, mix_backward
+from esp_cli.kernels.mixer import CompiledMixer
 from esp_cli.networks.mixer import MonotonicMixer
 from tests.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 from tests.networks.test_layers import generators
@@ -31,22 +31,28 @@ def test_two_agents_and_two_units_by_hand():
     """Units 1 * 2 + |-2| * 3 + 1 = 9 and |-1| * 2 + 0 * 3 - 3 = -1, so 9 and 1/e - 1; with |-2| and 3: 14.1036..."""
     own = torch.tensor([[[2.0, 3.0]]])
     weights = torch.tensor([[[1.0, -1.0, -2.0, 0.0, 1.0, -3.0, -2.0, 3.0, -2.0]]])
+    hidden = [torch.zeros(1, 4, 5), torch.ones(1, 1, 5)]  # units of the hypernetwork, whose last bias says the weights
+    run = CompiledMixer(own, [torch.randn(1, 1, 4)], [*hidden, torch.zeros(1, 5, 9), weights], 2, keep=True)
     below = math.exp(-1) - 1
-    assert mix(own, weights, 2).item() == pytest.approx(2 * 9 + 3 * below - 2, abs=1e-5)
-    by_own, by_weights = mix_backward(own, weights, 2, torch.tensor([[10.0]]))
+    assert run.outputs.item() == pytest.approx(2 * 9 + 3 * below - 2, abs=1e-5)
+    by_own, (_, by_hidden, by_last, by_weights) = run.unmix(torch.tensor([[10.0]]), [True] * 4)
     first, second = 20.0, 30 * math.exp(-1)  # by the sums of both units
     assert by_own.flatten().tolist() == pytest.approx([first + second, 2 * first], abs=1e-3)
     by_hand = [2 * first, -2 * second, -3 * first, 0.0, first, second, -90.0, 10 * below, 10.0]
     assert by_weights.flatten().tolist() == pytest.approx(by_hand, abs=1e-3)
+    torch.testing.assert_close(by_last, by_weights.expand(1, 5, 9), msg="all units of the hypernetwork are 1")
+    assert not by_hidden.any(), "no weight leads from the hidden units to the outputs"
 
 
 @needs_compiler
 def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits():
     torch.manual_seed(0)
-    own, weights, grad = torch.randn(3, 500, 3), torch.randn(3, 500, 5 * 20 + 1), torch.randn(3, 500)
+    own, state, grad = torch.randn(3, 500, 3), torch.randn(3, 500, 7), torch.randn(3, 500)
+    parameters = [torch.randn(3, *size) for size in ((7, 16), (1, 16), (16, 5 * 20 + 1), (1, 5 * 20 + 1))]
 
     def found(seeds):
-        given = (own[seeds], weights[seeds], 20)
-        return [mix(*given), *mix_backward(*given, grad[seeds])]
+        run = CompiledMixer(own[seeds], [state[seeds]], [p[seeds] for p in parameters], 20, keep=True)
+        by_own, grads = run.unmix(grad[seeds], [True] * 4)
+        return [run.outputs, by_own, *grads]
 
     assert_same_bits_alone_and_for_any_threads(found, 3)
