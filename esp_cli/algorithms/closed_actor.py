@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.closed_form import reordered
+from esp_cli.kernels import actor
+from esp_cli.kernels.library import computes
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
 
@@ -39,7 +41,7 @@ class Draw:
 
     Attributes:
         soft: [S, A, N, P, R] softmax(logits + Gumbel), whose gradient is taken.
-        hard: [S, N, A, P, R] the one-hot of its largest number: what the critic is asked about. Equal ones share it.
+        hard: [S, P R, N, A] the one-hot of its largest number: what the critic is asked about. Equal ones share it.
     """
 
     soft: Tensor
@@ -47,13 +49,24 @@ class Draw:
 
 
 @torch.no_grad()
-def draw(logits: Tensor, noise: Tensor) -> Draw:
-    """Draw actions by noise [S, B, T, N, A] uniform in [0, 1), the same for all parts of logits [S, A, N, P, B T]."""
+def draw(logits: Tensor, num_learned: int, noise: Tensor, compiled: bool = False) -> Draw:
+    """Draw actions from the first parts of logits, which are learned from.
+
+    Args:
+        logits: [S, A, N, P, B T].
+        num_learned: how many of the P parts.
+        noise: [S, B, T, N, A] uniform in [0, 1), the same for all parts.
+        compiled: whether the kernel draws them, on the CPU.
+    """
+    if computes(compiled, logits):
+        return Draw(*actor.draw(logits, num_learned, noise))
+    logits = logits[:, :, :, :num_learned]
     gumbel = noise.clamp(1e-7, 1 - 1e-7).log_().neg_().log_().neg_().permute(0, 4, 3, 1, 2).flatten(3).contiguous()
     soft = torch.softmax(logits + gumbel.unsqueeze(3), 1)
     largest = (soft - soft.amax(1, keepdim=True)).sign_().add_(1)
     largest.div_(largest.sum(1, keepdim=True))
-    return Draw(soft, largest.transpose(1, 2).contiguous())
+    hard = largest.transpose(1, 2).contiguous()  # [S, N, A, P, R]
+    return Draw(soft, hard.flatten(3).permute(0, 3, 1, 2))
 
 
 @torch.no_grad()
@@ -64,34 +77,48 @@ def actor_gradient(
     share: Tensor,
     transforms: Sequence[Transform],
     weights: ActorWeights,
-) -> Tensor:
-    """Return the gradient, by the logits, of -Q + penalty + c S_pi: as `logits`.
+    compiled: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Return the gradient, by the logits, of -Q + penalty + c S_pi: as `logits`; and mean entropies [S, R].
 
     Args:
         logits: [S, A, N, P, R] of all parts, not pulled back.
         drawn: from the parts that are learned from: all, or the originals.
-        by_action: [S, N, A, P, R] gradient of the loss by what was drawn.
+        by_action: [S, P R, N, A] gradient of the loss by what was drawn.
         share: [S, R] of each row in the mean over the originals; 0 where it does not count.
         transforms: K, with which the copies were made.
         weights: of the other terms.
+        compiled: whether the kernel computes it, on the CPU.
     """
+    if computes(compiled, logits):
+        return actor.actor_gradient(
+            logits,
+            drawn.soft,
+            by_action,
+            share,
+            [m.back for m in _maps(transforms)],
+            output_penalty=weights.output_penalty,
+            gap=weights.gap if transforms else 0.0,
+            stop_gradient=weights.stop_gradient,
+        )
     num_actions, num_agents, parts = logits.shape[1], logits.shape[2], drawn.soft.shape[3]
     learned, row = logits[:, :, :, :parts], share[:, None, None, None] / num_agents
-    gradient = torch._softmax_backward_data(by_action.transpose(1, 2).contiguous(), drawn.soft, 1, logits.dtype)
+    by_action = by_action.permute(0, 3, 2, 1).unflatten(3, (parts, -1)).contiguous()
+    gradient = torch._softmax_backward_data(by_action, drawn.soft, 1, logits.dtype)
     centred = learned - learned.mean(1, keepdim=True)
     gradient.addcmul_(centred, row, value=2 * weights.output_penalty / (num_actions * parts))
     if parts < logits.shape[3]:
         gradient = torch.cat([gradient, torch.zeros_like(logits[:, :, :, parts:])], 3)
     if weights.gap and transforms:
         gradient.add_(_divergence_gradient(logits, row * (weights.gap / len(transforms)), transforms, weights))
-    return gradient
+    return gradient, _entropy(learned).mean((1, 2))
 
 
 def _divergence_gradient(
     logits: Tensor, weight: Tensor, transforms: Sequence[Transform], weights: ActorWeights
 ) -> Tensor:
     """Return the gradient of KL[copy || original], weighted by rows [S, 1, 1, 1, R] and summed: as `logits`."""
-    maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
+    maps = _maps(transforms)
     log_prob = torch.log_softmax(reordered(logits, [m.back for m in maps]), 1)
     prob = log_prob.exp()
     here, moved, copy = log_prob[:, :, :, :1], log_prob[:, :, :, 1:], prob[:, :, :, 1:]
@@ -105,7 +132,11 @@ def _divergence_gradient(
     return reordered(gradient, [m.source for m in maps])
 
 
-def entropy(logits: Tensor) -> Tensor:
+def _maps(transforms: Sequence[Transform]) -> list[Gather]:
+    return [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
+
+
+def _entropy(logits: Tensor) -> Tensor:
     """Return that of the policies with logits [S, A, N, P, R]: [S, N, P, R]."""
     log_prob = torch.log_softmax(logits, 1)
     return (log_prob.exp() * log_prob).sum(1).neg_()

@@ -118,11 +118,9 @@ def _policy_gradient_compiled(
     logits: Tensor, maps: Sequence[Gather], action: Tensor, old_log_prob: Tensor, advantage: Tensor, weights: Weights
 ) -> Tensor:
     """Return what `_policy_gradient` returns."""
-    num_seeds, num_actions = logits.shape[:2]
-    stays = torch.arange(num_actions).expand(num_seeds, -1)
     return kernels.policy_gradient(
         logits,
-        torch.stack([stays, *(m.back.expand(num_seeds, -1) for m in maps)]),
+        [m.back for m in maps],
         action,
         old_log_prob,
         advantage,

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedParameters
-from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw, entropy
+from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw
 from esp_cli.algorithms.closed_form import carries
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
@@ -71,6 +71,7 @@ class Maddpg(OffPolicyLearner):
         if not spec.shared_reward:
             self.joint = OneValueEach(spec, config.critic_input)
         shape = perceptron(network, config.critic_activation)
+        _, self._compiled = shape.products
         width = self.critic_width + spec.num_agents * self.head.action_width
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
@@ -177,27 +178,26 @@ class Maddpg(OffPolicyLearner):
         obs = copies.rows.obs[:, :, :-1].permute(0, 3, 1, 2, 4)  # [S, N, B (1 + copies), T, D]
         outputs, pull = self.policy.actor.traced(obs)  # [S, N, B (1 + copies), T, A]
         parts = outputs.flatten(1, 3).transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
-        learned = parts if copies.augments else parts[:, :, :, :1]
-        drawn = draw(learned, noise)
+        num_learned = parts.shape[3] if copies.augments else 1
+        drawn = draw(parts, num_learned, noise, self._compiled)
 
-        action = drawn.hard.flatten(3).permute(0, 3, 1, 2).unflatten(1, (-1, obs.shape[3])).requires_grad_()
+        action = drawn.hard.unflatten(1, (-1, obs.shape[3])).requires_grad_()
         value = self.joint.value(self.critic, copies.learned(here), action)
         mask = copies.originals.mask
         share = mask / mask.flatten(1).sum(1).clamp_min(1).view(-1, 1, 1)
-        by_value = copies.repeated(share).unsqueeze(-1).mul(-self._value_scale / (learned.shape[3] * value.shape[3]))
+        by_value = copies.repeated(share).unsqueeze(-1).mul(-self._value_scale / (num_learned * value.shape[3]))
         (by_action,) = torch.autograd.grad((value * by_value).sum(), action)
-        by_action = by_action.flatten(1, 2).permute(0, 2, 3, 1).unflatten(3, (learned.shape[3], -1))
 
         weights = ActorWeights(
             config.output_penalty, prior.coefficient if prior.terms != "value" else 0.0, prior.stop_gradient
         )
-        by_outputs = actor_gradient(parts, drawn, by_action, share.flatten(1), copies.transforms, weights)
+        by_action, share = by_action.flatten(1, 2), share.flatten(1)
+        made = (by_action, share, copies.transforms, weights, self._compiled)
+        by_outputs, entropy = actor_gradient(parts, drawn, *made)
         by_outputs = by_outputs.flatten(2).transpose(1, 2).view(outputs.shape)
-        value, mask = value.detach(), copies.batch.mask
-        uncertain = entropy(learned).flatten(2).transpose(1, 2).unflatten(1, mask.shape[1:])
         return self.actor_optimiser.parameters.flat(pull(by_outputs)), {
-            "policy_loss": -self._value_scale * mean_per_seed(value, mask),
-            "entropy": mean_per_seed(uncertain, mask),
+            "policy_loss": -self._value_scale * mean_per_seed(value.detach(), copies.batch.mask),
+            "entropy": (entropy * share).sum(1),
         }
 
     def _encoded(self, rows: EpisodeBatch) -> Tensor:

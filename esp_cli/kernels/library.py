@@ -10,16 +10,11 @@ import subprocess
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 _OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
-_ARGUMENTS = {
-    "perceptron": {"forward": 2, "backward": 4},
-    "recurrent": {"gru_forward": 1, "gru_backward": 5},
-    "mixer": {"mix_forward": 3, "mix_backward": 5},
-    "policy_gradient": {"policy_gradient": 1},
-}
 
 PADDING = 16
 """PAD of vectors.h."""
@@ -65,6 +60,10 @@ def library(name: str) -> ctypes.CDLL:
                 f"the kernels of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
                 "may run from, or leave it off"
             ) from None
-    for function, count in _ARGUMENTS[name].items():
-        getattr(loaded, function).argtypes = (ctypes.c_void_p,) * count  # else addresses would be cut to 32 bits
     return loaded
+
+
+def call(kernel: str, function: str, *arguments: ctypes.Structure | ctypes.Array[Any] | Tensor | None) -> None:
+    """Call a function of a kernel with addresses: of structures, of tensors' first numbers, or of nothing."""
+    addresses = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x and ctypes.byref(x) for x in arguments]
+    getattr(library(kernel), function)(*addresses)

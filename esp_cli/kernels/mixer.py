@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import fields, library
+from esp_cli.kernels.library import call, fields
 from esp_cli.kernels.perceptron import CompiledPass
 
 
@@ -40,11 +40,10 @@ class CompiledMixer(CompiledPass):
     def unmix(self, grad: Tensor, learns: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
         """Return the gradients by the agents' values and by the parameters that learn."""
         by_own, found, grad = torch.empty_like(self._own), self._room(grad), grad.contiguous()
-        pointers = (grad.data_ptr(), found.data_ptr(), by_own.data_ptr())
-        library("mixer").mix_backward(ctypes.byref(self._arguments), ctypes.byref(self._mixer), *pointers)
+        call("mixer", "mix_backward", self._arguments, self._mixer, grad, found, by_own)
         return by_own, self._split(found, learns)
 
     def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
         total = like.new_empty(self._size)
-        library("mixer").mix_forward(ctypes.byref(self._arguments), ctypes.byref(self._mixer), total.data_ptr())
+        call("mixer", "mix_forward", self._arguments, self._mixer, total)
         return total

@@ -10,7 +10,7 @@ from math import prod
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import PADDING, fields, library, padded
+from esp_cli.kernels.library import PADDING, call, fields, padded
 
 _AXES = 3
 """AXES of perceptron.h."""
@@ -145,14 +145,12 @@ class CompiledPass:
         size = (num_seeds, width, num_rows) if columns_first else (num_seeds, num_rows, width)
         outputs = like.new_empty(size)
         outputs = outputs.transpose(1, 2) if columns_first else outputs
-        library("perceptron").forward(ctypes.byref(self._arguments), ctypes.byref(_Rows.of(outputs)))
+        call("perceptron", "forward", self._arguments, _Rows.of(outputs))
         return outputs
 
     def _pull(self, grad: Tensor, found: Tensor | None, below: _Below) -> None:
         """Write the gradients by all parameters [S, P] and by some columns of the inputs, where there is room."""
-        room = None if found is None else found.data_ptr()
-        pointers = ctypes.byref(_Rows.of(grad)), room, ctypes.byref(below)
-        library("perceptron").backward(ctypes.byref(self._arguments), *pointers)
+        call("perceptron", "backward", self._arguments, _Rows.of(grad), found, below)
 
     def _room(self, like: Tensor) -> Tensor:
         """Return an empty buffer [S, P] for the gradients by all parameters."""

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import fields, library
+from esp_cli.kernels.library import call, fields
+from esp_cli.kernels.policies import Policies, orders_of
 
 
-class _Policy(ctypes.Structure):
+class _Objective(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "seeds", "rows", "parts", "actions", "threads"),
         *fields(ctypes.c_int64, "augments", "moves_originals", "moves_copies"),
         *fields(ctypes.c_float, "clip_epsilon", "entropy_coef", "gap"),
-        *fields(ctypes.c_void_p, "logits", "orders", "action", "old_log_prob", "advantage", "gradient"),
+        *fields(ctypes.c_void_p, "action", "old_log_prob", "advantage", "gradient"),
     )
 
 
 def policy_gradient(
     logits: Tensor,
-    orders: Tensor,
+    back: Sequence[Tensor],
     action: Tensor,
     old_log_prob: Tensor,
     advantage: Tensor,
@@ -36,7 +37,7 @@ def policy_gradient(
 
     Args:
         logits: [S, A, P, R] of P parts: the originals and their copies.
-        orders: [P, S, A] int64, which action of a part is the original's.
+        back: of each copy, [S or 1, A]: which action of it is the original's.
         action: [S, R] int64 of the originals.
         old_log_prob: [S, R].
         advantage: [S, R].
@@ -46,22 +47,17 @@ def policy_gradient(
         augments: whether copies enter the objective.
         stop_gradient: "transformed", "original" or "none": which side of the divergence is held fixed.
     """
-    num_seeds, num_actions, num_parts, num_rows = logits.shape
-    data = [x.contiguous() for x in (logits, orders, action, old_log_prob, advantage)]
+    orders = orders_of(logits, back)
+    data = [x.contiguous() for x in (logits, action, old_log_prob, advantage)]
     gradient = torch.empty_like(data[0])
-    arguments = _Policy(
-        num_seeds,
-        num_rows,
-        num_parts,
-        num_actions,
-        torch.get_num_threads(),
+    objective = _Objective(
         augments,
         stop_gradient != "original",
         stop_gradient != "transformed",
         clip_epsilon,
         entropy_coef,
         gap,
-        *(x.data_ptr() for x in (*data, gradient)),
+        *(x.data_ptr() for x in (*data[1:], gradient)),
     )
-    library("policy_gradient").policy_gradient(ctypes.byref(arguments))
+    call("policy_gradient", "policy_gradient", Policies.of(data[0].unsqueeze(2), orders), objective)
     return gradient

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.kernels.library import fields, library, padded
+from esp_cli.kernels.library import call, fields, padded
 
 
 class _Unit(ctypes.Structure):
@@ -61,7 +61,7 @@ class CompiledUnroll:
             None if gates is None else gates.data_ptr(),
         )
         self._alive, self._shapes = (x, given, memories, gates), [p.shape[1:] for p in parameters]
-        library("recurrent").gru_forward(ctypes.byref(self._arguments))
+        call("recurrent", "gru_forward", self._arguments)
         self.memories = memories[..., :hidden]
 
     def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -71,8 +71,6 @@ class CompiledUnroll:
         sizes = [size.numel() for size in self._shapes]
         by_x, found = x.new_empty(x.shape), x.new_empty(x.shape[0], sum(sizes))
         strides = (ctypes.c_int64 * 3)(*grad.stride()[:3])
-        library("recurrent").gru_backward(
-            ctypes.byref(self._arguments), grad.data_ptr(), strides, found.data_ptr(), by_x.data_ptr()
-        )
+        call("recurrent", "gru_backward", self._arguments, grad, strides, found, by_x)
         parts = found.split(sizes, 1)
         return by_x, [part.unflatten(1, size) for part, size in zip(parts, self._shapes, strict=True)]

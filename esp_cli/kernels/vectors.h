@@ -197,12 +197,21 @@ static inline Vec exp_of(Vec x, float most = 86.0f) {
 
 static inline Vec tanh_of(Vec x) { return 1.0f - 2.0f * reciprocal(exp_of(2.0f * x, 40.0f) + 1.0f); }
 
-// Return log(x) of x >= 1: Halley's steps towards exp(y) = x, from a guess that reads the bits of x.
+// Return log(x) of x > 0: x = 2^n (1 + f) with 1 + f around 1, and a polynomial of f (Cephes).
 static inline Vec log_of(Vec x) {
-    Vec y = __builtin_convertvector((Ints)x - 0x3F800000, Vec) * (0.693147181f / 8388608.0f);
-    for (int step = 0; step < 2; step++) {
-        Vec e = exp_of(y);
-        y += 2.0f * (x - e) / (x + e);
-    }
-    return y;
+    Ints bits = (Ints)x, exponent = (bits >> 23) - 126;
+    Vec f = (Vec)((bits & 0x007FFFFF) | 0x3F000000);  // in [1/2, 1)
+    auto small = f < 0.707106781f;
+    Vec n = __builtin_convertvector(small ? exponent - 1 : exponent, Vec);
+    f = (small ? f + f : f) - 1.0f;
+    Vec square = f * f;
+    Vec p = 7.0376836292e-2f * f - 1.1514610310e-1f;
+    p = p * f + 1.1676998740e-1f;
+    p = p * f - 1.2420140846e-1f;
+    p = p * f + 1.4249322787e-1f;
+    p = p * f - 1.6668057665e-1f;
+    p = p * f + 2.0000714765e-1f;
+    p = p * f - 2.4999993993e-1f;
+    p = p * f + 3.3333331174e-1f;
+    return f + (p * f * square - n * 2.12194440e-4f - 0.5f * square) + n * 0.693359375f;
 }

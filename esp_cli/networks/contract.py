@@ -99,19 +99,23 @@ class Network(nn.Module, ABC):
         """Run over whole episodes, which begin with empty memory.
 
         Args:
-            x: [S, ..., T, in], episodes along any axes; the agents of a world are along the last one before T.
+            x: [S, B, T, in].
             truncation: steps after which the gradient through time is cut; 0 never cuts it.
 
         Returns:
-            y: [S, ..., T, out].
+            y: [S, B, T, out].
         """
 
+    def unroll_all(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Run over whole episodes along any axes, those of a world's agents along the last one: [S, ..., T, in]."""
+        return self.unroll(x.flatten(1, -3), truncation).unflatten(1, x.shape[1:-2])
+
     def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return what `unroll` does, and a function from the gradient by it to those by the parameters, in their order.
+        """Return what `unroll_all` does, and a function from the gradient by it to those by the parameters in order.
 
         By autograd, unless a network knows better.
         """
-        outputs = self.unroll(x, truncation)
+        outputs = self.unroll_all(x, truncation)
 
         def pull(gradient: Tensor) -> list[Tensor]:
             parameters = list(self.parameters())
@@ -129,4 +133,4 @@ class Memoryless(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once."""
-        return self(x.flatten(1, -2)).unflatten(1, x.shape[1:-1])
+        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])

@@ -41,7 +41,7 @@ class Critic(nn.Module):
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
-        return self._values(self.network.unroll(self._rows(obs, state), truncation))
+        return self._values(self.network.unroll_all(self._rows(obs, state), truncation))
 
     def traced(self, obs: Tensor, state: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return what `unroll` does, and a function from the gradient by it to those by the parameters."""

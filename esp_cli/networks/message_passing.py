@@ -241,10 +241,10 @@ class MessagePassing(Memoryless):
         return total.flatten(1, 2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once: [S, ..., T, D] -> [S, ..., T, out]."""
-        worlds = x.flatten(1, -3).unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
+        """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""
+        worlds = x.unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
         outputs = self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4])
-        return outputs.transpose(2, 3).flatten(1, 2).unflatten(1, x.shape[1:-2])
+        return outputs.transpose(2, 3).flatten(1, 2)
 
 
 def _fields(io: IoSpec) -> tuple[Field, Field]:

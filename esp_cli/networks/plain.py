@@ -87,7 +87,7 @@ class MLP(SeedMLP, Memoryless):
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
 
-    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+    def unroll_all(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Apply the network to all steps at once, wherever they lie in memory."""
         return self.of_parts(x).unflatten(1, x.shape[1:-1])
 
@@ -126,10 +126,9 @@ class GRU(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
-        x, batch = x.flatten(1, -3), x.shape[1:-2]
         size = (x.shape[2], x.shape[1])
         memories = self.gru.unroll(self.body.of_parts(x.transpose(1, 2)).unflatten(1, size), truncation).flatten(1, 2)
-        return self._said(self.norm(memories)).unflatten(1, size).transpose(1, 2).unflatten(1, batch)
+        return self._said(self.norm(memories)).unflatten(1, size).transpose(1, 2)
 
     def _said(self, rows: Tensor) -> Tensor:
         """Return the outputs for memories [S, B, H]."""

@@ -97,7 +97,7 @@ class StochasticPolicy(Policy):
 
     def rows(self, obs: Tensor, truncation: int = 0) -> Tensor:
         """Return the actor's outputs as they are, agent by agent: [S, B, N, T, outputs]; see `unroll`."""
-        return self.actor.unroll(obs.transpose(2, 3), truncation)
+        return self.actor.unroll_all(obs.transpose(2, 3), truncation)
 
     def traced(self, obs: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
         """Return what `rows` does, and a function from the gradient by it to those by the actor's parameters."""
@@ -169,4 +169,4 @@ class HistoryPolicy(Policy):
             previous = torch.cat([torch.zeros_like(done[:, :, :1]), done], 2)[:, :, : obs.shape[2]]
             rows = torch.cat([rows, previous.transpose(2, 3)], -1)
         allowed = None if action_mask is None else action_mask[:, :, : obs.shape[2]]
-        return self._normalised(self.actor.unroll(rows).transpose(2, 3), allowed)
+        return self._normalised(self.actor.unroll_all(rows).transpose(2, 3), allowed)

@@ -69,6 +69,7 @@ class Symmetrised(Network):
         return self._mean(y), apart.unflatten(1, (order, -1)).permute(0, 2, 1, 3).flatten(2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes with every image: [S, ..., T, in] -> [S, ..., T, out]."""
-        images = self._images(x.flatten(1, -2)).unflatten(1, (-1, x.shape[-2]))
-        return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:-1])
+        """Run over whole episodes with every image: [S, B, T, in] -> [S, B, T, out]."""
+        shape = (self.group.order * x.shape[1], x.shape[2])
+        images = self._images(x.flatten(1, 2)).unflatten(1, shape)
+        return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:3])

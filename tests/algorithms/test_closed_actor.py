@@ -97,8 +97,8 @@ def test_a_draw_is_the_heads_own_and_equal_numbers_share_it():
     outputs = torch.randn(2, 4, 6, 3, 5)
     noise = torch.rand(2, 4, 6, 3, 5)
     expected = trained.head.relaxed(trained.head.normalise(outputs), noise)
-    drawn = draw(outputs.permute(0, 4, 3, 1, 2).flatten(3).unsqueeze(3), noise)
-    torch.testing.assert_close(drawn.hard.permute(0, 3, 4, 1, 2).view(2, 4, 6, 3, 5), expected)
-    assert not torch.equal(drawn.soft.transpose(1, 2), drawn.hard), "negative control"
-    even = draw(torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1), torch.full((1, 1, 1, 1, 3), 0.5))
+    drawn = draw(outputs.permute(0, 4, 3, 1, 2).flatten(3).unsqueeze(3), 1, noise)
+    torch.testing.assert_close(drawn.hard.view(2, 4, 6, 3, 5), expected)
+    assert not torch.equal(drawn.soft.flatten(3).permute(0, 3, 2, 1), drawn.hard), "negative control"
+    even = draw(torch.tensor([1.0, 1.0, 0.0]).view(1, 3, 1, 1, 1), 1, torch.full((1, 1, 1, 1, 3), 0.5))
     torch.testing.assert_close(even.hard.flatten(), torch.tensor([0.5, 0.5, 0.0]))
