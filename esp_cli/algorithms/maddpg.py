@@ -19,6 +19,7 @@ from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw
 from esp_cli.algorithms.closed_form import carries
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
+from esp_cli.kernels.library import begin
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
@@ -97,6 +98,8 @@ class Maddpg(OffPolicyLearner):
         discrete = isinstance(self.head, ExploringCategorical) and isinstance(self.policy.actor, MLP)
         sampled = config.actor_gradient == "sampled" and config.actor_actions == "all"
         self._closed_form = discrete and sampled and not spec.masks and not spec.agents_end
+        if self._compiled and self._closed_form:
+            begin("actor")
 
     @classmethod
     def build_policy(

@@ -21,6 +21,7 @@ from esp_cli.algorithms.losses import clipped_surrogate, explained_variance, gae
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
+from esp_cli.kernels.library import begin
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic
@@ -91,6 +92,8 @@ class Mappo(Learner):
         self._old: tuple[StochasticPolicy, Critic] | None = None
         _, self._compiled = perceptron(network, "relu").products
         self._closed_form = not (config.clip_value or self.prior.recomputes or spec.masks or spec.agents_end)
+        if self._compiled and self._closed_form and isinstance(self.policy.head, Categorical):
+            begin("policy_gradient")
 
     @classmethod
     def build_policy(

@@ -31,6 +31,7 @@ from esp_cli.commands.options import (
 )
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.train_choices import with_file
+from esp_cli.kernels.library import begin
 
 if TYPE_CHECKING:
     from esp_cli.library.run import Run
@@ -115,7 +116,11 @@ def train(
     ] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
-    from esp_cli.library.run import Run, begin, plan
+    named = parse_assignments(settings or [])
+    if named.get("network.compiled"):
+        begin("perceptron")  # while torch is imported
+
+    from esp_cli.library import run as runs
     from esp_cli.machine import resolve_device
     from esp_cli.trackers import require
     from esp_cli.training.config import resolve_config
@@ -125,13 +130,12 @@ def train(
     if tensorboard:
         console.note("--tensorboard is now --track tensorboard")
     trackers = (*(track or ()), *(("tensorboard",) if tensorboard else ()))
-    named = parse_assignments(settings or [])
     register_tasks([task])
     register_learners([algo], [network, named.get("network.name")])
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
-        _train(Run(resume), trackers)
+        _train(runs.Run(resume), trackers)
         return
     require(trackers)
     short = {
@@ -159,14 +163,14 @@ def train(
     choices["device"] = resolve_device(choices["device"])
     idle = said & resolve_config(**choices, overrides=overrides).without_effect()
     init_from = None if kept else init_from
-    resolved, weights = plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
+    resolved, weights = runs.plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
     if kept is not None:
         resolved, weights = kept.start(resolved)
     note_without_effect(idle)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    _train(begin(resolved, weights, out), trackers)
+    _train(runs.begin(resolved, weights, out), trackers)
 
 
 def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> None:

@@ -8,11 +8,13 @@ import shlex
 import shutil
 import subprocess
 import tempfile
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+if TYPE_CHECKING:  # a kernel may be begun before torch is imported
+    from torch import Tensor
 
 _OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
 
@@ -37,33 +39,52 @@ def computes(compiled: bool, x: Tensor) -> bool:
 
 @cache
 def library(name: str) -> ctypes.CDLL:
-    """Compile a kernel, which takes up to a second, in a temporary folder, and load it.
+    """Load a kernel, which takes up to a second to compile where nothing began it before.
 
     Raises:
         ValueError: there is no C++ compiler, it fails, or what it made cannot be loaded.
     """
+    try:
+        with begin(name).result() as folder:
+            return ctypes.CDLL(str(Path(folder) / name))  # after torch, whose OpenMP it takes
+    except (ValueError, OSError) as error:
+        begin.cache_clear()  # so that it may be tried again
+        if isinstance(error, ValueError):
+            raise
+        raise ValueError(
+            f"the kernels of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
+            "may run from, or leave it off"
+        ) from None
+
+
+@cache
+def begin(name: str) -> Future[tempfile.TemporaryDirectory[str]]:
+    """Begin to compile a kernel, beside whatever else there is to do, in a temporary folder."""
+    workers = ThreadPoolExecutor(1)
+    compiling = workers.submit(_compile, name)
+    workers.shutdown(wait=False)
+    return compiling
+
+
+def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
     compiler = shlex.split(os.environ.get("CXX", "")) or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
     if shutil.which(compiler[0]) is None:
         raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
-    with tempfile.TemporaryDirectory() as folder:
-        built = Path(folder) / f"{name}.so"
-        command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(built)]
-        compiling = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
-        if compiling.returncode:
-            said = compiling.stderr
-            line = next((line for line in said.splitlines() if "error" in line), said.strip())
-            raise ValueError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
-        try:
-            loaded = ctypes.CDLL(str(built))
-        except OSError as error:
-            raise ValueError(
-                f"the kernels of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
-                "may run from, or leave it off"
-            ) from None
-    return loaded
+    folder = tempfile.TemporaryDirectory()
+    command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(Path(folder.name) / name)]
+    compiling = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
+    if compiling.returncode:
+        said = compiling.stderr
+        line = next((line for line in said.splitlines() if "error" in line), said.strip())
+        raise ValueError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
+    return folder
 
 
 def call(kernel: str, function: str, *arguments: ctypes.Structure | ctypes.Array[Any] | Tensor | None) -> None:
     """Call a function of a kernel with addresses: of structures, of tensors' first numbers, or of nothing."""
-    addresses = [ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else x and ctypes.byref(x) for x in arguments]
+    structures = (ctypes.Structure, ctypes.Array)
+    addresses = [
+        ctypes.byref(x) if isinstance(x, structures) else ctypes.c_void_p(None if x is None else x.data_ptr())
+        for x in arguments
+    ]
     getattr(library(kernel), function)(*addresses)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import prod
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -47,27 +49,37 @@ class _Below(ctypes.Structure):
     _fields_ = (("at", ctypes.c_void_p), *fields(ctypes.c_int64, "begin", "end"))
 
 
-def _with_whole_rows(x: Tensor) -> Tensor:
+def _whole_rows(x: Tensor) -> Tensor:
     """Return x [S, ., .] with each seed's numbers in a row; views of a learner's buffer are so already."""
-    return x if x.stride(2) == 1 and x.stride(1) == x.shape[2] else x.contiguous()
+    _, row, column = x.stride()
+    return x if column == 1 and row == x.shape[2] else x.detach().contiguous()
 
 
-def _counted(x: Tensor) -> tuple[Tensor, list[int], list[int]]:
+def _counted(x: Tensor) -> tuple[Tensor, tuple[int, ...], tuple[int, ...]]:
     """Return x [S, ..., d], copied where need be, and sizes and strides of few axes that count its rows."""
-    sizes, strides = [1], [0]
+    sizes, strides = [1] * _AXES, [0] * _AXES
     for size, stride in zip(x.shape[1:-1], x.stride()[1:-1], strict=True):
-        if size == 1:
-            continue
         if sizes[-1] == 1 or strides[-1] == size * stride:
-            sizes[-1] *= size
-            strides[-1] = stride
-        else:
-            sizes.append(size)
-            strides.append(stride)
+            sizes[-1], strides[-1] = sizes[-1] * size, stride
+        elif size > 1:
+            sizes, strides = [*sizes, size], [*strides, stride]
+    while len(sizes) > _AXES and sizes[0] == 1:
+        del sizes[0], strides[0]
     if len(sizes) > _AXES:
         return _counted(x.contiguous())
-    missing = _AXES - len(sizes)
-    return x, [1] * missing + sizes, [0] * missing + strides
+    return x, tuple(sizes), tuple(strides)
+
+
+@lru_cache
+def _tables(
+    widths: tuple[int, ...], addresses: tuple[int, ...], strides: tuple[int, ...]
+) -> tuple[ctypes.Array[Any], ...]:
+    """Return what does not change from pass to pass of a network, as the kernel reads it."""
+    return (
+        (ctypes.c_int64 * len(widths))(*widths),
+        (ctypes.c_void_p * len(addresses))(*addresses),
+        (ctypes.c_int64 * len(strides))(*strides),
+    )
 
 
 class CompiledPass:
@@ -85,7 +97,6 @@ class CompiledPass:
         outputs: y [S, B, out].
     """
 
-    @torch.no_grad()
     def __init__(
         self,
         inputs: Sequence[Tensor],
@@ -95,19 +106,16 @@ class CompiledPass:
         rows_innermost: bool = False,
         keep: bool = True,
     ) -> None:
-        parts, given = [_counted(x.detach()) for x in inputs], [_with_whole_rows(p.detach()) for p in parameters]
-        self._columns = list(pairwise(accumulate((x.shape[-1] for x in inputs), initial=0)))
-        self._widths = [self._columns[-1][1], *(bias.shape[2] for bias in parameters[1::2])]
-        self._size = (inputs[0].shape[0], prod(inputs[0].shape[1:-1]))
+        parts = [_counted(x.detach()) for x in inputs]
+        given = [_whole_rows(p) for p in parameters]
+        self._inputs = [x.shape[-1] for x in inputs]
         self._shapes = [p.shape[1:] for p in parameters]
+        self._widths = (sum(self._inputs), *(size[1] for size in self._shapes[1::2]))
+        self._size = (inputs[0].shape[0], prod(inputs[0].shape[1:-1]))
         activated = self._widths[1:] if activate_output else self._widths[1:-1]
-        hidden = given[0].new_empty(prod(self._size) * sum(map(padded, activated)) if keep else 0)
-        tables = (
-            (ctypes.c_int64 * len(self._widths))(*self._widths),
-            (ctypes.c_void_p * len(given))(*(p.data_ptr() for p in given)),
-            (ctypes.c_int64 * len(given))(*(p.stride(0) for p in given)),
-            (_Columns * len(parts))(*(_Columns.of(*part) for part in parts)),
-        )
+        hidden = given[0].new_empty(prod(self._size) * sum(map(padded, activated))) if keep else None
+        columns = (_Columns * len(parts))(*(_Columns.of(*part) for part in parts))
+        tables = _tables(self._widths, tuple(p.data_ptr() for p in given), tuple(p.stride(0) for p in given))
         self._arguments = _Perceptron(
             *self._size,
             len(self._widths) - 1,
@@ -115,11 +123,11 @@ class CompiledPass:
             activate_output,
             torch.get_num_threads(),
             len(parts),
-            *(ctypes.addressof(table) for table in tables),
-            hidden.data_ptr() if keep else None,
+            *map(ctypes.addressof, (*tables, columns)),
+            None if hidden is None else hidden.data_ptr(),
         )
-        self._alive = (parts, given, hidden, tables)
-        self.outputs = self._passed(hidden, rows_innermost or self._widths[-1] < PADDING)
+        self._alive = (parts, [p.detach() for p in given] if keep else given, hidden, tables, columns)
+        self.outputs = self._passed(given[0], rows_innermost or self._widths[-1] < PADDING)
 
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
@@ -132,7 +140,8 @@ class CompiledPass:
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
         """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
         found = self._room(grad) if any(learns) else None
-        columns = [at if wanted else None for wanted, at in zip(asked, self._columns, strict=False)]
+        ends = pairwise(accumulate(self._inputs, initial=0))
+        columns = [at if wanted else None for wanted, at in zip(asked, ends, strict=False)]
         wanted = [at for at in columns if at]
         first, end = (wanted[0][0], wanted[-1][1]) if wanted else (0, 0)
         below = grad.new_empty(*self._size, end - first)

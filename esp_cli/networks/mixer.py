@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.functional import elu_
 
-from esp_cli.kernels.library import computes
+from esp_cli.kernels.library import begin, computes
 from esp_cli.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
@@ -40,6 +40,8 @@ class MonotonicMixer(nn.Module):
     ) -> None:
         super().__init__()
         self.num_agents, self.width = num_agents, width
+        if compiled:
+            begin("mixer")
         outputs = num_agents * width + 2 * width + 1
         self.hypernetwork = SeedMLP(generators, (state_width, hidden, outputs), "relu", HYPER_GAIN, compiled=compiled)
 

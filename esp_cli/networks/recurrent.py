@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 
-from esp_cli.kernels.library import computes
+from esp_cli.kernels.library import begin, computes
 from esp_cli.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
 from esp_cli.networks.perceptron import activate_
@@ -29,6 +29,8 @@ class SeedGRU(nn.Module):
     def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int, compiled: bool = False) -> None:
         super().__init__()
         self.hidden, self.compiled = hidden, compiled
+        if compiled:
+            begin("recurrent")
         self.input = SeedLinear(generators, inputs, 3 * hidden, 1.0)
         self.recurrent = SeedLinear(generators, hidden, 3 * hidden, 1.0)
 

@@ -52,9 +52,9 @@ def test_noise_at_its_ends_and_equal_numbers():
 @needs_compiler
 def test_two_actions_by_hand():
     """p = (3/4, 1/4) and its copy, turned, (1/4, 3/4): KL = ln 3 / 2; soft (3/4, 1/4), as both get equal noise."""
-    (swap,) = [g for g in transform_set("rot180", SPACES).each()]
-    logits = torch.tensor([math.log(3.0), 0.0, 0.0, 0.0])  # right, up, left, down; the copy's right is the original's left
-    logits = torch.stack([logits, logits], -1).view(1, 4, 1, 2, 1)
+    (swap,) = transform_set("rot180", SPACES).each()
+    right = torch.tensor([math.log(3.0), 0.0, 0.0, 0.0])  # in the copy, what is left in the original
+    logits = torch.stack([right, right], -1).view(1, 4, 1, 2, 1)
     noise, share = torch.full((1, 1, 1, 1, 4), 0.5), torch.ones(1, 1)
     drawn = draw(logits, 1, noise, compiled=True)
     assert drawn.soft[0, :, 0, 0, 0].tolist() == pytest.approx([1 / 2, 1 / 6, 1 / 6, 1 / 6], abs=1e-5)

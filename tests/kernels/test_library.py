@@ -54,6 +54,7 @@ def without_compiler(_name):
 
 def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
     library.library.cache_clear()
+    library.begin.cache_clear()
     monkeypatch.setenv("CXX", "no-such-compiler")
     result = CliRunner().invoke(app, ["train", "--set", "network.compiled=true", "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
@@ -73,6 +74,7 @@ def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
 )
 def test_a_compiler_that_fails_and_one_that_makes_no_library_are_told(tmp_path, monkeypatch, script, sentence):
     library.library.cache_clear()
+    library.begin.cache_clear()
     compiler = tmp_path / "compiler"
     compiler.write_text(f"#!/bin/sh\n{script}\n")
     compiler.chmod(0o755)
