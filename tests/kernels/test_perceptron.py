@@ -83,6 +83,30 @@ def test_parts_side_by_side_and_frozen_parameters():
 
 
 @needs_compiler
+@pytest.mark.parametrize("axes", [(2, 3, 1, 0, 4), (4, 1, 2, 3, 0), (0, 3, 2, 1, 4)])
+def test_parts_may_lie_anyhow_in_memory(axes):
+    mlp = SeedMLP(generators(0, 1), (9, 16, 3), "tanh", 1.0, compiled=True)
+    places = [axes.index(k) for k in range(5)]
+    size = (2, 6, 5, 7, 4)  # seeds, three axes of rows, columns
+    moved = torch.randn([size[k] for k in axes]).permute(places)
+    shared = torch.randn(7, 1).expand(2, 6, 5, 7, 1)  # the same numbers for all seeds
+    cut = torch.randn(2, 6, 5, 9, 4)[:, :, :, 1:8]
+    assert moved.shape == size
+    parts = [cut, moved.requires_grad_(), shared]
+    ours, theirs = mlp.of_parts(*parts), reference(mlp, torch.cat(parts, -1).flatten(1, 3))
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
+    wanted = [moved, *mlp.parameters()]
+    assert_same_gradients(ours, theirs, torch.randn(2, 210, 3), wanted, rtol=1e-4, atol=1e-4)
+
+
+@needs_compiler
+def test_rows_along_more_axes_than_the_kernel_counts_are_copied():
+    mlp = SeedMLP(generators(0), (2, 16, 3), "relu", 1.0, compiled=True)
+    x = torch.randn(2, 3, 4, 5, 2, 1).permute(5, 3, 0, 2, 1, 4)
+    torch.testing.assert_close(mlp.of_parts(x), reference(mlp, x.flatten(1, -2)), rtol=1e-5, atol=1e-5)
+
+
+@needs_compiler
 def test_parameters_that_are_no_rows_and_no_rows_at_all():
     weight = torch.randn(2, 20, 5).transpose(1, 2)
     x, bias = torch.randn(2, 30, 5), torch.randn(2, 1, 20)

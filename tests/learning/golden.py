@@ -1,12 +1,14 @@
 """Trains small runs through the command line and hashes the weights that they end with.
 
     python tests/learning/golden.py             # write golden_weights.json anew
+    python tests/learning/golden.py --add       # add this processor to it
     python tests/learning/golden.py CASE ...    # print the hashes of some cases
 
-The hashes on file began as those of commit 1b792e9. Write them anew only for a change that is meant to change results.
-To take them from another commit, put its checkout first on the path:
+Processors round otherwise, so the file has hashes for each kind of them, which began as those of commit 1b792e9 on the
+first. Write them anew only for a change that is meant to change results. To take them from another commit, put its
+checkout first on the path:
 
-    PYTHONPATH=OTHER:OTHER/environments python tests/learning/golden.py
+    PYTHONPATH=OTHER:OTHER/environments python tests/learning/golden.py --add
 
 This module therefore uses nothing of the project but its command line and the tensors of a final checkpoint.
 """
@@ -156,7 +158,7 @@ def _described(tensor: Tensor) -> bytes:
 def probe() -> str:
     """Return the hash of fixed computations with the operations of training, and nothing of the project.
 
-    Where it differs from the one on file, processor or libraries round otherwise, and no run can have those weights.
+    Where it differs from those on file, processor or libraries round otherwise, and no run can have those weights.
     """
     generator = torch.Generator().manual_seed(0)
     results: dict[str, Tensor] = {"physics": _fall()}
@@ -197,9 +199,10 @@ def _fall() -> Tensor:
     return torch.stack(rows)
 
 
-def rounds_alike() -> bool:
-    """Return whether this machine can reach the weights on file."""
-    return probe() == json.loads(HASHES.read_text())["probe"]
+def on_file() -> dict[str, dict[str, str]]:
+    """Return the hashes of all cases, by the probe of the processors that reach them."""
+    hashes: dict[str, dict[str, str]] = json.loads(HASHES.read_text())
+    return hashes
 
 
 def measure(cases: Iterable[str]) -> dict[str, str]:
@@ -209,7 +212,8 @@ def measure(cases: Iterable[str]) -> dict[str, str]:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:]:
-        print(json.dumps(measure(sys.argv[1:]), indent=2))
+    if sys.argv[1:] in ([], ["--add"]):
+        others = on_file() if sys.argv[1:] else {}
+        HASHES.write_text(json.dumps(others | {probe(): measure(CASES)}, indent=2) + "\n")
     else:
-        HASHES.write_text(json.dumps({"probe": probe(), "weights": measure(CASES)}, indent=2) + "\n")
+        print(json.dumps(measure(sys.argv[1:]), indent=2))

@@ -158,9 +158,9 @@ def test_unrolling_an_episode_equals_stepping_through_it(name):
 @pytest.mark.parametrize(("name", "norm"), [("mlp", False), ("mlp", True), ("gru", False)])
 def test_the_way_back_by_hand_is_that_of_autograd(name, norm):
     network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8, 8), layer_norm=norm), 1.0)
-    x, gradient = torch.randn(2, 4, 5, 6), torch.randn(2, 4, 5, 3)
+    x, gradient = torch.randn(2, 2, 3, 5, 6), torch.randn(2, 2, 3, 5, 3)  # episodes along two axes
     outputs, pull = network.traced(x)
-    expected = network.unroll(x)
+    expected = network.unroll(x.flatten(1, 2)).unflatten(1, (2, 3))
     torch.testing.assert_close(outputs, expected.detach())
     assert not outputs.requires_grad
     found, parameters = pull(gradient), list(network.parameters())

@@ -8,21 +8,12 @@ The packages need an environment of their own:
         hydra-core tqdm pyyaml
     peers/bin/python tests/benchmarks/peers/benchmarl_spread.py --frames 300000 --seeds 0 --json spread.json
 
-The same task and the same convention here, and both in one file:
-
-    OMP_NUM_THREADS=1 esp train --task navigation --set task.convention=pettingzoo --steps 300k --out runs/spread-esp
-    peers/bin/python tests/benchmarks/peers/benchmarl_spread.py --seeds 0 --json spread.json \
-        --beside MAPPO-ESP=runs/spread-esp
-
-Writes for each run rows of frames, seconds since the start and the mean return of the training episodes: the sum of
-rewards over an episode, as the mean over agents. Prints the mean over the last 6000 frames, which are one row of
-BenchMARL. Goes on where it was when started again.
+The same task and the same convention here, and what the file holds: spread.py. Goes on where it was when started again.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 import time
 import warnings
@@ -31,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from spread import Row, add_missing, summarise
 
 warnings.simplefilter("ignore")
 
@@ -38,8 +30,6 @@ from benchmarl.algorithms import MappoConfig
 from benchmarl.environments import PettingZooTask
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
-
-Row = tuple[int, float, float]
 
 
 class Record(Callback):
@@ -71,32 +61,15 @@ def run(seed: int, frames: int) -> list[Row]:
     return record.rows
 
 
-def run_of_esp(folder: Path) -> list[Row]:
-    """Return the rows of a run folder of one seed."""
-    found = map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())
-    rows = [(row["step"], row["time/elapsed_s"], row["train/return"][0]) for row in found if "train/return" in row]
-    return [row for row in rows if row[2] is not None]
-
-
 def main() -> None:
     """Run the seeds that are missing in the file, and print how each run ends."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=300_000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--beside", nargs="+", default=[], metavar="LABEL=RUN")
     parser.add_argument("--json", type=Path, default=Path("spread.json"))
     given = parser.parse_args()
-    found: dict[str, list[Row]] = json.loads(given.json.read_text()) if given.json.exists() else {}
-    wanted = {f"BenchMARL, seed {seed}": partial(run, seed, given.frames) for seed in given.seeds}
-    wanted |= {name: partial(run_of_esp, Path(folder)) for name, folder in (x.split("=", 1) for x in given.beside)}
-    for name, rows in wanted.items():
-        if name not in found:
-            found[name] = [(frames, round(seconds, 2), round(returns, 3)) for frames, seconds, returns in rows()]
-            given.json.write_text(json.dumps(found) + "\n")
-    for name, rows in found.items():
-        frames, seconds, _ = rows[-1]
-        last = [row[2] for row in rows if row[0] > frames - 6000]
-        print(f"{name}: {sum(last) / len(last):.2f} after {frames} frames and {seconds:.1f} s")
+    add_missing(given.json, {f"BenchMARL, seed {seed}": partial(run, seed, given.frames) for seed in given.seeds})
+    summarise(given.json)
 
 
 if __name__ == "__main__":
