@@ -296,6 +296,7 @@ class TaskSpec(Spaces):
         totals: names of the metrics that add up over an episode; the others are averaged over its steps.
         terminates: whether an episode can reach an end of its own before the horizon, each world at another time.
         agents_end: whether an agent can reach an end of its own before its episode, which goes on for the others.
+        hidden: what decides what follows and is not in the global state, as "delayed actions".
     """
 
     name: str
@@ -307,6 +308,7 @@ class TaskSpec(Spaces):
     totals: tuple[str, ...] = ()
     terminates: bool = False
     agents_end: bool = False
+    hidden: tuple[str, ...] = ()
     settings: dict[str, object] = field(default_factory=dict)
 
     @property

@@ -121,8 +121,8 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
     """A state fixes observations and, where a task has no chance of its own, the next step."""
     env, other, third = subject.worlds(), subject.worlds(seeds=(50, 60)), subject.worlds(seeds=(51, 61))
     require_set_state(env)
-    if subject.hides_state:
-        raise NotAsked("the state leaves something out")
+    if env.spec.hidden:
+        raise NotAsked(f"the state leaves out {' and '.join(env.spec.hidden)}")
     observation, _, _ = env.reset(), other.reset(), third.reset()
     for t in range(min(6, env.spec.horizon - 1)):
         again, seen = (parts_of(worlds.set_state(observation.state)) for worlds in (other, third))
@@ -138,7 +138,11 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
         if not nearly(tensors_of(copy), tensors_of(twin), subject.rounding):
             raise NotAsked("the task has chance of its own")
         same = nearly(tensors_of(copy), tensors_of(step), subject.rounding)
-        require(same, "the step after 'set_state' differs from the one that the state had")
+        require(
+            same,
+            "the step after 'set_state' differs from the one that the state had; "
+            "put into the state what decides it, or name that in 'hidden' of the spec",
+        )
         observation = step.next
 
 

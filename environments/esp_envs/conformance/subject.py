@@ -29,13 +29,11 @@ class Subject:
     Attributes:
         make: makes the worlds, given E and the seeds.
         rounding: how far a step from a restored state may differ, where the physics is finer than float32.
-        hides_state: whether the global state leaves something out, so that nothing is asked of what follows it.
         align: gives the second environment the chance that the first has drawn in advance, at a step of its episode.
     """
 
     make: MakeWorlds
     rounding: float = 0.0
-    hides_state: bool = False
     align: Callable[[Environment, Environment, int], None] | None = None
 
     def worlds(self, num_envs: int = WORLDS, seeds: Sequence[int] = SEEDS) -> Environment:

@@ -131,6 +131,18 @@ class FormationSettings(TaskSettings):
         return min(self.neighbours, self.num_agents - 1)
 
     @property
+    def hidden(self) -> tuple[str, ...]:
+        """What decides the next step and is not in the state."""
+        parts = {
+            "delayed actions": self.action_delay,
+            "wheels of unequal size": self.wheel_mismatch,
+            "masses": self.mass_spread,
+            "grip": self.friction_spread,
+            "wheels and tilts": self.physics == "mujoco-3d",
+        }
+        return tuple(name for name, there in parts.items() if there)
+
+    @property
     def arena(self) -> Arena:
         """The arena that these settings describe."""
         return Arena(self.arena_m, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
@@ -174,6 +186,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         nearly="d4*agents",
         shared_reward=False,
         control_period_s=settings.control_period_s,
+        hidden=settings.hidden,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
         settings=settings.model_dump()
         | {"penalty_radius_m": settings.radius, "collision_penalty": settings.penalty, "sight": settings.seen_as},
