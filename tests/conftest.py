@@ -37,15 +37,6 @@ def nothing_left() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def like_machine() -> None:
-    """Skip where the numbers of old runs are out of reach: they come from the first processor of the golden weights."""
-    from tests.learning.golden import on_file, probe
-
-    if probe() != next(iter(on_file())):
-        pytest.skip("this processor, or its libraries, round otherwise than those that the runs on file come from")
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Skip what needs a GPU where there is none."""
     if torch.cuda.is_available():
