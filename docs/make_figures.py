@@ -157,15 +157,18 @@ def draw_results() -> None:
 
 
 def draw_peers() -> None:
-    """Draw the returns of training over steps and over seconds, each point the mean over 6000 steps."""
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
+    """Draw the returns of training over steps and over seconds, a line a seed, each point the mean over 6000 steps."""
+    figure = Figure(figsize=(8.0, 3.8), layout="constrained")
     both = figure.subplots(1, 2, sharey=True)
     runs = json.loads((MEASURED / "peers-spread.json").read_text(encoding="utf-8"))
-    for k, (name, rows) in enumerate(runs.items()):
+    labels = list(dict.fromkeys(name.rsplit(", seed ", 1)[0] for name in runs))
+    for name, rows in runs.items():
+        label, seed = name.rsplit(", seed ", 1)
+        named = label if seed == "0" else None
         points = np.array([np.mean([*block], 0) for _, block in groupby(rows, lambda row: (row[0] - 1) // 6000)])
-        colour, dashes = appearance(k)
+        colour, dashes = appearance(labels.index(label))
         for ax, x in zip(both, points.T, strict=False):
-            ax.plot(x, points[:, 2], color=colour, linestyle=dashes, label=name)
+            ax.plot(x, points[:, 2], color=colour, linestyle=dashes, linewidth=1.0, label=named)
     for ax, label in zip(both, ("environment steps", "seconds"), strict=True):
         ax.set_xlabel(label)
         ax.grid(alpha=0.4)
@@ -173,7 +176,7 @@ def draw_peers() -> None:
     both[0].set_ylabel("return in training")
     both[0].xaxis.set_major_formatter(EngFormatter(sep=""))
     both[1].set_xscale("log")
-    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs))
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.savefig(MEASURED / "peers-spread.png", dpi=150, metadata={"Software": None})
 
 
