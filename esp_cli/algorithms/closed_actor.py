@@ -2,7 +2,8 @@
 
 `Maddpg.reference_gradient` says in the terms of the paper what this is the gradient of; tests hold both together.
 
-Shape letters: S seeds, A actions, N agents, P parts (the originals and K copies of them), R rows of a part.
+Shape letters: S seeds, A actions, N agents, P parts (the originals and K copies of them), of which the first L are
+learned from, R rows of a part.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Draw:
     """Actions drawn from a policy, through which gradients flow (straight-through Gumbel-softmax).
 
     Attributes:
-        soft: [S, A, N, P, R] softmax(logits + Gumbel), whose gradient is taken.
-        hard: [S, P R, N, A] the one-hot of its largest number: what the critic is asked about. Equal ones share it.
+        soft: [S, A, N, L, R] softmax(logits + Gumbel), whose gradient is taken.
+        hard: [S, L R, N, A] the one-hot of its largest number: what the critic is asked about. Equal ones share it.
     """
 
     soft: Tensor
@@ -54,7 +55,7 @@ def draw(logits: Tensor, num_learned: int, noise: Tensor, compiled: bool = False
 
     Args:
         logits: [S, A, N, P, B T].
-        num_learned: how many of the P parts.
+        num_learned: L.
         noise: [S, B, T, N, A] uniform in [0, 1), the same for all parts.
         compiled: whether the kernel draws them, on the CPU.
     """
@@ -84,7 +85,7 @@ def actor_gradient(
     Args:
         logits: [S, A, N, P, R] of all parts, not pulled back.
         drawn: from the parts that are learned from: all, or the originals.
-        by_action: [S, P R, N, A] gradient of the loss by what was drawn.
+        by_action: [S, L R, N, A] gradient of the loss by what was drawn.
         share: [S, R] of each row in the mean over the originals; 0 where it does not count.
         transforms: K, with which the copies were made.
         weights: of the other terms.

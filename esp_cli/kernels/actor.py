@@ -29,16 +29,20 @@ def draw(logits: Tensor, num_learned: int, noise: Tensor) -> tuple[Tensor, Tenso
         noise: [S, ..., N, A] of R rows, uniform in [0, 1).
 
     Returns:
-        softmax(logits + Gumbel) of the first L parts, with room for all [S, A, N, P, R]; and the one-hot of its largest
-        number [S, L R, N, A].
+        softmax(logits + Gumbel) [S, A, N, L, R], and the one-hot of its largest number [S, L R, N, A].
+
+    Raises:
+        ValueError: there are fewer parts.
     """
-    num_seeds, num_actions, num_agents, _, num_rows = logits.shape
+    num_seeds, num_actions, num_agents, num_parts, num_rows = logits.shape
+    if num_learned > num_parts:
+        raise ValueError(f"{num_learned} parts of {num_parts} cannot be learned from")
     logits, noise = logits.contiguous(), noise.contiguous()
     soft = torch.empty_like(logits)
     hard = logits.new_empty(num_seeds, num_learned * num_rows, num_agents, num_actions)
     orders, actor = orders_of(logits, []), _Actor(learned=num_learned, soft=soft.data_ptr())
     call("actor", "draw", Policies.of(logits, orders), actor, noise, hard)
-    return soft, hard
+    return soft[:, :, :, :num_learned], hard
 
 
 def actor_gradient(
@@ -56,7 +60,7 @@ def actor_gradient(
 
     Args:
         logits: [S, A, N, P, R].
-        soft: of `draw`.
+        soft: of `draw`, of the first L parts.
         by_action: [S, L R, N, A] gradient by what was drawn.
         share: [S, R] of each row in the mean.
         back: of each copy, [S or 1, A]: which action of it is the original's.
@@ -68,7 +72,7 @@ def actor_gradient(
     logits, by_action, share = logits.contiguous(), by_action.contiguous(), share.contiguous()
     gradient, entropy = torch.empty_like(logits), torch.empty_like(share)
     actor = _Actor(
-        by_action.shape[1] // share.shape[1],
+        soft.shape[3],
         stop_gradient != "original",
         stop_gradient != "transformed",
         output_penalty,

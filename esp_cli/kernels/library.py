@@ -71,13 +71,18 @@ def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
     if shutil.which(compiler[0]) is None:
         raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
     folder = tempfile.TemporaryDirectory()
-    command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(Path(folder.name) / name)]
-    compiling = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
-    if compiling.returncode:
-        said = compiling.stderr
-        line = next((line for line in said.splitlines() if "error" in line), said.strip())
+    built, log = Path(folder.name) / name, Path(folder.name) / "log"
+    command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(built)]
+    with log.open("wb") as said:  # not a pipe, which a process forked meanwhile would hold open
+        failed = subprocess.run(command, check=False, stderr=said).returncode
+    if failed:
+        lines = log.read_text(errors="replace").strip().splitlines() or ["it says nothing"]
+        line = next((line for line in lines if "error" in line), lines[-1])
         raise ValueError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
     return folder
+
+
+os.register_at_fork(after_in_child=begin.cache_clear)  # a forked process has no thread that would end what was begun
 
 
 def call(kernel: str, function: str, *arguments: ctypes.Structure | ctypes.Array[Any] | Tensor | None) -> None:

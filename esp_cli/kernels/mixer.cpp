@@ -83,9 +83,10 @@ void mix_forward(const Perceptron *hypernetwork, const Mixer *mixer, float *tota
     });
 }
 
-// Compute the gradients by the hypernetwork's parameters and by the agents' values [S, R, N], from that by the team's.
+// Compute the gradients by the hypernetwork's parameters, by what it sees, and by the agents' values [S, R, N], from
+// that by the team's.
 void mix_backward(const Perceptron *hypernetwork, const Mixer *mixer, const float *by_total, float *by_parameters,
-                  float *by_own) {
+                  const Below *below, float *by_own) {
     const Layout net(*hypernetwork);
     const int64_t last = net.layers - 1, width = padded(net.out(last)), room = net.packed_room();
     Scratch packed = scratch(net.seeds * room);
@@ -97,7 +98,7 @@ void mix_backward(const Perceptron *hypernetwork, const Mixer *mixer, const floa
             unmix(*mixer, mixer->own + first, to + r * width, by_total[row], by_own + first);
         }
     };
-    pull(net, by_parameters, Below{}, [&](int64_t s) { pack(net, s, packed.get() + s * room); }, fill);
+    pull(net, by_parameters, *below, [&](int64_t s) { pack(net, s, packed.get() + s * room); }, fill);
 }
 
 }

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from math import prod
 
 import torch
 from torch import Tensor
 
 from esp_cli.kernels.library import call, fields
-from esp_cli.kernels.perceptron import CompiledPass
+from esp_cli.kernels.perceptron import Below, CompiledPass
 
 
 class _Mixer(ctypes.Structure):
@@ -28,20 +29,28 @@ class CompiledMixer(CompiledPass):
 
     Attributes:
         outputs: the team's values [S, B].
+
+    Raises:
+        ValueError: other numbers of rows.
     """
 
     def __init__(
         self, own: Tensor, inputs: Sequence[Tensor], parameters: Sequence[Tensor], width: int, keep: bool
     ) -> None:
-        self._own = own.detach()
+        if own.shape[:2] != (inputs[0].shape[0], prod(inputs[0].shape[1:-1])):
+            raise ValueError(f"a mixer got values {list(own.shape)} for states {list(inputs[0].shape)}")
+        self._own, self._by_own = own.detach(), torch.empty_like(own)
         self._mixer = _Mixer(own.shape[2], width, own.data_ptr())
         super().__init__(inputs, parameters, "relu", False, keep=keep)
 
-    def unmix(self, grad: Tensor, learns: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
-        """Return the gradients by the agents' values and by the parameters that learn."""
-        by_own, found, grad = torch.empty_like(self._own), self._room(grad), grad.contiguous()
-        call("mixer", "mix_backward", self._arguments, self._mixer, grad, found, by_own)
-        return by_own, self._split(found, learns)
+    def unmix(
+        self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
+    ) -> tuple[Tensor, list[Tensor | None], list[Tensor | None]]:
+        """Return the gradients by the agents' values, by the parameters that learn and by the inputs that ask."""
+        return self._by_own, *self.backward_to(grad.contiguous(), learns, asked)
+
+    def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
+        call("mixer", "mix_backward", self._arguments, self._mixer, grad, found, below, self._by_own)
 
     def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
         total = like.new_empty(self._size)

@@ -1,8 +1,8 @@
 // Passes of S seeds through a perceptron at once, in blocks of rows that stay in a core's cache through all layers.
 //
 // Parameters are [S, in, out] and [S, 1, out], inputs [S, R, in] in parts that may lie anyhow in memory. What hidden
-// layers give is kept as [S, R, padded(out)], layer after layer. A seed's gradient is summed over parts of its rows that
-// depend on R alone, so the results depend neither on the other seeds nor on the number of threads.
+// layers give is kept as [S, R, padded(out)], layer after layer. A seed's gradient is summed over parts of its rows
+// that depend on R alone, so the results depend neither on the other seeds nor on the number of threads.
 
 #pragma once
 
@@ -211,7 +211,8 @@ void pull_block(const Layout &net, int64_t seed, Span span, bool add, const floa
         std::swap(here, next);
     }
     int64_t columns = below.columns.size();
-    copy(span.size(), columns, {here, padded(columns), 1}, below.at + (seed * net.rows + span.begin) * columns, columns, 1);
+    float *to = below.at + (seed * net.rows + span.begin) * columns;
+    copy(span.size(), columns, {here, padded(columns), 1}, to, columns, 1);
 }
 
 // Add the sums of a seed's parts to its gradients [P].
@@ -230,9 +231,9 @@ void add_up(const Layout &net, const float *from, float *gradients) {
     }
 }
 
-// Pull gradients back: to the parameters, [S, P] in their order, and to the inputs, each unless there is no room for it.
-// prepare(seed) comes first; fill(seed, rows, to) writes the gradient by a block of outputs, [rows, padded(out)], filled
-// up with zeros.
+// Pull gradients back: to the parameters, [S, P] in their order, and to the inputs, each where there is room for it.
+// prepare(seed) comes first; fill(seed, rows, to) writes the gradient by a block of outputs, [rows, padded(out)],
+// filled up with zeros.
 template <class Prepare, class Fill>
 void pull(const Layout &net, float *by_parameters, const Below &below, Prepare prepare, Fill fill) {
     int64_t turned_room = 0, sum_room = 0, count = 0;

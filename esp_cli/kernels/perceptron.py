@@ -45,7 +45,9 @@ class _Rows(ctypes.Structure):
         return cls(x.data_ptr(), *x.stride())
 
 
-class _Below(ctypes.Structure):
+class Below(ctypes.Structure):
+    """Where the gradient by some columns of the inputs goes."""
+
     _fields_ = (("at", ctypes.c_void_p), *fields(ctypes.c_int64, "begin", "end"))
 
 
@@ -66,7 +68,7 @@ def _counted(x: Tensor) -> tuple[Tensor, tuple[int, ...], tuple[int, ...]]:
     while len(sizes) > _AXES and sizes[0] == 1:
         del sizes[0], strides[0]
     if len(sizes) > _AXES:
-        return _counted(x.contiguous())
+        return _counted(x.contiguous()) if x.numel() else (x, (1, 1, 0), (0, 0, 0))
     return x, tuple(sizes), tuple(strides)
 
 
@@ -86,7 +88,8 @@ class CompiledPass:
     """A pass through a perceptron that keeps its activations until its `backward`; see `perceptron.Pass`.
 
     Args:
-        inputs: [S, ..., d] parts of x, side by side, on the CPU; they may lie anyhow in memory.
+        inputs: [S, ..., d] parts of x, side by side, on the CPU; they may lie anyhow in memory, and are read again by
+            the backward.
         parameters: W_1, b_1, ..., W_n, b_n.
         activation: "relu" or "tanh".
         activate_output: whether it ends with an activation.
@@ -95,6 +98,9 @@ class CompiledPass:
 
     Attributes:
         outputs: y [S, B, out].
+
+    Raises:
+        ValueError: inputs of other shapes or numbers than the parameters take.
     """
 
     def __init__(
@@ -111,7 +117,12 @@ class CompiledPass:
         self._inputs = [x.shape[-1] for x in inputs]
         self._shapes = [p.shape[1:] for p in parameters]
         self._widths = (sum(self._inputs), *(size[1] for size in self._shapes[1::2]))
-        self._size = (inputs[0].shape[0], prod(inputs[0].shape[1:-1]))
+        self._size = (parameters[0].shape[0], prod(inputs[0].shape[1:-1]))
+        if self._widths[0] != self._shapes[0][0] or any(
+            (x.shape[0], prod(x.shape[1:-1])) != self._size or x.dtype != torch.float32 for x in inputs
+        ):
+            shapes = ", ".join(f"{x.dtype} {list(x.shape)}" for x in inputs)
+            raise ValueError(f"a perceptron for float32 rows [{self._size[0]}, ..., {self._shapes[0][0]}] got {shapes}")
         activated = self._widths[1:] if activate_output else self._widths[1:-1]
         hidden = given[0].new_empty(prod(self._size) * sum(map(padded, activated))) if keep else None
         columns = (_Columns * len(parts))(*(_Columns.of(*part) for part in parts))
@@ -132,7 +143,7 @@ class CompiledPass:
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
         found = self._room(grad)
-        self._pull(grad, found, _Below())
+        self._pull(grad, found, Below())
         return [found]
 
     def backward_to(
@@ -145,7 +156,7 @@ class CompiledPass:
         wanted = [at for at in columns if at]
         first, end = (wanted[0][0], wanted[-1][1]) if wanted else (0, 0)
         below = grad.new_empty(*self._size, end - first)
-        self._pull(grad, found, _Below(below.data_ptr() if wanted else None, first, end))
+        self._pull(grad, found, Below(below.data_ptr() if wanted else None, first, end))
         return self._split(found, learns), [at and below[..., at[0] - first : at[1] - first] for at in columns]
 
     def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
@@ -157,7 +168,7 @@ class CompiledPass:
         call("perceptron", "forward", self._arguments, _Rows.of(outputs))
         return outputs
 
-    def _pull(self, grad: Tensor, found: Tensor | None, below: _Below) -> None:
+    def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
         """Write the gradients by all parameters [S, P] and by some columns of the inputs, where there is room."""
         call("perceptron", "backward", self._arguments, _Rows.of(grad), found, below)
 

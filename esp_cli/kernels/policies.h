@@ -58,8 +58,10 @@ void each_batch(const Policies &of, int64_t vectors, Use use) {
 #pragma omp for schedule(static)
         for (int64_t task = 0; task < shares.tasks; task++)
             for (Span left = shares.of(task); left.size() > 0; left.begin += LANES)
-                for (int64_t n = 0; n < of.agents; n++)
-                    use(Batch{of, task / shares.parts, n, left.begin, std::min<int64_t>(LANES, left.size())}, &vec(own.get()));
+                for (int64_t n = 0; n < of.agents; n++) {
+                    int64_t count = std::min<int64_t>(LANES, left.size());
+                    use(Batch{of, task / shares.parts, n, left.begin, count}, &vec(own.get()));
+                }
     }
 }
 

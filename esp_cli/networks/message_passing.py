@@ -9,13 +9,13 @@ values, permuted actions.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from pydantic import Field as Setting
 from torch import Tensor, nn
-from torch.nn.functional import conv2d
+from torch.autograd import Function
 
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
 from esp_cli.networks.contract import Memoryless, Network, NetworkConfig
@@ -66,80 +66,90 @@ class PictureEncoder(nn.Module):
             block = following
         self.layers = nn.ModuleList(layers)
         self.output = block
-        generator = torch.Generator().manual_seed(0)
+        keys = torch.randn(2, field.width, generator=torch.Generator().manual_seed(0))
         self.keys: Tensor
-        self.register_buffer("keys", torch.randn(2, field.width, generator=generator), False)
-        depths = (field.count, *[2] * (len(self.sides) - 1))
-        for k, (depth, side) in enumerate(zip(depths, self.sides, strict=True)):
-            self.register_buffer(f"filter_{k}", torch.randn(2, depth, side, side, generator=generator), False)
+        self.register_buffer("keys", keys, False)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Encode pictures; equal pictures are encoded once. No gradient reaches a picture."""
-        which, place = distinct(pictures.detach() @ self.keys.T)
-        return taken(self.encode(taken(pictures.detach(), which)), place)
+        which, place = distinct(pictures.detach(), self.keys)
+        num_seeds, batch = place.shape
+        seeds = torch.arange(num_seeds, device=place.device).unsqueeze(1)
+        rows = pictures.detach().flatten(0, 1).index_select(0, (which + batch * seeds).flatten())
+        features = self.encode(rows.unflatten(0, which.shape))
+        index = (place + which.shape[1] * seeds).flatten()
+        return features.flatten(0, 1).index_select(0, index).unflatten(0, place.shape)
 
     def encode(self, pictures: Tensor) -> Tensor:
         """Encode every picture."""
-        *_, (features, place) = self.convolved(pictures)
-        place, order = place.flatten(2), features.detach().argsort(1)
-        rank = torch.arange(float(order.shape[1]), device=order.device).view(1, -1, 1).expand(order.shape)
-        rank = torch.empty_like(rank).scatter_(1, order, rank)
-        highest = taken(rank, place.flatten(1)).unflatten(1, place.shape[1:]).amax(2)
-        return features.gather(1, order.gather(1, highest.long()))  # so that a gradient reaches the largest alone
+        return self.responses(self.as_pictures(pictures))[-1].flatten(2, 3).amax(2)
 
-    def convolved(self, pictures: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield what each layer says of pictures [S, B, D], equal patches once.
+    def as_pictures(self, rows: Tensor) -> Tensor:
+        """Shape rows of numbers [S, B, D] as pictures [S, B, rows, columns, channels]."""
+        return rows.unflatten(-1, self.shape).movedim(2, -1)
 
-        Yields:
-            Features [S, U, C], and which of them stand where: [S, B, rows, columns].
-        """
-        num_seeds, batch = pictures.shape[:2]
-        code = pictures.view(-1, *self.shape)  # of pixels, later of features: equal ones have equal codes
-        features = code.flatten(2).transpose(1, 2).reshape(num_seeds, -1, self.shape[0])
-        place = torch.arange(features.shape[1], device=code.device).view(1, batch, *self.shape[1:])
-        place = place.expand(num_seeds, -1, -1, -1)
-        for k, (layer, side, stride) in enumerate(zip(self.layers, self.sides, self.strides, strict=True)):
+    def responses(self, x: Tensor) -> list[Tensor]:
+        """Return the output of each layer for pictures [S, B, rows, columns, channels], in the same layout."""
+        out = []
+        for layer, side, stride in zip(self.layers, self.sides, self.strides, strict=True):
             assert isinstance(layer, ConstrainedLinear)
-            marks = conv2d(code, getattr(self, f"filter_{k}"), stride=stride).unflatten(0, (num_seeds, batch))
-            which, sort = distinct(marks.movedim(2, -1).flatten(1, 3))
-            seen = place.unfold(2, side, stride).unfold(3, side, stride)  # [S, B, rows, columns, side, side]
-            size, seeds = seen.shape[1:4], torch.arange(num_seeds, device=code.device).unsqueeze(1)
-            patches = taken(features, seen[(seeds, *torch.unravel_index(which, size))].flatten(1))
+            num_seeds, batch = x.shape[:2]
+            rows, columns = ((length - side) // stride + 1 for length in x.shape[2:4])
+            patches = _Patches.apply(x, side, stride)  # type: ignore[no-untyped-call]
             # a constrained weight orders channels, then pixels; a patch orders pixels, then channels, for long copies
             weight = layer.weight().unflatten(1, (-1, side * side)).transpose(1, 2).flatten(1, 2)
-            features = torch.relu(affine(layer.bias(), patches.view(num_seeds, which.shape[1], -1), weight))
-            place = sort.view(num_seeds, *size)
-            codes = torch.randn(which.shape[1], 2, generator=torch.Generator().manual_seed(k)).to(code.device)
-            code = codes[place].flatten(0, 1).movedim(-1, 1)
-            yield features, place
+            x = torch.relu(affine(layer.bias(), patches, weight)).view(num_seeds, batch, rows, columns, -1)
+            out.append(x)
+        return out
 
 
-def taken(rows: Tensor, which: Tensor) -> Tensor:
-    """Return some rows [S, U, D] of each seed's [S, B, D], by their indices [S, U]."""
-    shifted = which + rows.shape[1] * torch.arange(rows.shape[0], device=rows.device).unsqueeze(1)
-    return rows.flatten(0, 1).index_select(0, shifted.flatten()).unflatten(0, which.shape)
+class _Patches(Function):
+    """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C].
+
+    Torch's backward of the view adds single numbers; this backward adds whole pictures.
+    """
+
+    @staticmethod
+    def forward(ctx, x, side, stride):  # type: ignore[no-untyped-def]
+        patches = x.unfold(2, side, stride).unfold(3, side, stride).permute(0, 1, 2, 3, 5, 6, 4)
+        ctx.shape, ctx.patches, ctx.stride = x.shape, patches.shape, stride
+        return patches.reshape(x.shape[0], -1, side * side * x.shape[-1])
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        if not ctx.needs_input_grad[0]:
+            return None, None, None
+        (_, _, rows, columns, side, _, _), stride = ctx.patches, ctx.stride
+        grad, out = grad.reshape(ctx.patches), grad.new_zeros(ctx.shape)
+        for i in range(side):
+            for j in range(side):
+                last_row, last_column = i + (rows - 1) * stride + 1, j + (columns - 1) * stride + 1
+                out[:, :, i:last_row:stride, j:last_column:stride] += grad[:, :, :, :, i, j]
+        return out, None, None
 
 
-def distinct(marks: Tensor) -> tuple[Tensor, Tensor]:
+def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
     """Find the different rows; a batch of thousands of pictures of a torus with 49 cells has 49.
 
     Two fixed random projections identify a row; two different rows collide with probability 2^-46.
 
     Args:
-        marks: [S, B, 2] projections.
+        rows: [S, B, D].
+        keys: [2, D].
 
     Returns:
         which: [S, U] for each seed the index of one row of each kind; the rest is padding.
         place: [S, B] the kind of each row.
     """
-    num_seeds, batch, _ = marks.shape
-    first, second = marks.contiguous().view(torch.int32).long().unbind(-1)
-    keys, order = ((first << 32) ^ (second & 0xFFFFFFFF)).sort(1)
+    num_seeds, batch, width = rows.shape
+    flat = rows.reshape(-1, width)
+    first, second = ((flat @ key).view(torch.int32).long() for key in keys)
+    marks, order = ((first << 32) ^ (second & 0xFFFFFFFF)).view(num_seeds, batch).sort(1)
     sort = torch.zeros_like(order)
-    sort[:, 1:] = (keys[:, 1:] != keys[:, :-1]).cumsum(1)
+    sort[:, 1:] = (marks[:, 1:] != marks[:, :-1]).cumsum(1)
     sorts = min(batch, -(-(int(sort[:, -1].max()) + 1) // _LOT) * _LOT)
     place = torch.empty_like(order).scatter_(1, order, sort)
-    which = torch.zeros(num_seeds, sorts, dtype=torch.int64, device=marks.device).scatter_(1, sort, order)
+    which = torch.zeros(num_seeds, sorts, dtype=torch.int64, device=rows.device).scatter_(1, sort, order)
     return which, place
 
 

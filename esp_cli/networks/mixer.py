@@ -53,9 +53,9 @@ class MonotonicMixer(nn.Module):
         """
         own = values.reshape(values.shape[0], -1, values.shape[-1])
         if computes(self.hypernetwork.compiled, state):
-            layers = self.hypernetwork.parameters()
-            return _CompiledMixed.apply(own.contiguous(), state, self.width, *layers).view(values.shape[:-1])  # type: ignore[no-untyped-call]
-        seen, size = state.flatten(1, -2), max(1, CACHED_ROWS // values.shape[0])
+            given = (own.contiguous(), state, *self.hypernetwork.parameters())
+            return _CompiledMixed.apply(self.width, torch.is_grad_enabled(), *given).view(values.shape[:-1])  # type: ignore[no-untyped-call]
+        seen, size = state.reshape(len(state), -1, state.shape[-1]), max(1, CACHED_ROWS // values.shape[0])
         pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
         return torch.cat(pieces, 1).view(values.shape[:-1])
 
@@ -102,16 +102,16 @@ class _CompiledMixed(Function):
     """The same by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
 
     @staticmethod
-    def forward(ctx, own, state, width, *parameters):  # type: ignore[no-untyped-def]
-        ctx.run = CompiledMixer(own, [state], parameters, width, keep=any(ctx.needs_input_grad))
-        ctx.save_for_backward(own, *parameters)  # so that autograd notices a change of them
+    def forward(ctx, width, keep, own, state, *parameters):  # type: ignore[no-untyped-def]
+        ctx.run = CompiledMixer(own, [state], parameters, width, keep)
+        ctx.save_for_backward(own, state, *parameters)  # so that autograd notices a change of them
         return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _ = ctx.saved_tensors
-        by_own, grads = ctx.run.unmix(grad, ctx.needs_input_grad[3:])
-        return by_own, None, None, *grads
+        _, state, *_ = ctx.saved_tensors
+        by_own, grads, (by_state,) = ctx.run.unmix(grad, ctx.needs_input_grad[4:], ctx.needs_input_grad[3:4])
+        return None, None, by_own, None if by_state is None else by_state.view(state.shape), *grads
 
 
 def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

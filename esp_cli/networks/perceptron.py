@@ -64,7 +64,7 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
 
 def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
-    """Return a pass with a backward to call by hand; arguments as of `perceptron`."""
+    """Return a pass with a backward to call by hand, before which the inputs must not change; arguments as above."""
     return (_compiled if computes(shape.compiled, inputs[0]) else Pass)(shape, inputs, parameters)
 
 
@@ -158,7 +158,7 @@ class _Perceptron(Function):
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
         inputs = tensors[:num_inputs]
         ctx.sizes, ctx.run = [x.shape[1:-1] for x in inputs], passed(shape, inputs, tensors[num_inputs:])
-        ctx.save_for_backward(*tensors[num_inputs:])  # so that autograd notices a change of them
+        ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
         return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
@@ -193,6 +193,7 @@ def _backward(
     for k in reversed(range(len(weights))):
         if learns[2 * k]:
             grads[2 * k] = _outer(run[k], here, grads[2 * k])
+        if learns[2 * k + 1]:
             grads[2 * k + 1] = _added(here.sum(1, keepdim=True), grads[2 * k + 1])
         if k > 0:
             here = _activation_backward(_down(here, weights[k]), run[k], shape.activation)

@@ -103,7 +103,6 @@ def _cases() -> Iterator[tuple[str, Case]]:
         options = f"--algo {algorithm}" + f" --network {network}" * bool(network)
         yield f"{name}, plain, 10 seeds", Training(f"{options} --prior none", 10, 12 * 200)
         yield f"{name}, esp, 10 seeds", Training(options, 10, 12 * 200)
-    yield "mappo on wildlife, esp, 1 seed", Training("--task wildlife", 1, 12 * 1024)
     yield "formation, esp train end to end, 1 seed", Training("--task formation", 1, 48_000, end_to_end=True)
     for task in ("navigation", "predator-prey", "wildlife"):
         yield f"{task} worlds", Worlds(task)

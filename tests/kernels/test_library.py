@@ -1,15 +1,18 @@
 """Learners learn the same with the kernels, and a missing compiler is told."""
 
 import gc
+import os
 import weakref
 
 import pytest
 import torch
+from torch.autograd.function import BackwardCFunction
 from typer.testing import CliRunner
 
 from esp_cli.app import app
 from esp_cli.kernels import library
 from esp_cli.networks.layers import SeedMLP
+from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.recurrent import SeedGRU
 from esp_cli.training.build import build_learner
@@ -83,23 +86,45 @@ def test_a_compiler_that_fails_and_one_that_makes_no_library_are_told(tmp_path, 
         library.library("mixer")
 
 
+def test_a_forked_process_compiles_for_itself(tmp_path, monkeypatch):
+    """What a thread of its parent had begun would never end in it."""
+    compiler = tmp_path / "compiler"
+    compiler.write_text("#!/bin/sh\nsleep 1\nexit 1\n")
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    library.begin.cache_clear()
+    begun = library.begin("mixer")
+    child = os.fork()
+    if child == 0:
+        os._exit(library.begin("mixer") is begun)
+    assert os.waitpid(child, 0)[1] == 0
+    assert library.begin("mixer") is begun
+    library.begin.cache_clear()
+
+
 def test_bfloat16_and_the_kernel_exclude_each_other():
     with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
         MlpConfig(compiled=True, precision="bfloat16")
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
-@pytest.mark.parametrize("kind", ["perceptron", "recurrent"])
+@pytest.mark.parametrize("kind", ["perceptron", "recurrent", "mixer"])
 def test_what_a_pass_keeps_goes_with_its_outputs(kind, compiled):
     """Not with the next visit of the garbage collector: until then a learner would fill gigabytes."""
     x = torch.randn(1, 8, 5, 4, requires_grad=True)
     perceptron = SeedMLP(generators(0), (4, 6, 3), "relu", 1.0, activate_output=True, compiled=compiled)
     unit = SeedGRU(generators(0), 4, 6, compiled)
+    mixer = MonotonicMixer(generators(0), 5, 4, 3, 6, compiled)
     gc.collect()
     gc.disable()
     try:
-        outputs = perceptron(x.flatten(1, 2)) if kind == "perceptron" else unit.unroll(x)
-        kept = weakref.ref(outputs.grad_fn)
+        made = {"perceptron": lambda: perceptron(x.flatten(1, 2)), "recurrent": lambda: unit.unroll(x)}
+        outputs = (made | {"mixer": lambda: mixer(x[..., 0], x[:, :, 0])})[kind]()
+        node = outputs.grad_fn
+        while not isinstance(node, BackwardCFunction):  # the mixer's stands behind views
+            ((node, _), *_) = node.next_functions
+        kept = weakref.ref(node)
+        del node
         assert kept() is not None
         del outputs
         assert kept() is None

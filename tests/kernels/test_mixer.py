@@ -16,14 +16,21 @@ from tests.networks.test_layers import generators
 def test_values_and_gradients_equal_those_of_torch(num_agents, width, rows):
     torch.manual_seed(0)
     compiled, eager = (MonotonicMixer(generators(0, 1), num_agents, 6, width, 16, c) for c in (True, False))
-    state, weight = torch.randn(2, rows, 6), torch.randn(2, rows)
+    state, weight = torch.randn(2, rows, 6, requires_grad=True), torch.randn(2, rows)
     found = []
     for mixer in (compiled, eager):
         own = torch.randn(2, rows, num_agents, generator=torch.Generator().manual_seed(1)).requires_grad_()
         total = mixer(own, state)
-        found.append([total, *torch.autograd.grad((total * weight).sum(), [own, *mixer.parameters()])])
+        found.append([total, *torch.autograd.grad((total * weight).sum(), [own, state, *mixer.parameters()])])
     for ours, theirs in zip(*found, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5 * max(1.0, theirs.abs().max().item()))
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_values_may_have_any_axes(compiled):
+    mixer = MonotonicMixer(generators(0, 1), 3, 6, 5, 8, compiled)
+    values, state = torch.randn(2, 4, 7, 3), torch.randn(2, 4, 7, 6)
+    torch.testing.assert_close(mixer(values, state)[:, 2, 5], mixer(values[:, 2, 5], state[:, 2, 5]))
 
 
 @needs_compiler
@@ -35,7 +42,7 @@ def test_two_agents_and_two_units_by_hand():
     run = CompiledMixer(own, [torch.randn(1, 1, 4)], [*hidden, torch.zeros(1, 5, 9), weights], 2, keep=True)
     below = math.exp(-1) - 1
     assert run.outputs.item() == pytest.approx(2 * 9 + 3 * below - 2, abs=1e-5)
-    by_own, (_, by_hidden, by_last, by_weights) = run.unmix(torch.tensor([[10.0]]), [True] * 4)
+    by_own, (_, by_hidden, by_last, by_weights), _ = run.unmix(torch.tensor([[10.0]]), [True] * 4, [False])
     first, second = 20.0, 30 * math.exp(-1)  # by the sums of both units
     assert by_own.flatten().tolist() == pytest.approx([first + second, 2 * first], abs=1e-3)
     by_hand = [2 * first, -2 * second, -3 * first, 0.0, first, second, -90.0, 10 * below, 10.0]
@@ -52,7 +59,7 @@ def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits():
 
     def found(seeds):
         run = CompiledMixer(own[seeds], [state[seeds]], [p[seeds] for p in parameters], 20, keep=True)
-        by_own, grads = run.unmix(grad[seeds], [True] * 4)
-        return [run.outputs, by_own, *grads]
+        by_own, grads, below = run.unmix(grad[seeds], [True] * 4, [True])
+        return [run.outputs, by_own, *grads, *below]
 
     assert_same_bits_alone_and_for_any_threads(found, 3)

@@ -99,11 +99,49 @@ def test_parts_may_lie_anyhow_in_memory(axes):
     assert_same_gradients(ours, theirs, torch.randn(2, 210, 3), wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_a_change_of_inputs_before_the_backward_is_noticed(compiled):
+    mlp = SeedMLP(generators(0), (5, 16, 3), "tanh", 1.0, compiled=compiled)
+    x, more = torch.randn(1, 7, 4), torch.randn(1, 7, 1)
+    y = mlp.of_parts(x, more)
+    x.zero_()
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        y.sum().backward()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [torch.zeros(1, 7, 4)],
+        [torch.zeros(1, 7, 3), torch.zeros(1, 6, 2)],
+        [torch.zeros(2, 7, 5)],
+        [torch.zeros(1, 7, 5, dtype=torch.float64)],
+    ],
+)
+def test_inputs_of_other_shapes_or_numbers_are_refused(parts):
+    """The kernel would read foreign memory."""
+    mlp = SeedMLP(generators(0), (5, 16, 3), "tanh", 1.0, compiled=True)
+    with pytest.raises(ValueError, match=r"a perceptron for float32 rows \[1, ..., 5\] got"):
+        mlp.of_parts(*parts)
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("frozen", [0, 1, 2, 3])
+def test_a_frozen_parameter_leaves_the_others_their_gradients(frozen, compiled):
+    mlp = SeedMLP(generators(0, 1), (5, 16, 3), "tanh", 1.0, compiled=compiled)
+    list(mlp.parameters())[frozen].requires_grad_(False)
+    x = torch.randn(2, 7, 5)
+    learning = [p for p in mlp.parameters() if p.requires_grad]
+    assert_same_gradients(mlp(x), reference(mlp, x), torch.randn(2, 7, 3), learning, rtol=1e-4, atol=1e-4)
+
+
 @needs_compiler
 def test_rows_along_more_axes_than_the_kernel_counts_are_copied():
     mlp = SeedMLP(generators(0), (2, 16, 3), "relu", 1.0, compiled=True)
     x = torch.randn(2, 3, 4, 5, 2, 1).permute(5, 3, 0, 2, 1, 4)
     torch.testing.assert_close(mlp.of_parts(x), reference(mlp, x.flatten(1, -2)), rtol=1e-5, atol=1e-5)
+    assert mlp.of_parts(x[:, :, :0]).shape == (1, 0, 3)
 
 
 @needs_compiler

@@ -10,7 +10,7 @@ from esp_cli.networks.build import NETWORKS, NetworkConfig, build_network
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedMLP, orthogonal
-from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct, taken
+from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
 from esp_cli.networks.symmetrised import Symmetrised
 from esp_cli.symmetry import (
     cyclic,
@@ -63,14 +63,6 @@ def message_passing(spec: TaskSpec, name: str, group: str = "c4") -> MessagePass
     return network
 
 
-def responses_of(encoder: PictureEncoder, pictures: Tensor) -> list[Tensor]:
-    """The output of each layer for pictures [S, B, D]: [S, B, rows, columns, channels]."""
-    return [
-        taken(features, place.flatten(1)).unflatten(1, place.shape[1:])
-        for features, place in encoder.convolved(pictures)
-    ]
-
-
 @pytest.mark.parametrize("group", ["c4", "d4", "c2"])
 def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_world(group) -> None:
     spec, obs, _ = scene()
@@ -79,7 +71,7 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
     rows = obs.flatten(1, 2)
     pictures = rows[..., network.picture]
     here = network.features(rows)
-    responses = responses_of(network.encoder, pictures)
+    responses = network.encoder.responses(network.encoder.as_pictures(pictures))
     blocks = [network.encoder.output, *(layer.outputs[0] for layer in network.layers)]
     convolved = [layer.outputs[0] for layer in network.encoder.layers]
     for transform in transform_set(group, spec).each():
@@ -88,8 +80,8 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
         there = network.features(transform.obs(obs).flatten(1, 2))
         for block, before, after in zip(blocks, here, there, strict=True):
             torch.testing.assert_close(after, turned(block, g, before), atol=EXACT, rtol=EXACT)
-        moved = responses_of(network.encoder, transform.obs(obs).flatten(1, 2)[..., network.picture])
-        for block, before, after in zip(convolved, responses, moved, strict=True):
+        moved = network.encoder.as_pictures(transform.obs(obs).flatten(1, 2)[..., network.picture])
+        for block, before, after in zip(convolved, responses, network.encoder.responses(moved), strict=True):
             # a response's place turns as a pixel does, its channels as regular features
             channels = turned(block, g, before)
             picture = channels.flip(2) if element.mirrored else channels
@@ -240,7 +232,7 @@ def test_pictures_that_occur_several_times_are_encoded_once_and_nobody_notices()
     pictures = torch.stack([sorts[s][pick[s]] for s in range(SEEDS)])
     encoder = PictureEncoder(generators(0, 1), spec.observation.fields[0], cyclic(1))
     stir(encoder)
-    which, place = distinct(pictures @ encoder.keys.T)
+    which, place = distinct(pictures, encoder.keys)
     assert which.shape == (SEEDS, 32)
     for s in range(SEEDS):
         assert torch.equal(pictures[s][which[s][place[s]]], pictures[s])
@@ -272,7 +264,7 @@ def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
 
 def test_pictures_that_all_differ_are_all_encoded() -> None:
     pictures = torch.rand(1, 50, 441)
-    which, place = distinct(pictures @ torch.randn(441, 2))
+    which, place = distinct(pictures, torch.randn(2, 441))
     assert torch.equal(pictures[0][which[0][place[0]]], pictures[0])
     assert len(place.unique()) == 50
 
