@@ -14,11 +14,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from esp_cli.algorithms.closed_form import reordered
+from esp_cli.algorithms.closed_form import gathers, reordered
 from esp_cli.kernels import actor
 from esp_cli.kernels.library import computes
 from esp_cli.symmetry import Transform
-from esp_cli.symmetry.maps import Gather
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def draw(logits: Tensor, num_learned: int, noise: Tensor, compiled: bool = False
     soft = torch.softmax(logits + gumbel.unsqueeze(3), 1)
     largest = (soft - soft.amax(1, keepdim=True)).sign_().add_(1)
     largest.div_(largest.sum(1, keepdim=True))
-    hard = largest.transpose(1, 2).contiguous()  # [S, N, A, P, R]
+    hard = largest.transpose(1, 2).contiguous()  # [S, N, A, L, R]
     return Draw(soft, hard.flatten(3).permute(0, 3, 1, 2))
 
 
@@ -97,7 +96,7 @@ def actor_gradient(
             drawn.soft,
             by_action,
             share,
-            [m.back for m in _maps(transforms)],
+            [m.back for m in gathers(transforms)],
             output_penalty=weights.output_penalty,
             gap=weights.gap if transforms else 0.0,
             stop_gradient=weights.stop_gradient,
@@ -119,7 +118,7 @@ def _divergence_gradient(
     logits: Tensor, weight: Tensor, transforms: Sequence[Transform], weights: ActorWeights
 ) -> Tensor:
     """Return the gradient of KL[copy || original], weighted by rows [S, 1, 1, 1, R] and summed: as `logits`."""
-    maps = _maps(transforms)
+    maps = gathers(transforms)
     log_prob = torch.log_softmax(reordered(logits, [m.back for m in maps]), 1)
     prob = log_prob.exp()
     here, moved, copy = log_prob[:, :, :, :1], log_prob[:, :, :, 1:], prob[:, :, :, 1:]
@@ -131,10 +130,6 @@ def _divergence_gradient(
     if weights.stop_gradient != "original":
         gradient[:, :, :, :1] = (prob[:, :, :, :1] - copy).mul_(weight).sum(3, keepdim=True)
     return reordered(gradient, [m.source for m in maps])
-
-
-def _maps(transforms: Sequence[Transform]) -> list[Gather]:
-    return [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
 
 
 def _entropy(logits: Tensor) -> Tensor:

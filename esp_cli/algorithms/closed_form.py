@@ -73,6 +73,11 @@ def carries(transforms: Sequence[Transform]) -> bool:
     )
 
 
+def gathers(transforms: Sequence[Transform]) -> list[Gather]:
+    """Return how transforms that `carries` knows permute the logits."""
+    return [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
+
+
 def policy_gradient(
     logits: Tensor,
     transforms: Sequence[Transform],
@@ -93,7 +98,7 @@ def policy_gradient(
         weights: of the terms.
         compiled: whether the kernel computes it, on the CPU.
     """
-    maps = [g.output_map for g in transforms if isinstance(g.output_map, Gather)]
+    maps = gathers(transforms)
     action, old_log_prob, advantage = (x.transpose(2, 3).flatten(1) for x in (action, old_log_prob, advantage))
     parts = logits.flatten(1, 3).transpose(1, 2).unflatten(2, (1 + len(maps), -1))
     found = _policy_gradient_compiled if computes(compiled, logits) else _policy_gradient
