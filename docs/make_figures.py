@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from esp_cli.evaluation.curve_statistics import median_steps
 from esp_cli.reporting.page import draw_over_strength
 from esp_cli.reporting.plots import Group, appearance, dots
 from esp_cli.reporting.results import join, read_results
@@ -41,6 +42,8 @@ TUNED = {
     "tuned-predator-prey": ("mappo", "maddpg", "qmix"),
 }
 """Figures in docs/measured -> the ends of the names of the results that are drawn together."""
+TASKS = ("navigation", "predator-prey", "formation")
+"""From top to bottom in the figure of the steps."""
 Row = dict[str, str]
 
 
@@ -156,6 +159,34 @@ def draw_results() -> None:
             svg.unlink()
 
 
+def draw_steps() -> None:
+    """Draw the steps to what the plain learner ends with, as a share of its run: median seeds and their intervals."""
+    cells = join([read_results(MEASURED / f"{name}.json") for name in ("table1", "table1-3m")]).cells
+    pairs = [(cell, other) for cell in cells for other in cells if other.name == cell.reference and cell.steps_to]
+    pairs.sort(key=lambda pair: (-TASKS.index(str(pair[0].config["task"])), -pair[0].steps, pair[0].variant))
+    figure = Figure(figsize=(8.0, 1.2 + 0.24 * len(pairs)), layout="constrained")
+    ax = figure.subplots()
+    for place, pair in enumerate(pairs):
+        looks = ((COLOUR, "with the prior", 0.15), ("#777777", "plain", -0.15))
+        for cell, (colour, label, shift) in zip(pair, looks, strict=True):
+            median, interval = median_steps(cell.steps_to[0].per_seed)
+            ends = [min(steps / cell.steps, 2.0) for steps in interval or (median, median)]  # 2 is out of view
+            ax.plot(ends, [place + shift] * 2, color=colour, linewidth=1.8, marker="|", markersize=7)
+            named = None if place else label
+            ax.plot([min(median / cell.steps, 1.2)], [place + shift], "o", color=colour, markersize=6, label=named)
+    ax.set_xscale("log")
+    ax.set_xlim(0.02, 1.4)
+    ax.set_xticks([1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1], ["1/32", "1/16", "1/8", "1/4", "1/2", "1"])
+    ax.minorticks_off()
+    ax.set_yticks(range(len(pairs)), [f"{cell.panel}: {other.variant}" for cell, other in pairs])
+    ax.set_ylim(-0.6, len(pairs) - 0.4)
+    ax.grid(axis="x", alpha=0.4)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.set_xlabel("steps to the return that the plain learner ends with, as a share of its run; right of 1: never")
+    figure.legend(loc="outside upper right", ncols=2)
+    figure.savefig(MEASURED / "steps-saved.png", dpi=150, metadata={"Software": None})
+
+
 def draw_peers() -> None:
     """Draw the returns of training over steps and over seconds, a line a seed, each point the mean over 6000 steps."""
     figure = Figure(figsize=(8.0, 3.8), layout="constrained")
@@ -184,6 +215,7 @@ def main() -> None:
     """Draw every figure."""
     draw_results()
     mpl.rcParams.update({"font.size": 9, "svg.hashsalt": "esp"})
+    draw_steps()
     draw_peers()
     for name, panels in FIGURES.items():
         heights = [len(table(panel)) + 2 for panel in panels]

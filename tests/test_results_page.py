@@ -153,3 +153,10 @@ def test_a_table_that_is_gone_is_noticed() -> None:
     drawing = runpy.run_path(str(DOCS / "make_figures.py"))
     with pytest.raises(ValueError, match="no table with the column 'gone'"):
         drawing["table"](drawing["Panel"]("choices", "run", ["run"], "gone", ""))
+
+
+def test_the_figure_of_the_steps_is_on_its_page_and_in_the_readme() -> None:
+    page = (DOCS / "measurements" / "steps-saved.md").read_text(encoding="utf-8")
+    assert "(../measured/steps-saved.png)" in page
+    assert "(docs/measured/steps-saved.png)" in (DOCS.parent / "README.md").read_text(encoding="utf-8")
+    assert (DOCS / "measured" / "steps-saved.png").is_file()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from pydantic import JsonValue
 
+from esp_cli.evaluation.curve_statistics import median_steps
 from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
 from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
 from esp_cli.reporting.breaking import ESP, PLAIN, at, leaders, series_of, side, verdicts
@@ -124,16 +126,36 @@ def statistics_table(results: Results) -> Table:
             continue
         seeds = sum(x is not None for x in found.returns.per_seed)
         duration = NOTHING if cell.seconds is None else format_duration(cell.seconds)
-        reached = [(p.threshold, NOTHING if p.of_mean is None else format_count(p.of_mean)) for p in cell.steps_to]
-        passings = "; ".join(f"{threshold:.2f}: {steps}" for threshold, steps in reached) or NOTHING
-        texts = (_estimate(found.iqm), _mean_of(found.normalised), passings, _mean_of(found.area))
+        texts = (_estimate(found.iqm), _mean_of(found.normalised), _mean_of(found.area))
         rows.append((cell.panel, cell.variant, str(seeds), *texts, duration))
     caption = (
-        "IQM: mean of the middle half of the seeds. Normalised: 0 is the random policy, 1 the best heuristic. Steps "
-        "to: when the mean curve first reaches what the reference ended with. Mean over the run: area under the curve."
+        "IQM: mean of the middle half of the seeds. Normalised: 0 is the random policy, 1 the best heuristic. "
+        "Mean over the run: area under the curve."
     )
-    headings = ("panel", "run", "seeds>", "IQM>", "normalised>", "steps to>", "mean over the run>", "training>")
-    return Table("Seeds, scale and speed of learning", headings, tuple(rows), caption)
+    headings = ("panel", "run", "seeds>", "IQM>", "normalised>", "mean over the run>", "training>")
+    return Table("Seeds and scale", headings, tuple(rows), caption)
+
+
+def steps_table(results: Results) -> Table | None:
+    """Return when each cell first reaches a return, by default what its reference ended with; None where none does."""
+    rows = []
+    runs = {(cell.variant, cell.panel if cell.at is None else None): cell for cell in results.cells}
+    for cell in runs.values():  # of runs compared at several steps the last
+        run = results.reference_of(cell) or cell
+        for passing in cell.steps_to:
+            mean = math.inf if passing.of_mean is None else passing.of_mean
+            median, interval = median_steps(passing.per_seed)
+            counts = [_within(steps, cell.step) for steps in (mean, median, *(interval or ()))]
+            span = f"[{counts[2]}, {counts[3]}]" if interval else NOTHING
+            share = f"{median / run.steps:.2f}" if math.isfinite(median) else NOTHING
+            rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *counts[:2], span, share))
+    caption = (
+        "Environment steps to what the reference ended with, or to a return that was asked for. Mean: of the mean "
+        "curve. The interval is that of the median; its ends are seeds, of ten the second and the ninth. Share: the "
+        "median seed's steps as a share of the reference's whole run."
+    )
+    headings = ("panel", "run", "return>", "mean>", "median seed>", "95 % interval>", "share>")
+    return Table("Steps to a return", headings, tuple(rows), caption) if rows else None
 
 
 def networks_table(results: Results) -> Table | None:
@@ -231,6 +253,7 @@ TABLES: dict[str, Callable[[Results], Table | None]] = {
     "paper": lambda results: returns_table(results, whole=True),
     "comparison": comparison_table,
     "statistics": statistics_table,
+    "steps": steps_table,
     "networks": networks_table,
     "breaking": breaking_table,
     "methods": methods_table,
@@ -298,6 +321,11 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
     """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
     symmetric = config.get("network.name") in ("equivariant", "empn") or config.get("network.symmetrise")
     return config.get("prior.kind") == "none" and not symmetric
+
+
+def _within(steps: float, run: int) -> str:
+    """Return a number of steps, or that it is more than a run took."""
+    return format_count(steps) if math.isfinite(steps) else f"> {format_count(run)}"
 
 
 def _mean_of(summary: SeedSummary | None) -> str:

@@ -145,7 +145,7 @@ def test_a_finished_study_has_the_numbers_of_the_old_one(study: Path, tmp_path: 
     tables = []
     for name in ("new", "old"):
         page = tmp_path / "page.md"
-        kinds = ("returns", "comparison", "statistics")
+        kinds = ("returns", "comparison", "statistics", "steps")
         page.write_text("".join(f"<!-- results: {name}.json {kind} -->\n<!-- end of results -->\n" for kind in kinds))
         esp("report", "--fill", page)
         text = page.read_text().replace(f"{name}.json", "it.json")

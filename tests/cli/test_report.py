@@ -79,8 +79,12 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
     assert compared[3][5].startswith(f"{second['returns']['150']['difference']['mean']:+.2f} [")
     assert [row[6] for row in compared[1::2]] == ["-", "-"], "two seeds do not rank"
     assert [run["step"] for run in result["runs"]] == [150, 150]
-    passed = [row[5] for row in table if row[0] in panels and row not in compared]
-    assert passed == ["-1000.00: 0; -0.50: -"] * 4
+    passed = [row[1:] for row in table if {"-1000.00", "-0.50"} & {*row}]
+    assert passed == [
+        [label, *texts]
+        for label in ("plain", "ESP")
+        for texts in (["-1000.00", "0", "0", "-", "0.00"], ["-0.50", "> 150", "> 150", "-", "-"])
+    ]
     assert result["convention"] in told.stdout
     with Image.open(picture) as image:
         assert image.format == "PNG"

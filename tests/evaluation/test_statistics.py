@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from esp_cli.evaluation.curve_statistics import StepsToThreshold, area_under_curve, curve_band, steps_to_threshold
+from esp_cli.evaluation.curve_statistics import (
+    StepsToThreshold,
+    area_under_curve,
+    curve_band,
+    median_steps,
+    steps_to_threshold,
+)
 from esp_cli.evaluation.spread import MOST_RESAMPLED, EpisodeSpread, spread_over_episodes
 from esp_cli.evaluation.statistics import (
     Estimate,
@@ -177,6 +183,23 @@ def test_steps_to_threshold_by_hand():
     assert steps_to_threshold(steps, values, -125) == StepsToThreshold(200, (100, 300))
     assert steps_to_threshold(steps, values, -115) == StepsToThreshold(300, (100, None))
     assert steps_to_threshold(steps, values, -100) == StepsToThreshold(None, (None, None))
+
+
+def test_median_steps_by_hand():
+    ten = [300, 100, 200, 200, 250, 150, 350, 400, 500, 450]
+    # in order 100 150 200 200 250 300 350 400 450 500; P(B <= 1) = 11 / 1024 of ten fair coins, P(B <= 2) = 56 / 1024
+    assert median_steps(ten) == (275, (150, 450))
+    assert median_steps([1, 2, 3, 4, 5, 6]) == (3.5, (1, 6))  # P(B <= 0) = 1 / 64 < 0.025
+    assert median_steps([1, 2, 3, 4, 5]) == (3, None)  # 1 / 32 > 0.025
+    assert median_steps([None, *ten[1:-1], None]) == (300, (150, math.inf))
+    assert median_steps([None, None, 7]) == (math.inf, None)
+
+
+def test_the_interval_of_the_median_holds_it_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    drawn = rng.exponential(1000.0, (2000, 10))  # of median 1000 log 2
+    held = [low <= 1000 * math.log(2) <= high for _, (low, high) in map(median_steps, drawn.tolist())]
+    assert np.mean(held) == pytest.approx(0.979, abs=0.01)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

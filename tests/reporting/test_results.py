@@ -83,7 +83,23 @@ def test_steps_to_where_the_reference_ended(results):
     # plain's mean curve: -190 -170 -150; that with the prior: -170 -150 -130
     assert plain.steps_to == (Passing(threshold=-150.0, of_mean=200, per_seed=(200, None, 200)),)
     assert esp.steps_to == (Passing(threshold=-150.0, of_mean=100, per_seed=(100, 100, 200)),)
-    assert column(results, "statistics", "steps to>") == ["-150.00: 200", "-150.00: 100"]
+    assert column(results, "steps", "return>") == ["-150.00", "-150.00"]
+    assert column(results, "steps", "mean>") == ["200", "100"]
+    assert column(results, "steps", "median seed>") == ["200", "100"]
+    assert column(results, "steps", "share>") == [f"{200 / plain.steps:.2f}", f"{100 / plain.steps:.2f}"]
+
+
+def test_seeds_that_never_get_there_count_as_infinitely_late(results):
+    plain, esp = results.cells
+    slow = Passing(threshold=-150.0, of_mean=None, per_seed=(100, 150, 150, 200, None, None, None))
+    found = results.model_copy(update={"cells": (plain, esp.model_copy(update={"steps_to": (slow,), "step": 200}))})
+    assert column(found, "steps", "mean>")[1] == "> 200"
+    assert column(found, "steps", "median seed>")[1] == "200"
+    assert column(found, "steps", "95 % interval>") == ["-", "[100, > 200]"]
+    slower = slow.model_copy(update={"per_seed": (100, None, None)})
+    never = results.model_copy(update={"cells": (plain, esp.model_copy(update={"steps_to": (slower,), "step": 200}))})
+    assert column(never, "steps", "median seed>")[1] == "> 200"
+    assert column(never, "steps", "share>")[1] == "-"
 
 
 @pytest.mark.parametrize(("seeds", "shown"), [((0, 1), "-"), ((0, 1, 2), "1.00")])
