@@ -147,7 +147,7 @@ def steps_table(results: Results) -> Table | None:
             median, interval = median_steps(passing.per_seed)
             counts = [_within(steps, cell.step) for steps in (mean, median, *(interval or ()))]
             span = f"[{counts[2]}, {counts[3]}]" if interval else NOTHING
-            share = f"{median / run.steps:.2f}" if math.isfinite(median) else NOTHING
+            share = f"{median / run.step:.2f}" if math.isfinite(median) else NOTHING
             rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *counts[:2], span, share))
     caption = (
         "Environment steps to what the reference ended with, or to a return that was asked for. Mean: of the mean "

@@ -86,7 +86,7 @@ def test_steps_to_where_the_reference_ended(results):
     assert column(results, "steps", "return>") == ["-150.00", "-150.00"]
     assert column(results, "steps", "mean>") == ["200", "100"]
     assert column(results, "steps", "median seed>") == ["200", "100"]
-    assert column(results, "steps", "share>") == [f"{200 / plain.steps:.2f}", f"{100 / plain.steps:.2f}"]
+    assert column(results, "steps", "share>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
 
 
 def test_seeds_that_never_get_there_count_as_infinitely_late(results):
