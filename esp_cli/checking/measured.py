@@ -37,7 +37,7 @@ def prepared(config: RunConfig) -> RunConfig:
     prior = config.prior
     if prior.kind == "none":
         return config
-    if prior.compass and prior.trust != "full" and not prior.weights:
+    if prior.compass and prior.trust != "full":
         raise ValueError(
             f"with prior.compass nothing is false that prior.trust={prior.trust} could find; leave one of the two out"
         )

@@ -53,11 +53,12 @@ def check(
 
     Symmetry is judged per element and field: it holds, it is broken, or the data does not cover it.
     """
+    from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
     register_tasks([task])
     register_learners(algo or [], network or [])
-    chosen = parse_task_settings(settings or [])
+    chosen = resolve_task_settings(task, parse_task_settings(settings or []))
 
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(task, num_envs, seeds, chosen)

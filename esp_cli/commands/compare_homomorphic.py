@@ -26,7 +26,7 @@ def compare_homomorphic(
     grid: Annotated[int, typer.Option("--grid", min=3, help="Cells along each side, an odd number.")] = GRID,
     methods: Annotated[
         str | None,
-        typer.Option("--methods", "--contestants", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order."),
+        typer.Option("--methods", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order."),
     ] = None,
     group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = GROUP,
     mode: Annotated[

@@ -7,14 +7,11 @@ from collections.abc import Iterable
 from decimal import Decimal
 
 from esp_cli import console
+from esp_cli.defaults import MAX_SEEDS, MAX_STEPS
 
 _MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
 _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
 _SEED_LIST = re.compile(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?")
-MAX_STEPS = 10**12
-"""Steps that one run may take; the fastest machine needs years for them."""
-MAX_SEEDS = 1000
-"""Most seeds of one run; more is a typing error."""
 
 
 def parse_count(value: str | int) -> int:

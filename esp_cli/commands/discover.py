@@ -64,12 +64,13 @@ def _discovery(
 ) -> Discovery:
     from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
     from esp_cli.checking.logs import read_transitions
+    from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
     register_tasks([task or "", what if ":" in what and not Path(what).exists() else ""])
     path = Path(what)
     if path.suffix == ".npz" or path.is_file():
-        spec = None if task is None else make(task, 1, [0], settings).spec
+        spec = None if task is None else make(task, 1, [0], resolve_task_settings(task, settings)).spec
         data = read_transitions(path, spec)
         if spec is None or blind:
             from esp_cli.checking.blind import discover_blindly
@@ -87,6 +88,8 @@ def _discovery(
 
         config = parse_config(RunFolder.open(path).config, path)
         name, settings = config.task, config.task_settings | settings
+
+    settings = resolve_task_settings(name, settings)
 
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)

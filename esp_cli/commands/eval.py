@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from esp_cli import console
@@ -19,6 +20,7 @@ from esp_cli.commands.options import (
     register_learners,
     register_tasks,
 )
+from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
     from esp_cli.evaluation.final import FinalEvaluation
@@ -33,7 +35,7 @@ EPILOG = """Examples:\n
 def evaluate(
     policy: PolicyArgument,
     task: OwnTaskOption = None,
-    episodes: EpisodesOption = 320,
+    episodes: EpisodesOption = EPISODES,
     physics: PhysicsOption = None,
     settings: TaskSetOption = None,
     algo: BundledAlgoOption = None,
@@ -66,7 +68,7 @@ def _print(result: FinalEvaluation, policy: str) -> None:
     alone = len(result.seeds) == 1
     for mode in ("greedy", "stochastic"):
         returns = result.returns(mode)
-        error = result.over_episodes[mode] if alone else returns
+        error = result.over_episodes.get(mode, returns)  # of one seed that stopped there is neither
         rows.append((mode, console.format_mean(returns.mean, error.sem), console.format_interval(error.ci95)))
     first = "".join(result.heuristics[:1])
     names = {"random": "random", "heuristic": f"heuristic {first}"}
@@ -84,7 +86,8 @@ def _print(result: FinalEvaluation, policy: str) -> None:
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
     console.table(("policy", "episode return>", "95 % interval>"), rows, title=title, caption=caption)
     metrics = [
-        (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key][metric]:.4f}" for key in names))
+        (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key].get(metric, math.nan):.4f}" for key in names))
         for metric, value in result.metrics.items()
     ]
-    console.table(("metric", "greedy policy>", *(f"{label}>" for label in names.values())), metrics)
+    if metrics:  # of seeds that all stopped there are none
+        console.table(("metric", "greedy policy>", *(f"{label}>" for label in names.values())), metrics)

@@ -20,6 +20,7 @@ from esp_cli.commands.options import (
     register_learners,
     register_tasks,
 )
+from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
     from esp_cli.deploy.export import Exported
@@ -32,7 +33,6 @@ EPILOG = """Examples:\n
     esp export formation -f webots -o formation-webots\n
     esp export runs/cn-mappo -f policy -o checkpoints"""
 
-EPISODES = 320
 FORMATS = ("onnx", "torch", "c", "numpy", "webots", "ros2", "policy")
 
 
@@ -62,7 +62,7 @@ def export(
             "-e",
             min=2,
             help="Per seed, to find the best; as many others evaluate a bundled policy.",
-            show_default="320",
+            show_default=str(EPISODES),
         ),
     ] = None,
     name: Annotated[

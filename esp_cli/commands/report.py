@@ -74,7 +74,6 @@ LimitsOption = Annotated[
     tuple[float, float] | None,
     typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
 ]
-OldViewOption = Annotated[tuple[float, float] | None, typer.Option("--view", help="Old for --y-limits.", hidden=True)]
 CsvOption = Annotated[
     Path | None,
     typer.Option(
@@ -98,7 +97,6 @@ def report(
     reference: ReferenceOption = None,
     mode: ModeOption = None,
     y_limits: LimitsOption = None,
-    view: OldViewOption = None,
     plot: PlotOption = None,
     csv: CsvOption = None,
     task: OwnTaskOption = None,
@@ -115,7 +113,7 @@ def report(
 
     register_tasks(task)
     register_learners(algo or [], network or [])
-    of_the_picture = reference or y_limits or view
+    of_the_picture = reference or y_limits
     of_runs = any((out, films, results, at, threshold, of_the_picture, mode, plot, csv, json))
     if not runs and (of_runs or fill is None):
         raise ValueError("there is nothing to report; name a study folder or run folders")
@@ -125,7 +123,7 @@ def report(
         return
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
-    y_limits = _limits(y_limits, view)
+    _check_limits(y_limits)
     if TUNING_FORMAT.is_one(Path(runs[0]) / TUNING):  # the report of a tuning has a file of this name too
         fresh = shlex.quote(str(Path(runs[0]) / FRESH))
         raise ValueError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
@@ -172,15 +170,11 @@ def _refuse_idle(films: bool, of_the_picture: bool) -> None:
         raise ValueError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
 
 
-def _limits(given: tuple[float, float] | None, old: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Return the limits of the picture, which had another spelling."""
-    if old is not None:
-        console.note("--view LOW HIGH is now --y-limits LOW HIGH")
-    limits = given or old
+def _check_limits(limits: tuple[float, float] | None) -> None:
+    """Refuse limits of the picture that leave nothing to see."""
     check_finite("--y-limits", *(limits or ()))
     if limits is not None and limits[0] >= limits[1]:
         raise ValueError(f"--y-limits {limits[0]:g} {limits[1]:g} is empty; write the lowest return before the highest")
-    return limits
 
 
 def threshold_words(thresholds: Sequence[float]) -> list[str]:

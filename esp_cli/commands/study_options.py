@@ -26,13 +26,13 @@ from esp_cli.commands.options import (
     register_learners,
     register_tasks,
 )
+from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.study import StudyFolder
 
 DEFAULT_SEEDS = tuple(range(10))
-DEFAULT_EPISODES = 320
 DEFAULT_PRESET = "default"
 
 TasksOption = Annotated[
@@ -134,7 +134,7 @@ class StudyChoices:
     preset: PresetOption = DEFAULT_PRESET
     settings: SetOption = None
     device: DeviceOption = "cpu"
-    episodes: EpisodesOption = DEFAULT_EPISODES
+    episodes: EpisodesOption = EPISODES
     jobs: JobsOption = None
     engine: EngineOption = "local"
     address: AddressOption = None
@@ -215,7 +215,7 @@ class StudyChoices:
         words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
-        return words + (["--episodes", str(self.episodes)] if self.episodes != DEFAULT_EPISODES else [])
+        return words + (["--episodes", str(self.episodes)] if self.episodes != EPISODES else [])
 
 
 def study_command(command: Callable[..., None] | None = None, **helps: str) -> Callable[..., Any]:

@@ -31,6 +31,7 @@ from esp_cli.commands.options import (
 )
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.train_choices import with_file
+from esp_cli.defaults import STEPS
 from esp_cli.kernels.library import begin
 
 if TYPE_CHECKING:
@@ -44,7 +45,6 @@ EPILOG = """Examples:\n
     esp train --task formation --physics pymunk --set task.num_obstacles=0\n
     esp train --resume runs/cn-mappo"""
 
-DEFAULT_STEPS = 1_000_000
 DEFAULT_SEEDS = (0,)
 
 
@@ -73,7 +73,7 @@ def train(
             metavar="NETWORK",
         ),
     ] = None,
-    steps: StepsOption = DEFAULT_STEPS,
+    steps: StepsOption = STEPS,
     seeds: SeedsOption = None,
     seed_list: SeedListOption = None,
     out: Annotated[
@@ -111,9 +111,6 @@ def train(
             metavar="TRACKER",
         ),
     ] = None,
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Old for --track tensorboard.", hidden=True)
-    ] = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     named = parse_assignments(settings or [])
@@ -127,9 +124,7 @@ def train(
     from esp_cli.training.initial import OwnCopy
     from esp_cli.training.run_folder import RUN_FORMAT
 
-    if tensorboard:
-        console.note("--tensorboard is now --track tensorboard")
-    trackers = (*(track or ()), *(("tensorboard",) if tensorboard else ()))
+    trackers = tuple(track or ())
     register_tasks([task])
     register_learners([algo], [network, named.get("network.name")])
     if resume is not None:
@@ -178,7 +173,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", "tensorboard", *allowed) and was_given(context, parameter.name)
+        if parameter.name not in ("resume", "track", *allowed) and was_given(context, parameter.name)
     ]
     if given:
         raise ValueError(

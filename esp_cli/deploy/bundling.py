@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from esp_cli import __version__
 from esp_cli.deploy.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import Episodes, PolicyController
 from esp_cli.training.policy_file import describe_policy, write_policy
@@ -62,21 +64,19 @@ def bundle(
         Its line in the manifest.
 
     Raises:
-        ValueError: an unknown seed, an invalid name or one that is taken, a damaged manifest, or a file that cannot be
-            written.
+        ValueError: an unknown seed, an invalid name or one that is taken, the folder of a run, a damaged manifest, or a
+            file that cannot be written.
     """
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
     if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
         raise ValueError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
-    there = read_bundled(folder)
-    if not force and any(entry.name == name for entry in there):
-        raise ValueError(f"{folder} has {name} already; choose another --name, or replace it with --force")
+    _others(folder, name, force)  # before the episodes are played; they take minutes
     alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
     played = play_greedily(alone, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
-    others = tuple(entry for entry in there if entry.name != name)
+    others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
     file = folder / f"{name}.safetensors"
     description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
     write_policy(file, alone.policy.state_dict(), description)
@@ -100,3 +100,17 @@ def bundle(
     )
     write_bundled(folder, (*others, entry))
     return entry
+
+
+def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:
+    """Return what a folder lists besides a policy that is to be written into it.
+
+    Raises:
+        ValueError: it is the folder of a run, has a policy or another file of that name, or its manifest is damaged.
+    """
+    if os.path.lexists(folder / CONFIG):
+        raise ValueError(f"{folder} is the folder of a run, whose own policies have such names; choose another --out")
+    there = read_bundled(folder)
+    if not force and (any(entry.name == name for entry in there) or os.path.lexists(folder / f"{name}.safetensors")):
+        raise ValueError(f"{folder} has {name} already; choose another --name, or replace it with --force")
+    return tuple(entry for entry in there if entry.name != name)

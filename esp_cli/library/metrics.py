@@ -37,9 +37,11 @@ class Metrics(Mapping[str, Floats]):
         for index, row in enumerate(rows):
             for name, value in row.items():
                 if name != "step":
-                    shape = (len(rows), len(self.seeds) if isinstance(value, list) else 1)
-                    self._arrays.setdefault(name, np.full(shape, math.nan))[index] = np.array(value, dtype=np.float64)
-                    self._whole |= set() if isinstance(value, list) else {name}
+                    if name not in self._arrays:
+                        columns = len(self.seeds) if isinstance(value, list) else 1
+                        self._arrays[name] = np.full((len(rows), columns), math.nan)
+                        self._whole |= set() if isinstance(value, list) else {name}
+                    self._arrays[name][index] = np.array(value, dtype=np.float64)
 
     def __getitem__(self, name: str) -> Floats:
         """Return one metric [U, S]."""

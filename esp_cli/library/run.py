@@ -22,6 +22,7 @@ from torch import Tensor
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import prepared
+from esp_cli.defaults import EPISODES, STEPS
 from esp_cli.deploy.bundled import open_policy
 from esp_cli.deploy.library import LoadedPolicy, register_own
 from esp_cli.evaluation.final import FinalEvaluation
@@ -120,7 +121,7 @@ class Run:
         with self.trainer(track) as trainer:
             return (trainer.is_complete and self.is_complete) or trainer.run(listener or _go_on)
 
-    def evaluate(self, episodes: int = 320, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
+    def evaluate(self, episodes: int = EPISODES, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
         """Play episodes with the newest policies, and with the reference policies of the task.
 
         Args:
@@ -205,7 +206,7 @@ def train(
     task: str | type[Environment] = "navigation",
     algo: str | type[Learner] = "mappo",
     *,
-    steps: int = 1_000_000,
+    steps: int = STEPS,
     seeds: Sequence[int] = (0,),
     preset: str = "default",
     settings: Mapping[str, object] | None = None,

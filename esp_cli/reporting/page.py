@@ -33,6 +33,7 @@ from esp_cli.training.folder_names import POLICY
 from esp_cli.training.loading import load_policy
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
+CURVES = "curves"
 _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
 _FILM_SECONDS = 15.0
@@ -66,7 +67,8 @@ def write_report(material: Material, out: Path) -> list[Path]:
     """
     if not material.curves:
         raise ValueError("no run of this study has an evaluation yet; run it first, or wait a little")
-    foreign = next((out / name for name in (MARKDOWN, RESULTS) if os.path.lexists(out / name)), None)
+    own = (MARKDOWN, RESULTS, PAGE, MARL_EVAL, f"{CURVES}.png", f"{CURVES}.svg")
+    foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
     if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
         raise ValueError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
     out.mkdir(parents=True, exist_ok=True)
@@ -144,7 +146,7 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
     """Draw the curves, and for variants their returns, or the returns over their coefficient."""
     results = material.results
     label = f"{results.mode} return"
-    pictures = [curve_panels(panels, out / "curves", label)]
+    pictures = [curve_panels(panels, out / CURVES, label)]
     if results.rows == "panels":
         return pictures
     finished: dict[str, dict[str, CellResult]] = {}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import planned
+from esp_cli.defaults import EPISODES
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
@@ -41,7 +42,7 @@ class Request:
     preset: str = "default"
     overrides: Settings = field(default_factory=dict)
     device: str = "cpu"
-    episodes: int = 320
+    episodes: int = EPISODES
     variants: Sequence[str] | None = None
     group: str = "c4"
     breakings: Sequence[str] | None = None

@@ -120,7 +120,6 @@ def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
 
 def _layout_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which field cannot be transformed, if one cannot."""
-    # A picture says so when its map is built, without a matrix of its pixels' square.
     layouts = [spaces.observation, spaces.state]
     if isinstance(spaces.action, Continuous):
         layouts.append(spaces.action.layout)
@@ -129,6 +128,9 @@ def _layout_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
             item_places(elements, field)
             if field.pixels is None:
                 block_matrix(field, elements)
+            else:
+                for element in elements:
+                    element.gather(field)  # instead of a matrix of the pixels' square
     except ValueError as error:
         return str(error)
     return None

@@ -13,6 +13,7 @@ from pydantic_core import to_jsonable_python
 
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
 from esp_cli.files.documents import Strict, one_sentence, parse_value, shortened
 from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
@@ -46,8 +47,8 @@ class RunConfig(Strict):
     task: str = Field(max_length=100)
     algorithm: str = Field(max_length=100)
     preset: str = Field("default", max_length=100)
-    steps: int = Field(ge=1, le=10**12, description="environment steps per seed")
-    seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=1000, description="as many as --seeds takes")
+    steps: int = Field(ge=1, le=MAX_STEPS, description="environment steps per seed")
+    seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=MAX_SEEDS, description="as many as --seeds takes")
     task_settings: dict[str, Any] = Field(default_factory=dict)
     algorithm_settings: dict[str, Any] = Field(default_factory=dict)
     network: AnyNetworkConfig = MlpConfig()
@@ -126,7 +127,7 @@ def resolve_config(
     task: str,
     algorithm: str = "mappo",
     preset: str = "default",
-    steps: int = 1_000_000,
+    steps: int = STEPS,
     seeds: Sequence[int] = (0,),
     device: str = "cpu",
     overrides: Mapping[str, object] | None = None,

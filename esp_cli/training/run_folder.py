@@ -89,7 +89,6 @@ class RunFolder:
         cls,
         path: str | os.PathLike[str],
         config: Mapping[str, Any],
-        force: bool = False,
         initial: Mapping[str, Tensor] | None = None,
     ) -> RunFolder:
         """Make a run folder; its configuration is written last, so that a folder with one is complete.
@@ -97,7 +96,6 @@ class RunFolder:
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
             config: resolved configuration, JSON-able; the keys ``format`` and ``version`` are the folder's own.
-            force: restart an existing run: its metrics, checkpoints and policy go, other files stay.
             initial: weights of the policy that the run starts from.
 
         Raises:
@@ -114,11 +112,11 @@ class RunFolder:
             if path.exists() and not path.is_dir():
                 raise RunFolderError(f"{path} is a file; choose another --out")
             path.mkdir(parents=True, exist_ok=True)
-            _refuse_taken(path, force)
+            _refuse_taken(path)
             folder = cls(path, resolved)
             with folder.lock():
                 # a second time, as another process may have made a run here in between
-                _refuse_taken(path, force)
+                _refuse_taken(path)
                 for file in (folder.policy_path, folder.initial_path, *folder.checkpoints(), folder.metrics_path):
                     remove_file(file)
                 (path / CHECKPOINTS).mkdir(exist_ok=True)
@@ -298,16 +296,12 @@ class RunFolder:
                 file.unlink(missing_ok=True)
 
 
-def _refuse_taken(path: Path, force: bool) -> None:
-    """Refuse a folder that holds a run (unless forced) or files that no run has."""
+def _refuse_taken(path: Path) -> None:
+    """Refuse a folder that holds a run or files that no run has."""
     if (path / CONFIG).exists():
-        if not force:
-            raise RunFolderError(
-                f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
-            )
-        # forcing restarts a run; it must not overwrite another run's configuration
-        RunFolder.open(path)
-        return
+        raise RunFolderError(
+            f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
+        )
     foreign = sorted(entry.name for entry in path.iterdir() if not is_leftover(entry))
     if foreign:
         raise RunFolderError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")

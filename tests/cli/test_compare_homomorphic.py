@@ -67,7 +67,7 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
             ["--methods", "mpn,cnn"],
             "they are 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'",
         ),
-        (["--contestants", "mpn,mpn"], "name each variant of this study once"),
+        (["--methods", "mpn,mpn"], "name each variant of this study once"),
         (["--grid", "6"], "use odd numbers"),
         (["--group", "so2"], "so2 cannot act on wildlife"),
         (["--set", "network.name=mlp"], "is what this study varies by itself"),

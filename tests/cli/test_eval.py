@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from esp_cli.app import app
+from esp_cli.deploy import bundled
 from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
@@ -62,6 +66,20 @@ def test_one_seed_has_no_error_over_seeds_and_states_that_over_episodes(tmp_path
         f"[{low:.2f}, {high:.2f}]",
     ]
     assert "95 % interval over 8 episodes of one seed" in told
+
+
+def test_one_seed_that_stopped_has_no_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    open_policy = bundled.open_policy
+    monkeypatch.setattr(bundled, "open_policy", lambda *given: replace(open_policy(*given), stopped=(0,)))
+    told = CliRunner().invoke(app, ["eval", "navigation", "--episodes", "2"])
+    assert told.exit_code == 0
+    rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in told.stdout.splitlines()]
+    assert [row for row in rows if row[0] in ("greedy", "stochastic")] == [
+        ["greedy", "-", "-"],
+        ["stochastic", "-", "-"],
+    ]
+    assert "heuristic greedy" in told.stdout
+    assert "metric" not in told.stdout
 
 
 def test_several_seeds_state_their_error_over_seeds_and_say_so(finished: Path) -> None:

@@ -40,13 +40,6 @@ def test_every_logged_number_is_a_cell_of_the_csv(finished: Path, plain: Path, t
             assert row["time/elapsed_s"] == str(logged.get("time/elapsed_s", "")), "a number of the whole run"
 
 
-def test_the_old_spelling_of_the_limits_still_works_with_a_note(finished: Path, plain: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "curves.png"
-    told = esp("report", plain, finished, "--view", "-200", "0", "--plot", picture)
-    assert "--view LOW HIGH is now --y-limits LOW HIGH" in told.stderr
-    assert picture.is_file()
-
-
 def cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.strip("│").split("│")]
 

@@ -254,7 +254,7 @@ def test_options_that_a_resumed_run_would_ignore_are_refused(copied: Path, optio
 def test_tensorboard_may_be_asked_for_on_resuming(copied: Path) -> None:
     pytest.importorskip("tensorboard")
     (copied / "policy.safetensors").unlink()
-    esp("train", "--resume", copied, "--tensorboard")
+    esp("train", "--resume", copied, "--track", "tensorboard")
     assert (copied / "tensorboard").is_dir()
 
 

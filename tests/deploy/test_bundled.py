@@ -13,12 +13,14 @@ import pytest
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
-from esp_cli.deploy import manifest
+from esp_cli.deploy import bundling, manifest
 from esp_cli.deploy.bundled import find, load_entry, open_policy
 from esp_cli.deploy.bundling import best_seed, bundle, play_greedily, score_of
 from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled
 from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
+from esp_cli.training.loading import TrainedPolicy
+from esp_cli.training.play import Episodes
 from tests.deploy.policies import drawn_policy
 
 ENTRIES = read_bundled()
@@ -164,6 +166,30 @@ def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
     assert read_bundled(tmp_path) == (second,)
     with pytest.raises(ValueError, match=r"'Best one!' is not a valid policy name"):
         bundle(drawn_policy("choice"), tmp_path, 4, name="Best one!")
+
+
+def test_files_of_others_are_left_alone(tmp_path: Path) -> None:
+    mine = tmp_path / "thesis.safetensors"
+    mine.write_text("mine")
+    with pytest.raises(ValueError, match=r"has thesis already; choose another --name, or replace it with --force"):
+        bundle(drawn_policy("choice"), tmp_path, 4, name="thesis")
+    (tmp_path / "config.json").write_text("{}")
+    for force in (False, True):
+        with pytest.raises(ValueError, match=r"is the folder of a run, .*; choose another --out"):
+            bundle(drawn_policy("choice"), tmp_path, 4, name="policy", force=force)
+    assert mine.read_text() == "mine"
+    assert {file.name for file in tmp_path.iterdir()} == {"thesis.safetensors", "config.json"}
+
+
+def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def meanwhile(alone: TrainedPolicy, episodes: int) -> Episodes:
+        monkeypatch.setattr(bundling, "play_greedily", play_greedily)
+        bundle(drawn_policy("vector"), tmp_path, 4, name="other")
+        return play_greedily(alone, episodes)
+
+    monkeypatch.setattr(bundling, "play_greedily", meanwhile)
+    bundle(drawn_policy("choice"), tmp_path, 4, name="own")
+    assert [entry.name for entry in read_bundled(tmp_path)] == ["other", "own"]
 
 
 def test_a_file_that_is_not_the_manifests_is_refused(small: Path, tmp_path: Path) -> None:

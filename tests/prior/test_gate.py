@@ -248,6 +248,7 @@ def test_a_gate_that_keeps_nothing_trains_as_the_plain_learner_with_every_row_tw
         ({"network.name": "gru"}, "a recurrent network cannot take"),
         ({"prior.compass": 1.0}, "leave one of the two out"),
         ({"prior.compass": 1.0, "prior.trust": "measured"}, "leave one of the two out"),
+        ({"prior.compass": 1.0, "prior.weights": {"rot90": 0.5}}, "leave one of the two out"),
     ],
     ids=str,
 )

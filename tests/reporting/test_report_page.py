@@ -128,7 +128,7 @@ def test_a_study_that_has_not_begun_has_no_report(tmp_path):
         write_report(Material(made.study, made.results, {}, {}), tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["report.md", "results.json"])
+@pytest.mark.parametrize("name", ["report.md", "results.json", "report.html", "curves.png"])
 def test_a_report_of_somebody_else_is_not_replaced(tmp_path, name):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("mine")

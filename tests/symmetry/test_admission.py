@@ -140,6 +140,15 @@ def test_a_ring_carries_the_turns_between_its_rays(make_spec) -> None:
         transform_set("rot90", spec)
 
 
+def test_a_picture_carries_what_moves_its_pixels_onto_pixels(make_spec) -> None:
+    for pixels, groups in (((5, 5), UP_TO_D4), ((4, 6), ("c2", "d2"))):
+        seen = layout(Field("camera", Kind.PICTURE, pixels=pixels))
+        spec = replace(make_spec(action=FORCE), observation=seen, state=seen)
+        assert carried_groups(spec) == groups
+        with pytest.raises(ValueError, match=r"pixels of a picture of . x . do not come to lie .*; use a group within"):
+            transform_set("o2", spec)
+
+
 def test_each_carried_group_makes_a_set(make_spec) -> None:
     for action in (FORCE, WHEEL_PAIRS):
         spec = make_spec(action=action)

@@ -85,13 +85,6 @@ def test_a_missing_package_is_one_sentence_before_there_is_a_folder(
         trackers.require(["comet"])
 
 
-def test_the_old_spelling_still_works_with_a_note(tmp_path: Path) -> None:
-    pytest.importorskip("tensorboard")
-    told = esp("train", *TINY_OPTIONS, *STEPS, "--tensorboard", "--out", tmp_path / "run")
-    assert "--tensorboard is now --track tensorboard" in told.stderr
-    assert (tmp_path / "run" / "tensorboard").is_dir()
-
-
 Curves = dict[str, list[tuple[int, float]]]
 """Steps and values by name, as a tracker holds them."""
 
