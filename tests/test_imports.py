@@ -20,6 +20,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 RANKS = {
+    "defaults": 0,
     "files": 0,
     "machine": 0,
     "formatting": 0,

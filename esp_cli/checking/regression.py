@@ -20,13 +20,12 @@ from torch import Tensor
 
 from esp_cli.checking.transitions import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
-from esp_cli.prior.gate import inputs_of
+from esp_cli.prior.regression import inputs_of, moments, ridge
 from esp_cli.symmetry import Element, build_transform
 from esp_envs.spec import Spaces
 
 TOLERATED = 2e-3
 """Gap below which an element counts as a symmetry of transitions."""
-_RIDGE = 1e-4
 _ROWS = 4
 """Rows for each feature, below which more rows improve a fit whether they are true or not."""
 _STILL = 1e-10
@@ -114,15 +113,11 @@ class _Plain:
         return self._error(self._own[0] + gram, self._own[1] + cross) - self._errors
 
     def _error(self, gram: Tensor, cross: Tensor) -> Tensor:
-        ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
-        weights = torch.linalg.solve(gram + ridge, cross).float()
-        predicted = torch.einsum("mtaf,afo->mtao", self._held[0], weights)
+        predicted = torch.einsum("mtaf,afo->mtao", self._held[0], ridge(gram, cross))
         return (predicted - self._held[1]).double().square().mean((1, 2))
 
     def _moments(self, inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return X^T X and X^T Y of each regression, in float64."""
-        x, y = (self._arranged(part).flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
-        return (x.mT @ x).double(), (x.mT @ y).double()
+        return moments(self._arranged(inputs), self._arranged(outputs))
 
     def _arranged(self, part: Tensor) -> Tensor:
         return part.flatten(1, 2).unsqueeze(2) if self._shared else part

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
-from esp_cli.prior.gate import own_inputs
+from esp_cli.prior.regression import own_inputs, ridge
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment
 from esp_envs.spec import Discrete, Spaces
@@ -157,9 +157,7 @@ def outputs_of(data: Transitions) -> Tensor:
 def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
     """Return the ridge regression [N, features, outputs] of each agent's outputs [M, N, ...]."""
     x, y = inputs.double().transpose(0, 1), outputs.double().transpose(0, 1)
-    gram = x.mT @ x / x.shape[1]
-    gram += _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6))
-    return torch.linalg.solve(gram, x.mT @ y / x.shape[1]).float()
+    return ridge(x.mT @ x / x.shape[1], x.mT @ y / x.shape[1], _RIDGE, 1e-6)
 
 
 def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:

@@ -55,6 +55,19 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
         write(content)
 
 
+def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) -> None:
+    """Remove what a kill left behind the last line break, so that the next line does not run into it.
+
+    Args:
+        path: a file of lines, or none.
+        is_whole: whether what is left is a line that lacks its break alone; then it gets one.
+    """
+    content = path.read_bytes() if path.is_file() else b""
+    whole, line_break, last = content.rpartition(b"\n")
+    if last:
+        replace_file(path, content + b"\n" if is_whole is not None and is_whole(last) else whole + line_break)
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]:
     """Replace a file as a whole by content that comes in parts.

@@ -34,7 +34,7 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.trackers import require
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.initial import describe, fitted
+from esp_cli.training.initial import describe, matching_weights
 from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, transfer
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -189,7 +189,7 @@ def plan(
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    weights = fitted(learner.policy, open_policy(Path(init_from)))
+    weights = matching_weights(learner.policy, open_policy(Path(init_from)))
     return config.model_copy(update={"init_from": describe(os.fspath(init_from), weights)}), weights
 
 

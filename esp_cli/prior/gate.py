@@ -13,16 +13,16 @@ field. P_N is a ridge regression on products of two numbers, a class of function
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
+from esp_cli.prior.regression import inputs_of, moments, ridge
 from esp_cli.symmetry import Transform
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Spaces
 
 if TYPE_CHECKING:  # a loop of one's own brings no environment of ours
     from esp_envs.base import Environment
@@ -31,62 +31,12 @@ ROWS = 12_800
 """Joint steps that the predictors are fitted to, about."""
 STEPS = 50
 """Steps of an episode that are looked at, at most."""
-_WIDEST_PAIRS = 48
-"""Up to so many numbers of one agent, products of two of them are looked at too."""
-_WIDEST_OTHERS = 160
-"""Up to so many numbers that all other agents see and do, what they see is looked at too; else what they do alone."""
-_RIDGE = 1e-4
 _SIGNIFICANT = 4.0
 """Standard errors of a prediction below which a gap counts as none."""
 _CACHED_ROWS = 2048
 """Rows of features that fit a processor's cache."""
 _STILL = 1e-5
 """Standard deviation below which a field does not change, so that it says nothing."""
-
-
-def own_inputs(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
-    """Return 1, what each agent sees and does, and the products of two of these numbers: [..., N, features]."""
-    return _side_by_side(_columns(spaces, obs, action), [])
-
-
-def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
-    """Return `own_inputs` with what the other agents see and do, on which an agent's next observation depends.
-
-    Args:
-        spaces: what the numbers are.
-        obs: [M, T, N, D].
-        action: [M, T, N] int64, or [M, T, N, width] float32.
-
-    Returns:
-        [M, T, N, features].
-    """
-    columns = _columns(spaces, obs, action)
-    agents = range(spaces.num_agents)
-    known = columns if (len(agents) - 1) * len(columns) <= _WIDEST_OTHERS else columns[spaces.observation.width :]
-    others = zip(*([j for j in agents if j != i] for i in agents), strict=True)
-    return _side_by_side(columns, [known[..., list(order)] for order in others])
-
-
-def _columns(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
-    """Return what each agent sees and does, one number after the other: [numbers, ..., N]."""
-    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
-    return torch.cat([obs, acted], -1).movedim(-1, 0).contiguous()
-
-
-def _side_by_side(columns: Tensor, others: Sequence[Tensor]) -> Tensor:
-    """Return 1, the columns [numbers, ..., N], their products, and others: [..., N, features], features outermost."""
-    count = len(columns)
-    paired = count if count <= _WIDEST_PAIRS else 0
-    sizes = [1, count, *range(paired, 0, -1), *map(len, others)]
-    features = columns.new_empty(sum(sizes), *columns.shape[1:])
-    one, own, *rest = features.split(sizes)
-    one.fill_(1)
-    own.copy_(columns)
-    for k in range(paired):
-        torch.mul(columns[k:], columns[k], out=rest[k])
-    for part, other in zip(rest[paired:], others, strict=True):
-        part.copy_(other)
-    return features.movedim(0, -1)
 
 
 @dataclass(frozen=True)
@@ -186,7 +136,7 @@ class Gate:
 
 
 @torch.no_grad()
-def fitted(env: Environment, doubt: float, certain: Collection[str], alike: bool) -> Gate:
+def fit_gate(env: Environment, doubt: float, certain: Collection[str], alike: bool) -> Gate:
     """Fit the predictors of a task to episodes of its worlds, half of them by the heuristic if there is one.
 
     Args:
@@ -199,9 +149,11 @@ def fitted(env: Environment, doubt: float, certain: Collection[str], alike: bool
     obs, action, outputs = _played(env)
     inputs = inputs_of(spaces, obs, spaces.action.admissible(action))
     # every second episode: the first and the last half may be of two policies
-    parts = [_moments(inputs[part], outputs[part], alike) for part in (slice(0, None, 2), slice(1, None, 2))]
-    whole = _solved(parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
-    first, second = (_solved(*part) for part in parts)
+    parts = [moments(inputs[part], outputs[part]) for part in (slice(0, None, 2), slice(1, None, 2))]
+    if alike:
+        parts = [(gram.sum(0, keepdim=True), cross.sum(0, keepdim=True)) for gram, cross in parts]
+    whole = ridge(parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
+    first, second = (ridge(*part) for part in parts)
     spread = outputs.flatten(0, 2).std(0)
     # The halves' predictions differ by twice the error of the whole's, and a gap has the errors of two predictions.
     error = _predicted(inputs, first - second).square().mean((0, 1, 2)).sqrt() / 2**0.5
@@ -237,15 +189,3 @@ def _predicted(inputs: Tensor, weights: Tensor) -> Tensor:
     if len(weights) == 1:  # of all agents: one product, several times faster with its few outputs in front (MKL)
         return (weights[0].mT @ inputs.flatten(0, 2).mT).mT.unflatten(0, inputs.shape[:3])
     return torch.einsum("mtnf,nfo->mtno", inputs, weights)
-
-
-def _moments(inputs: Tensor, outputs: Tensor, alike: bool) -> tuple[Tensor, Tensor]:
-    """Return X^T X [N, F, F] and X^T Y [N, F, O] of each agent, or [1, F, F] and [1, F, O] of all, in float64."""
-    x, y = (part.flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
-    gram, cross = (x.mT @ x).double(), (x.mT @ y).double()
-    return (gram.sum(0, keepdim=True), cross.sum(0, keepdim=True)) if alike else (gram, cross)
-
-
-def _solved(gram: Tensor, cross: Tensor) -> Tensor:
-    ridge = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(1e-9))
-    return torch.linalg.solve(gram + ridge, cross).float()

@@ -91,7 +91,7 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     lines += ["## Budgets and scores", "", *markdown_rows(*budget_table(outcomes))]
     lines += ["", "## Best settings", "", *markdown_rows(*settings_table(outcomes))]
     lines += _refused_lines(outcomes)
-    lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` judges them on others."]
+    lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` evaluates them on others."]
     for prior, study in trials.studies.items():
         for name, title in _draw(study, out, prior):
             lines += ["", f"## {NAMES[prior]}: {title}", "", f"![{title}]({name})"]

@@ -15,7 +15,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from esp_cli.files.documents import shortened
-from esp_cli.files.writing import remove_file, replace_file
+from esp_cli.files.writing import mend_last_line, remove_file, replace_file
 from esp_cli.studies.engine import Engine
 from esp_cli.studies.scheduler import Run, Scheduler
 from esp_cli.studies.study import StudyError
@@ -72,7 +72,7 @@ class Trials:
         self.folder, self.tuning = folder, folder.tuning
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         path = folder.path / JOURNAL
-        _cut_torn_line(path)
+        mend_last_line(path)
         try:
             storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock()))
             self.studies = {prior: self._study(storage, prior) for prior in self.tuning.priors}
@@ -259,14 +259,6 @@ class _HeldLock:
 
     def release(self) -> None:
         pass
-
-
-def _cut_torn_line(path: Path) -> None:
-    """Remove what a kill left behind the last line break."""
-    content = path.read_bytes() if path.exists() else b""
-    if content and not content.endswith(b"\n"):
-        whole, _, _ = content.rpartition(b"\n")
-        replace_file(path, whole + b"\n" if whole else b"")
 
 
 def write_presets(folder: TuningFolder, outcomes: list[Outcome]) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Tuning: what is asked for, what a trial runs, how its curve is scored, and the study that judges the best."""
+"""Tuning: what is asked for, what a trial runs, how its curve is scored, and the study that evaluates the best."""
 
 from __future__ import annotations
 
@@ -185,7 +185,7 @@ class TuningFolder(StudyFolder):
         journal.jsonl       Optuna's record of all trials
         trials/PRIOR-NUMBER/    a run folder per trial
         preset-PRIOR.json   the best settings, for esp train --config
-        fresh/              the study that judges them on seeds that no trial had
+        fresh/              the study that evaluates them on seeds that no trial had
         report/             table and figures
         study.lock          held by the process that works on it
     """
@@ -287,7 +287,7 @@ def score(curve: Sequence[Point], tuning: Tuning) -> float | None:
 def fresh_study(
     tuning: Tuning, best: Mapping[str, tuple[int, Mapping[str, object]]], seeds: Sequence[int], episodes: int
 ) -> Study:
-    """Plan the study that judges the best settings of each prior, beside the default ones, on seeds of its own.
+    """Plan the study that evaluates the best settings of each prior, beside the default ones, on seeds of its own.
 
     Default settings are compared with those of the plain learner, tuned ones with the tuned plain learner. Where that
     is missing or the run itself, tuned settings are compared with the default ones.

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.prior.gate import fitted
+from esp_cli.prior.gate import fit_gate
 from esp_cli.training.config import RunConfig
 from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
@@ -70,5 +70,5 @@ def _set_gate(learner: Learner, config: RunConfig) -> None:
     if certain != set(prior.weights):
         worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)
         exchanged = any("agents" in name for name in prior.weights)
-        gate = fitted(worlds, prior.doubt, certain, alike=not exchanged)
+        gate = fit_gate(worlds, prior.doubt, certain, alike=not exchanged)
         learner.prior.gate = replace(gate, to_environment=learner.policy.head.to_environment)

@@ -13,7 +13,7 @@ LOG, FINAL = "log.txt", "final-evaluation.json"
 STUDY, TUNING, STUDY_LOCK, JOURNAL = "study.json", "tuning.json", "study.lock", "journal.jsonl"
 """Of the folder of a study or a tuning."""
 FRESH = "fresh"
-"""Of the folder of the study that judges the best settings of a tuning."""
+"""Of the folder of the study that evaluates the best settings of a tuning."""
 
 
 def is_leftover(entry: Path) -> bool:

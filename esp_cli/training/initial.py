@@ -19,7 +19,7 @@ from esp_cli.training.run_folder import RunFolder
 from esp_envs.policy_format import digest
 
 
-def fitted(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:
+def matching_weights(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:
     """Return the weights of a trained policy for the S seeds of a new one.
 
     One seed serves all; as many seeds as the new policy has serve one each.
@@ -31,11 +31,11 @@ def fitted(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:
     Raises:
         ValueError: numbers of seeds, names or shapes differ.
     """
-    return _fitted(policy, trained.policy.state_dict(), trained.config, trained.source)
+    return _matching(policy, trained.policy.state_dict(), trained.config, trained.source)
 
 
-def _fitted(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, source: Path) -> dict[str, Tensor]:
-    """Return weights [S', ...] of the policy of a configuration for the S seeds of a new one; see `fitted`."""
+def _matching(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, source: Path) -> dict[str, Tensor]:
+    """Return weights [S', ...] of a configuration's policy for the S seeds of a new one; see `matching_weights`."""
     seeds, others = policy.num_seeds, len(next(iter(theirs.values())))
     if others not in (1, seeds):
         raise ValueError(
@@ -93,7 +93,7 @@ class OwnCopy:
         Raises:
             ValueError: they do not fit.
         """
-        weights = _fitted(build_learner(config).policy, self.weights, self.config, self.folder)
+        weights = _matching(build_learner(config).policy, self.weights, self.config, self.folder)
         return config.model_copy(update={"init_from": describe(self.recorded.source, weights)}), weights
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
-from esp_cli.files.writing import replace_file
+from esp_cli.files.writing import mend_last_line, replace_file
 from esp_cli.trackers import Sink
 
 Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
@@ -59,7 +59,7 @@ class MetricsWriter:
         self._path = Path(path)
         self._sinks = sinks
         with attempting("write", self._path, MetricsError):
-            _remove_torn_line(self._path)
+            mend_last_line(self._path, lambda line: _parse(line) is not None)
             # closed by close(), which __exit__ calls
             self._file = os.fdopen(open_own(self._path, os.O_WRONLY | os.O_APPEND), "ab", buffering=0)
 
@@ -226,17 +226,3 @@ def _parse(line: bytes) -> dict[str, Any] | None:
     # a step beyond 64 bits could not be an array's element
     sound = isinstance(row, dict) and type(row.get("step")) is int and abs(row["step"]) < 2**63
     return row if sound else None
-
-
-def _remove_torn_line(path: Path) -> None:
-    """Cut what follows the last line break, so that the next row does not run into it; complete it if it is a row."""
-    if not path.is_file():
-        return
-    content = path.read_bytes()
-    if content.endswith(b"\n") or not content:
-        return
-    whole, _, last = content.rpartition(b"\n")
-    if _parse(last) is not None:
-        replace_file(path, content + b"\n")
-    else:
-        replace_file(path, whole + b"\n" if whole else b"")

@@ -11,7 +11,8 @@ import torch
 
 from esp_cli.checking.measured import prepared
 from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
-from esp_cli.prior.gate import Gate, fitted, gated, inputs_of
+from esp_cli.prior.gate import Gate, fit_gate, gated
+from esp_cli.prior.regression import inputs_of
 from esp_cli.symmetry import transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -137,7 +138,7 @@ LEFT_AND_BROKEN = [
 @pytest.mark.parametrize(("task", "settings", "left", "broken"), LEFT_AND_BROKEN, ids=str)
 def test_predictors_of_a_task_let_through_what_holds(task: str, settings, left: list[str], broken: list[str]) -> None:
     env = make(task, 128, [5], settings)
-    gate = fitted(env, 2.0, (), alike=True)
+    gate = fit_gate(env, 2.0, (), alike=True)
     seen, action = env.reset(), env.random_action()
     for g in transform_set("rot90,rot180,flip-x", env.spec).each():
         kept = float(gate.kept(g, seen.obs.unsqueeze(2), action.unsqueeze(2)).mean())
@@ -148,7 +149,7 @@ def test_predictors_of_a_task_let_through_what_holds(task: str, settings, left: 
 
 def test_mud_closes_the_gate_where_something_moves_and_nowhere_else() -> None:
     env = make("navigation", 128, [5], {"mud": 0.5})
-    gate = fitted(env, 2.0, (), alike=True)
+    gate = fit_gate(env, 2.0, (), alike=True)
     (turn,) = transform_set("rot180", env.spec).each()
     obs = torch.zeros(1, 2, 1, 3, env.spec.observation.width)
     obs[0, 1, ..., 0], obs[..., 2] = 2.0, 0.8  # one world at rest and one that moves, all right of x = 0
@@ -162,7 +163,7 @@ def test_who_differs_is_seen_where_agents_are_exchanged() -> None:
         env = make("navigation", 128, [5], {"weak_agent": weak_agent})
         (swap,) = transform_set("agents-1-0-2", env.spec).each()
         seen, action = env.reset(), torch.full((1, 128, 1, 3), RIGHT)
-        return float(fitted(env, 2.0, (), alike=False).kept(swap, seen.obs.unsqueeze(2), action).mean())
+        return float(fit_gate(env, 2.0, (), alike=False).kept(swap, seen.obs.unsqueeze(2), action).mean())
 
     assert kept(0.8) < 0.5
     assert kept(0.0) > 0.95

@@ -18,11 +18,11 @@ import os
 from collections.abc import Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
+from esp_envs.adapters import seed_of
 from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, HereCopies, Sizes, WorkerCopies, can_fork
 from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
 from esp_envs.base import (
@@ -214,8 +214,7 @@ class ParallelTask(CopyHooks, Environment):
     def _seeds(self, which: Array) -> list[int]:
         """Return the seed of the next episode of some copies; no copy's depends on the others."""
         base, episode = self._base.flatten().numpy()[which > 0], self._begun.flatten().numpy()[which > 0]
-        pairs = zip(base.tolist(), episode.tolist(), strict=True)
-        return [int(np.random.SeedSequence(pair).generate_state(1)[0] >> 1) for pair in pairs]
+        return list(map(seed_of, base.tolist(), episode.tolist()))
 
     def action_mask(self) -> Tensor | None:
         """Return which actions each agent may take now; None without `masks`."""

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,11 +51,6 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
             raise ValueError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {error}") from error
 
     return make
-
-
-def seed_of(base: int, episode: int) -> int:
-    """Return the seed of an episode."""
-    return int(np.random.SeedSequence([base, episode]).generate_state(1)[0] >> 1)
 
 
 class Dice:

@@ -18,7 +18,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import simulation
+from esp_envs.adapters import seed_of, simulation
 from esp_envs.base import (
     OTHER_SIZE,
     Environment,
@@ -231,7 +231,7 @@ class VmasTask(Environment):
         if episode not in kept:
             while len(kept) >= _KEPT_STARTS:
                 kept.pop(next(iter(kept)))
-            obs = self._nursery.reset(seed=simulation.seed_of(int(self._base[s]), episode))
+            obs = self._nursery.reset(seed=seed_of(int(self._base[s]), episode))
             kept[episode] = simulation.Start(simulation.snapshot(self._nursery), self._look(self._nursery, obs))
         return kept[episode]
 

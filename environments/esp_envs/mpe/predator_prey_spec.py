@@ -47,6 +47,10 @@ class PredatorPreySettings(ParticleSettings):
         """What breaks the symmetry, with the group that is left."""
         return (*super().breakings, Breaking("learned_prey", self.learned_prey, "c1", agents=False))
 
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset({"prey_policy_seed"} if self.prey_policy is None else ())
+
     @model_validator(mode="after")
     def _policy_goes_with_its_file(self) -> PredatorPreySettings:
         if self.control == "prey" and (self.prey != "random" or self.learned_prey):
