@@ -203,13 +203,13 @@ def describe(layer: Layer) -> dict[str, object]:
     if isinstance(layer, Activation):
         return {"kind": layer.name, "width": layer.width}
     if isinstance(layer, Slice):
-        return {"kind": "cut", "begin": layer.begin, "end": layer.end}
+        return {"kind": "slice", "begin": layer.begin, "end": layer.end}
     if isinstance(layer, Convolution):
         return {"kind": "convolution", **_named(layer, "channels", "rows", "columns", "side", "stride", "outputs")}
     if isinstance(layer, GlobalMaxPool):
-        return {"kind": "largest", "channels": layer.channels, "places": layer.places}
+        return {"kind": "global_max_pool", "channels": layer.channels, "places": layer.places}
     if isinstance(layer, MessageAggregation):
-        return {"kind": "hear", **_named(layer, "begin", "end", "team", "reach_squared")}
+        return {"kind": "aggregate", **_named(layer, "begin", "end", "team", "reach_squared")}
     return {"kind": "gru", "inputs": layer.input.weight.shape[0], "hidden": layer.hidden}
 
 

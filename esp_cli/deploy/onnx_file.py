@@ -52,9 +52,9 @@ def onnx_model(program: Program, description: str) -> bytes:
     x, hidden = "observation", ""
     if program.memory_width:
         inputs.append(value("memory", float_type, ["rows", program.memory_width]))
-        hidden = graph.cut("memory", 0, program.hidden)
+        hidden = graph.slice("memory", 0, program.hidden)
     if program.previous:
-        x = graph.node("Concat", [x, graph.cut("memory", program.hidden, program.memory_width)], axis=1)
+        x = graph.node("Concat", [x, graph.slice("memory", program.hidden, program.memory_width)], axis=1)
     for layer in program.layers:
         if isinstance(layer, layers.Recurrent):
             x = hidden = graph.recur(graph.affine(x, layer.input), graph.affine(hidden, layer.recurrent), hidden)
@@ -110,7 +110,7 @@ class _Graph:
         self.nodes.append(self.onnx.helper.make_node("Identity", [value], [name]))
         return name
 
-    def cut(self, value: str, begin: int, end: int) -> str:
+    def slice(self, value: str, begin: int, end: int) -> str:
         """Return columns of a matrix."""
         bounds = [self.constant(np.array([k], np.int64)) for k in (begin, end, 1)]
         return self.node("Slice", [value, *bounds])
@@ -124,7 +124,7 @@ class _Graph:
             layers.Affine: self.affine,
             layers.Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
             layers.Norm: self.normalise,
-            layers.Slice: lambda x, layer: self.cut(x, layer.begin, layer.end),
+            layers.Slice: lambda x, layer: self.slice(x, layer.begin, layer.end),
             layers.Convolution: self.convolve,
             layers.GlobalMaxPool: self.global_max_pool,
             layers.MessageAggregation: self.aggregate,
@@ -159,7 +159,7 @@ class _Graph:
         number = [self.constant(np.array(value, np.float32)) for value in (1, layer.reach_squared, layer.reach)]
         one, reach_squared, reach = number
         others = layer.team - 1
-        ways = self.reshape(self.cut("observation", layer.begin, layer.end), -1, others, 2)
+        ways = self.reshape(self.slice("observation", layer.begin, layer.end), -1, others, 2)
         squares = self.reduce("ReduceSum", self.node("Mul", [ways, ways]), 2, keepdims=1)
         near = self.node("Cast", [self.node("Less", [squares, reach_squared])], to=self.onnx.TensorProto.FLOAT)
         count = self.node("Add", [self.reduce("ReduceSum", near, 1, keepdims=1), one])

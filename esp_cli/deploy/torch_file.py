@@ -87,7 +87,7 @@ def _apply(x: Tensor, layer: layers.Layer, arrays: list[Tensor], observation: Te
     if isinstance(layer, layers.Convolution):
         return _convolve(x, layer, arrays)
     if isinstance(layer, layers.MessageAggregation):
-        return _hear(x, observation, layer)
+        return _aggregate(x, observation, layer)
     assert isinstance(layer, layers.GlobalMaxPool)
     return x.unflatten(1, (layer.channels, layer.places)).amax(2)
 
@@ -98,7 +98,7 @@ def _convolve(x: Tensor, layer: layers.Convolution, arrays: list[Tensor]) -> Ten
     return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
 
 
-def _hear(x: Tensor, observation: Tensor, layer: layers.MessageAggregation) -> Tensor:
+def _aggregate(x: Tensor, observation: Tensor, layer: layers.MessageAggregation) -> Tensor:
     """Put what the near ones say beside each agent's own features."""
     ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
     near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()

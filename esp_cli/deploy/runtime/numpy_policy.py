@@ -116,14 +116,14 @@ def _apply(x: Any, layer: dict[str, Any], arrays: list[Any], obs: Any) -> Any:
         centred = x - x.mean(-1, keepdims=True)
         x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
         x = x * arrays[0] + arrays[1]
-    elif kind == "cut":
+    elif kind == "slice":
         x = x[..., layer["begin"] : layer["end"]]
     elif kind == "convolution":
         x = _convolve(x, layer, arrays)
-    elif kind == "largest":
+    elif kind == "global_max_pool":
         x = x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1)
     else:
-        x = _hear(x, layer, obs)
+        x = _aggregate(x, layer, obs)
     return x
 
 
@@ -136,7 +136,7 @@ def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any]) -> Any:
     return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], -1)
 
 
-def _hear(x: Any, layer: dict[str, Any], obs: Any) -> Any:
+def _aggregate(x: Any, layer: dict[str, Any], obs: Any) -> Any:
     """Put what the near ones say beside each agent's own features."""
     team, reach_squared = layer["team"], np.float32(layer["reach_squared"])
     ways = obs[..., layer["begin"] : layer["end"]].reshape(*obs.shape[:-1], team - 1, 2)
