@@ -103,21 +103,19 @@ class _Plain:
         each = steps * (agents if shared else 1)
         fewest = -(-_ROWS * features // each)
         self.reason = "" if half >= fewest else f"{len(inputs)} episodes are too few, record at least {2 * fewest}"
-        self._held = self._arranged(inputs[half:]), self._arranged(outputs[half:])
-        self._own = self._moments(inputs[:half], outputs[:half])
+        inputs, outputs = self._arranged(inputs), self._arranged(outputs)
+        self._held = inputs[half:], outputs[half:]
+        self._own = moments(inputs[:half], outputs[:half])
         self._errors = self._error(*self._own)
 
     def worsening(self, inputs: Tensor, outputs: Tensor) -> Tensor:
         """Return by how much copies [M / 2, T, A, ...] worsen predictions of held-out episodes, [M / 2, outputs]."""
-        gram, cross = self._moments(inputs, outputs)
+        gram, cross = moments(self._arranged(inputs), self._arranged(outputs))
         return self._error(self._own[0] + gram, self._own[1] + cross) - self._errors
 
     def _error(self, gram: Tensor, cross: Tensor) -> Tensor:
         predicted = torch.einsum("mtaf,afo->mtao", self._held[0], ridge(gram, cross))
         return (predicted - self._held[1]).double().square().mean((1, 2))
-
-    def _moments(self, inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        return moments(self._arranged(inputs), self._arranged(outputs))
 
     def _arranged(self, part: Tensor) -> Tensor:
         return part.flatten(1, 2).unsqueeze(2) if self._shared else part

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
-from esp_cli.prior.regression import own_inputs, ridge
+from esp_cli.prior.regression import moments, own_inputs, ridge
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment
 from esp_envs.spec import Discrete, Spaces
@@ -29,7 +29,6 @@ FEWEST = 64
 """Episodes (or single transitions) below which nothing can be told."""
 _ASYMMETRIC = 0.05
 """Shift of the starts, in standard deviations, from which an element is not covered."""
-_RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,9 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     _refuse_what_says_nothing(spaces, data)
     half = len(data.obs) // 2
     inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
-    model = _regression(inputs[:half].flatten(0, 1), outputs[:half].flatten(0, 1))
+    gram, cross = moments(inputs[:half].double(), outputs[:half].double())
+    rows = half * data.obs.shape[1]
+    model = ridge(gram / rows, cross / rows, strength=1e-3, floor=1e-6)
     held = data.episodes(slice(half, None))
     return [_judge(element, spaces, held, model) for element in elements]
 
@@ -152,12 +153,6 @@ def outputs_of(data: Transitions) -> Tensor:
     outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
     outputs += [] if data.action_mask is None else [data.action_mask.float()]
     return torch.cat(outputs, -1)
-
-
-def _regression(inputs: Tensor, outputs: Tensor) -> Tensor:
-    """Return the ridge regression [N, features, outputs] of each agent's outputs [M, N, ...]."""
-    x, y = inputs.double().transpose(0, 1), outputs.double().transpose(0, 1)
-    return ridge(x.mT @ x / x.shape[1], x.mT @ y / x.shape[1], _RIDGE, 1e-6)
 
 
 def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
