@@ -291,3 +291,10 @@ class Environment(ABC):
             count = self.spec.action.count
             draws = [torch.randint(count, shape, generator=g, device=self.device) for g in self.generators]
         return torch.stack(draws)
+
+    def half_by_heuristic(self, action: Tensor) -> Tensor:
+        """Return a joint action whose first half of the worlds follows the main heuristic, if the task has one."""
+        action, half = action.clone(), self.num_envs // 2
+        if self.heuristics:
+            action[:, :half] = self.heuristic()[:, :half]
+        return action

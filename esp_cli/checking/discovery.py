@@ -16,7 +16,7 @@ from esp_cli.checking.candidates import candidates, generate
 from esp_cli.checking.paired import MakeWorlds, check_paired
 from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.transitions import Transitions, collect
-from esp_cli.checking.verdicts import ElementVerdict
+from esp_cli.checking.verdicts import RANK, ElementVerdict
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import DISCOVERED, exchangeable
 from esp_cli.symmetry.elements import order_name
@@ -260,9 +260,8 @@ def _p_value(verdict: ElementVerdict, tolerance: float) -> float:
 
 
 def _tried(verdict: ElementVerdict, p_value: float, accepted: bool) -> Tried:
-    rank = {"broken": 2, "holds": 1, "not covered": 0}
     fields = [f for f in verdict.fields if f.outcome != "not covered"]
     if not fields:
         return Tried(verdict.element, accepted, p_value, math.nan, math.nan, verdict.reason or "not covered")
-    worst = max(fields, key=lambda f: (rank[f.outcome], f.gap))
+    worst = max(fields, key=lambda f: (RANK[f.outcome], f.gap))
     return Tried(verdict.element, accepted, p_value, worst.gap, worst.error, worst.field)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, judged
+from esp_cli.checking.verdicts import RANK, ElementVerdict, FieldVerdict, judged
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
 from esp_envs.spec import Layout, TaskSpec
@@ -60,11 +60,8 @@ def _visit(env: Environment) -> list[tuple[Tensor, Tensor]]:
     for t in range(max(taken) + 1):
         action = env.random_action()
         if t in taken:
-            visited.append((observation.state.clone(), action.clone()))
-        if env.heuristics:
-            half = env.num_envs // 2
-            action[:, :half] = env.heuristic()[:, :half]
-        observation = env.step(action).next
+            visited.append((observation.state.clone(), action))
+        observation = env.step(env.half_by_heuristic(action)).next
     return visited
 
 
@@ -128,13 +125,12 @@ def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], acro
 
 def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
     """Keep one verdict for each field: the start's and the reached observation are of one field."""
-    rank = {"broken": 2, "holds": 1, "not covered": 0}
     best: dict[str, FieldVerdict] = {}
     for verdict in verdicts:
         name = verdict.field.removeprefix("start ")
         renamed = FieldVerdict(name, verdict.outcome, verdict.gap, verdict.error)
         known = best.get(name)
-        if known is None or (rank[renamed.outcome], renamed.gap) > (rank[known.outcome], known.gap):
+        if known is None or (RANK[renamed.outcome], renamed.gap) > (RANK[known.outcome], known.gap):
             best[name] = renamed
     return list(best.values())
 

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 Outcome = Literal["holds", "broken", "not covered"]
+RANK: dict[Outcome, int] = {"not covered": 0, "holds": 1, "broken": 2}
+"""The outcome of several verdicts is the one of the highest rank."""
 SIGNIFICANT = 6.0
 """Standard errors that a gap must exceed: with thousands of comparisons, chance alone reaches 4."""
 NEGLIGIBLE = 1e-3
@@ -51,10 +53,8 @@ class ElementVerdict:
     @property
     def outcome(self) -> Outcome:
         """Broken if any field is; it holds if some field says so."""
-        found = {verdict.outcome for verdict in self.fields}
-        if "broken" in found:
-            return "broken"
-        return "holds" if "holds" in found else "not covered"
+        outcomes = (verdict.outcome for verdict in self.fields)
+        return max(outcomes, key=RANK.__getitem__, default="not covered")
 
 
 def judged(field: str, samples: Tensor, scale: float, moved: bool) -> FieldVerdict:

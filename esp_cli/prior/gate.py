@@ -172,10 +172,7 @@ def _played(env: Environment) -> tuple[Tensor, Tensor, Tensor]:
     for _ in range(max(1, ROWS // (env.num_envs * steps))):
         seen, rows = env.reset(), []
         for _ in range(steps):
-            action = env.random_action()
-            if env.heuristics:
-                half = env.num_envs // 2
-                action[:, :half] = env.heuristic()[:, :half]
+            action = env.half_by_heuristic(env.random_action())
             step = env.step(action)
             change = step.reached.obs - seen.obs
             rows.append((seen.obs, action, torch.cat([change, step.reward.unsqueeze(-1)], -1)))
