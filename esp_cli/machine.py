@@ -38,11 +38,6 @@ def busy_with() -> float:
     return load / (os.cpu_count() or 1)
 
 
-def available_cores() -> int:
-    """Return the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def resolve_device(wanted: str) -> str:
     """Return "cpu" or "cuda" for what --device asks for.
 

@@ -11,8 +11,8 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from esp_cli.machine import available_cores
 from esp_cli.studies.versions import refuse_difference, versions
+from esp_envs.machine import available_cores
 
 NAMESPACE = "esp"
 CONNECT_S = 10.0

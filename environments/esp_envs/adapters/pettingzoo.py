@@ -14,7 +14,6 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -36,6 +35,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
+from esp_envs.machine import available_cores
 from esp_envs.spec import Discrete, TaskSpec, joint_layout
 
 _FEW_COPIES = 8
@@ -164,7 +164,7 @@ class ParallelTask(CopyHooks, Environment):
         if self._copies is None:
             count, workers = self._base.numel(), self.settings.workers
             if workers is None:
-                cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+                cores = available_cores()
                 workers = cores if cores > 1 and count > _FEW_COPIES else 0
             spec, discrete = self.spec, isinstance(self.action, Discrete)
             sizes = Sizes(
