@@ -9,7 +9,7 @@ import torch
 
 from esp_cli.symmetry import build_transform, environment_errors, parse_elements
 from esp_envs import Environment, Field, Kind, generators_for, layout, make, register
-from esp_envs.adapters import simulation
+from esp_envs.adapters import seed_of
 from esp_envs.conformance import Subject, check
 from tests.own_tasks import save_page_files
 
@@ -54,7 +54,7 @@ def test_a_task_gives_the_numbers_of_vmas_itself(name: str, settings) -> None:
     task = worlds(name, settings, 6, (5,))
     start = task.reset()
     theirs = vmas.make_env(task.scenario, 6, seed=0, **task.arguments())
-    seed = simulation.seed_of(int(task.state_dict()["base"][0]), 0)
+    seed = seed_of(int(task.state_dict()["base"][0]), 0)
     seen = task.reading(torch.stack(theirs.reset(seed=seed), 1))
     torch.testing.assert_close(start.obs[0], seen, rtol=0, atol=0)
     for _ in range(20):
