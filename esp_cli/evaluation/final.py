@@ -20,7 +20,7 @@ Mode = Literal["greedy", "stochastic"]
 """How a policy acts: by its most probable action, or by actions that it draws."""
 MAX_WORLDS = 4096
 """Worlds played at once, over all seeds; more episodes are played one batch after the other."""
-_STREAM = "judgement"  # seeds the episodes, and so all published numbers
+_STREAM = "judgement"
 """Names the worlds. The word decides the numbers of every final evaluation, so it stays as it is."""
 Metrics = dict[str, float | None]
 
