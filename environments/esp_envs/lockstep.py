@@ -214,5 +214,6 @@ class BatchedTask(LockstepTask):
 def to_others(position: Tensor) -> Tensor:
     """Return where each agent sees each other agent, in index order: [..., N, N - 1, w] from positions [..., N, w]."""
     count = position.shape[-2]
-    others = torch.tensor([[j for j in range(count) if j != i] for i in range(count)], device=position.device)
+    each = [[j for j in range(count) if j != i] for i in range(count)]
+    others = torch.tensor(each, dtype=torch.long, device=position.device)  # of one agent there is no number to tell
     return position[..., others, :] - position.unsqueeze(-2)

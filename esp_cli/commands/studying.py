@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import shutil
 import time
@@ -189,7 +190,9 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
         print_tables(results)
     if json is not None:
         console.write_json(json, results.document())
-    words = ["esp", "report", str(folder.path), *threshold_words(thresholds)]
+    own = [cell.config.own_words() for cell in folder.study.cells]
+    named = dict.fromkeys(pair for words in own for pair in zip(words[::2], words[1::2], strict=True))
+    words = ["esp", "report", str(folder.path), *itertools.chain(*named), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")
 
 

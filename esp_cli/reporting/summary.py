@@ -40,7 +40,7 @@ class Gap:
         paired: whether both have the same seeds, which are compared one by one.
         probability: of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds.
         over_all_pairs: the same with every seed against every seed, as Agarwal et al. define it.
-        ahead: by whether the interval of the difference holds 0; None where there is no interval.
+        ahead: by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval.
     """
 
     difference: Estimate
@@ -155,7 +155,7 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
     if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
         of_all = probability_of_improvement(values, others)
         chance = probability_of_improvement(values, others, paired=True) if paired else of_all
-    return Gap(found, paired, chance, of_all, side_of(found.ci95))
+    return Gap(found, paired, chance, of_all, None if of_all is None else side_of(found.ci95))
 
 
 def side_of(interval: tuple[float, float] | None) -> Side | None:

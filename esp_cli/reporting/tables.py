@@ -147,12 +147,13 @@ def steps_table(results: Results) -> Table | None:
             median, interval = median_steps(passing.per_seed)
             counts = [_within(steps, cell.step) for steps in (mean, median, *(interval or ()))]
             span = f"[{counts[2]}, {counts[3]}]" if interval else NOTHING
-            share = f"{median / run.step:.2f}" if math.isfinite(median) else NOTHING
+            share = f"{median / run.step:.2f}" if math.isfinite(median) and run.step else NOTHING
             rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *counts[:2], span, share))
     caption = (
-        "Environment steps to what the reference ended with, or to a return that was asked for. Mean: of the mean "
-        "curve. The interval is that of the median; its ends are seeds, of ten the second and the ninth. Share: the "
-        "median seed's steps as a share of the reference's whole run."
+        "Environment steps to what the reference ended with, or to a return that was asked for. Curves are of the "
+        "evaluations on the way; a run may stay below what it has in its final evaluation on new episodes. Mean: of "
+        "the mean curve. The interval is that of the median; its ends are seeds, of ten the second and the ninth. "
+        "Share: the median seed's steps as a share of the reference's whole run."
     )
     headings = ("panel", "run", "return>", "mean>", "median seed>", "95 % interval>", "share>")
     return Table("Steps to a return", headings, tuple(rows), caption) if rows else None

@@ -111,7 +111,7 @@ def test_a_study_hands_the_task_to_its_workers(folder: Path) -> None:
         "--episodes",
         "2",
     ]
-    esp(folder, *words, *SHORT)
+    assert f"next: esp report study --task {TASK}\n" in esp(folder, *words, *SHORT).stderr
     assert "found nothing" not in esp(folder, "report", "study", "--task", TASK).stdout
     page = (folder / "study" / "report" / "report.html").read_text(encoding="utf-8")
     assert re.search(r">\s*Rendezvous, MAPPO", page), "a chart is titled by the class"

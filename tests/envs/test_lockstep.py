@@ -152,6 +152,7 @@ def test_an_observation_of_another_width_is_refused() -> None:
 def test_others_are_seen_in_index_order() -> None:
     position = torch.tensor([[0.0], [1.0], [10.0]])
     assert to_others(position).squeeze(-1).tolist() == [[1.0, 10.0], [-1.0, 9.0], [-10.0, -9.0]]
+    assert to_others(position[:1]).shape == (1, 0, 1)
 
 
 class Nan(Plain):

@@ -89,6 +89,20 @@ def test_steps_to_where_the_reference_ended(results):
     assert column(results, "steps", "share>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
 
 
+def test_a_reference_that_has_only_begun_has_no_share(results):
+    plain, esp = results.cells
+    begun = plain.model_copy(update={"step": 0})
+    found = results.model_copy(update={"cells": (begun, esp)})
+    assert column(found, "steps", "share>") == ["-", "-"]
+
+
+def test_two_seeds_give_no_verdict(tmp_path):
+    for count, verdict in ((2, "-"), (3, "yes")):
+        ends = {"MAPPO": PLAIN[:count], "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN[:count])]}
+        folder = write_study(tmp_path / str(count), small_study(seeds=tuple(range(count))), ends)
+        assert column(collect(folder).results, "comparison", "ahead of reference") == ["", verdict]
+
+
 def test_seeds_that_never_get_there_count_as_infinitely_late(results):
     plain, esp = results.cells
     slow = Passing(threshold=-150.0, of_mean=None, per_seed=(100, 150, 150, 200, None, None, None))
