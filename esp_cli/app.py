@@ -122,7 +122,7 @@ def _report_own_code(failure: Exception) -> int | None:
 
 
 def _report_usage(failure: typer.TyperException) -> int:
-    message = failure.format_message()
+    message = failure.format_message().replace("Value error, ", "")
     context = getattr(failure, "ctx", None)
     if message:  # empty where no argument was given at all: typer has shown the help already
         console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")

@@ -185,6 +185,8 @@ def plan(
     Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: what
     the caller brings along is registered already.
     """
+    if isinstance(seeds, int):
+        raise ValueError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
     config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
     learner = build_learner(config)
     if init_from is None:

@@ -88,9 +88,14 @@ def test_a_program_loads_such_a_policy_by_naming_its_task(folder: Path, monkeypa
 def test_a_task_without_heuristics_is_evaluated_beside_the_random_policy_alone(folder: Path) -> None:
     source = (folder / "rendezvous.py").read_text()
     (folder / "bare.py").write_text(
-        source.replace('    heuristics = ("middle",)\n', "").replace("def heuristic(", "def h(")
+        source.replace('    heuristics = ("middle",)\n', "")
+        .replace("def heuristic(", "def h(")
+        .replace("def scene(", "def s(")
     )
-    esp(folder, "train", "--task", "bare:Rendezvous", "--out", "bare-run", *SHORT)
+    told = esp(folder, "train", "--task", "bare:Rendezvous", "--out", "bare-run", *SHORT)
+    assert "next: esp eval bare-run --task bare:Rendezvous\n" in told.stderr, (
+        "what cannot be drawn is not to be rendered"
+    )
     shown = esp(folder, "eval", "bare-run", "--episodes", "2", "--task", "bare:Rendezvous").stdout
     assert "random" in shown
     assert "heuristic" not in shown

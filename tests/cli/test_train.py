@@ -142,7 +142,10 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--task", "chess"], "unknown task 'chess'; the tasks are navigation, predator-prey"),
         (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper, fast"),
-        (["--prior", "some"], "'some' is not one of 'esp', 'auto', 'augment', 'consistency', 'none'"),
+        (
+            ["--prior", "some"],
+            "Invalid value for '--prior': 'some' is not one of 'esp', 'auto', 'augment', 'consistency', 'none'",
+        ),
         (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
         (["--consistency-coef", "-1"], "--consistency-coef"),

@@ -108,6 +108,7 @@ def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Pat
         ({"algo": "dqn"}, "unknown algorithm 'dqn'"),
         ({"settings": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"steps": 0}, "steps"),
+        ({"seeds": 3}, r"not how many; write seeds=range\(3\)"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_no_folder(
