@@ -170,10 +170,10 @@ def draw_steps() -> None:
         looks = ((COLOUR, "with the prior", 0.15), ("#777777", "plain", -0.15))
         for cell, (colour, label, shift) in zip(pair, looks, strict=True):
             median, interval = median_steps(cell.steps_to[0].per_seed)
-            ends = [min(steps / cell.steps, 2.0) for steps in interval or (median, median)]  # 2 is out of view
+            ends = [min(steps / cell.step, 2.0) for steps in interval or (median, median)]  # 2 is out of view
             ax.plot(ends, [place + shift] * 2, color=colour, linewidth=1.8, marker="|", markersize=7)
             named = None if place else label
-            ax.plot([min(median / cell.steps, 1.2)], [place + shift], "o", color=colour, markersize=6, label=named)
+            ax.plot([min(median / cell.step, 1.2)], [place + shift], "o", color=colour, markersize=6, label=named)
     ax.set_xscale("log")
     ax.set_xlim(0.02, 1.4)
     ax.set_xticks([1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1], ["1/32", "1/16", "1/8", "1/4", "1/2", "1"])

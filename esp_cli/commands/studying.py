@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import shlex
 import shutil
 import time
@@ -190,9 +189,8 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
         print_tables(results)
     if json is not None:
         console.write_json(json, results.document())
-    own = [cell.config.own_words() for cell in folder.study.cells]
-    named = dict.fromkeys(pair for words in own for pair in zip(words[::2], words[1::2], strict=True))
-    words = ["esp", "report", str(folder.path), *itertools.chain(*named), *threshold_words(thresholds)]
+    first, *others = (cell.config for cell in folder.study.cells)
+    words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")
 
 

@@ -242,8 +242,6 @@ def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
     import numpy as np
 
     from esp_cli.evaluation.statistics import mean_and_sem
-    from esp_envs.base import Environment
-    from esp_envs.registry import task_class
 
     rows = []
     for mode, values in trainer.final_returns().items():
@@ -252,5 +250,4 @@ def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
     words = shlex.join([str(path), *config.own_words()])
-    drawn = f"    esp render {words} -o out.gif" if task_class(config.task).scene is not Environment.scene else ""
-    console.note(f"next: esp eval {words}{drawn}")
+    console.note(f"next: esp eval {words}" + (f"    esp render {words} -o out.gif" if trainer.can_be_drawn else ""))

@@ -145,10 +145,10 @@ def steps_table(results: Results) -> Table | None:
         for passing in cell.steps_to:
             mean = math.inf if passing.of_mean is None else passing.of_mean
             median, interval = median_steps(passing.per_seed)
-            counts = [_within(steps, cell.step) for steps in (mean, median, *(interval or ()))]
-            span = f"[{counts[2]}, {counts[3]}]" if interval else NOTHING
+            reached = (_within(mean, cell.step), _within(median, cell.step))
+            span = f"[{', '.join(_within(end, cell.step) for end in interval)}]" if interval else NOTHING
             share = f"{median / run.step:.2f}" if math.isfinite(median) and run.step else NOTHING
-            rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *counts[:2], span, share))
+            rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *reached, span, share))
     caption = (
         "Environment steps to what the reference ended with, or to a return that was asked for. Curves are of the "
         "evaluations on the way; a run may stay below what it has in its final evaluation on new episodes. Mean: of "

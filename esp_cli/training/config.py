@@ -87,10 +87,15 @@ class RunConfig(Strict):
         """Return the contract of the task; for that it makes one world."""
         return make(self.task, 1, (0,), self.task_settings).spec
 
-    def own_words(self) -> list[str]:
-        """Return the options that name what is not installed, for a command about this run: ["--task", "mine:Task"]."""
-        chosen = (("--task", self.task), ("--algo", self.algorithm), ("--network", self.network.name))
-        return [word for option, name in chosen if ":" in name for word in (option, name)]
+    def own_words(self, *others: RunConfig) -> list[str]:
+        """Return the options that name what is not installed, each once, for a command about this run and others.
+
+        For example ["--task", "mine:Task"].
+        """
+        runs = (self, *others)
+        chosen = [(("--task", run.task), ("--algo", run.algorithm), ("--network", run.network.name)) for run in runs]
+        named = dict.fromkeys((option, name) for pairs in chosen for option, name in pairs if ":" in name)
+        return [word for pair in named for word in pair]
 
     def command(self) -> str:
         """Return the `esp train` command line that resolves to this configuration, quoted for a shell.

@@ -132,6 +132,11 @@ class Trainer:
         """The reward convention in which returns are counted."""
         return self.learner.spec.convention
 
+    @property
+    def can_be_drawn(self) -> bool:
+        """Whether the task can be drawn."""
+        return self._eval_env.has("scene")
+
     def final_returns(self) -> dict[str, NDArray[np.float64]]:
         """Return the last evaluation of the run: greedy and stochastic, one return per seed (NaN where it stopped)."""
         rows = read_metrics(self.folder.metrics_path)
