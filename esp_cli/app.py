@@ -122,7 +122,7 @@ def _report_own_code(failure: Exception) -> int | None:
 
 
 def _report_usage(failure: typer.TyperException) -> int:
-    message = failure.format_message().replace("Value error, ", "")
+    message = failures.own_words(failure.format_message())
     context = getattr(failure, "ctx", None)
     if message:  # empty where no argument was given at all: typer has shown the help already
         console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
@@ -143,7 +143,7 @@ def _validation_sentence(failure: ValidationError) -> str:
         if item["type"] == "extra_forbidden":
             found.append(f"there is no setting '{where}'")
             continue
-        message = item["msg"].removeprefix("Value error, ")
+        message = failures.own_words(item["msg"])
         found.append(f"setting '{where}': {message} (got {item['input']!r})" if where else message)
     return f"{failure.title}: {'; '.join(found)}"
 

@@ -6,6 +6,8 @@ STEPS = 1_000_000
 """Environment steps per seed of a run."""
 EPISODES = 320
 """Of an evaluation, per seed."""
+STUDY_SEEDS = tuple(range(10))
+"""Of a study: as many as the paper has."""
 MAX_STEPS = 10**12
 """Steps that one run may take; the fastest machine needs years for them."""
 MAX_SEEDS = 1000

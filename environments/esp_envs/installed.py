@@ -95,6 +95,10 @@ class Registry(Mapping[str, type[T]]):
         """Yield the names: built-in ones, installed ones, those that the caller registered."""
         return iter(dict.fromkeys((*self._built_in, *self._installed(), *self._registered)))
 
+    def ships(self, name: str) -> bool:
+        """Return whether the package itself brings a class of this name."""
+        return name in self._built_in
+
     def __len__(self) -> int:
         """Return the number of names."""
         return sum(1 for _ in self)

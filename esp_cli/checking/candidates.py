@@ -22,14 +22,14 @@ _MOST = 64
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try: those asked for, else of d8, any angle, orders of agents and of declared items.
 
-    Elements that the actions or layouts cannot carry are left out.
+    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task.
 
     Args:
         spaces: of the task.
         transforms: text as `--transforms` takes it.
 
     Raises:
-        ValueError: the text means nothing, or nothing that is asked for can be carried.
+        ValueError: the text means nothing, or nothing that is asked for can be tried.
     """
     texts = [transforms] if transforms is not None else [_TRIED, Factors.of(spaces.symmetry).plane]
     if transforms is None:
@@ -51,12 +51,12 @@ def _orders(name: str, count: int) -> list[str]:
 
 
 def _refusal(element: Element, spaces: Spaces) -> str | None:
-    """Say why the actions or layouts cannot carry an element, if they cannot."""
+    """Say why an element cannot be tried, if it cannot: actions or layouts cannot carry it, or it moves nothing."""
     try:
-        build_transform([element], spaces)
+        transform = build_transform([element], spaces)
     except ValueError as error:
         return str(error)
-    return None
+    return f"{element.name} moves no number of it" if transform.is_identity else None
 
 
 def is_declared(element: Element, spaces: Spaces) -> bool:

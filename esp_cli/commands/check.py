@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from esp_cli.checking.paired import MakeWorlds
     from esp_envs import Environment
     from esp_envs.conformance import Finding
+    from esp_envs.spec import TaskSpec
 
 EPILOG = """Examples:\n
     esp check task rendezvous:Rendezvous\n
     esp check symmetry navigation --set task.actions=continuous\n
     esp check symmetry rendezvous:Rendezvous --transforms d8*agents --json symmetry.json"""
 
+_SYMMETRY = "actions and layouts can carry the declared symmetry"
 _ROUNDING = 1e-4
 """How far a step from a restored state may differ: physics may be finer than the float32 of states."""
 
@@ -77,7 +79,7 @@ def check(
 def _check_task(task: str, make_worlds: MakeWorlds, json: str | None) -> bool:
     from esp_envs.conformance import Subject, check
 
-    findings: list[Finding] = list(check(Subject(make_worlds, rounding=_ROUNDING)))
+    findings = [_of_the_symmetry(make_worlds(1, [0]).spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
     if json != "-":
         rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
                 for f in findings]  # fmt: skip
@@ -85,6 +87,18 @@ def _check_task(task: str, make_worlds: MakeWorlds, json: str | None) -> bool:
     if json is not None:
         console.write_json(json, findings)
     return not any(finding.broken for finding in findings)
+
+
+def _of_the_symmetry(spec: TaskSpec) -> Finding:
+    """Return whether actions and layouts can carry what a task declares; `esp check symmetry` asks whether it holds."""
+    from esp_cli.symmetry import admit_declared
+    from esp_envs.conformance import Finding
+
+    try:
+        admit_declared(spec)
+    except ValueError as error:
+        return Finding(_SYMMETRY, broken=str(error))
+    return Finding(_SYMMETRY, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
 
 
 def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> bool:

@@ -26,13 +26,12 @@ from esp_cli.commands.options import (
     register_learners,
     register_tasks,
 )
-from esp_cli.defaults import EPISODES
+from esp_cli.defaults import EPISODES, STUDY_SEEDS
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.study import StudyFolder
 
-DEFAULT_SEEDS = tuple(range(10))
 DEFAULT_PRESET = "default"
 
 TasksOption = Annotated[
@@ -129,7 +128,7 @@ class StudyChoices:
     tasks: TasksOption = None
     algos: AlgosOption = None
     steps: StudyStepsOption = None
-    seeds: Annotated[tuple[int, ...], SeedsOption] = DEFAULT_SEEDS
+    seeds: Annotated[tuple[int, ...], SeedsOption] = STUDY_SEEDS
     out: StudyOutOption = None
     preset: PresetOption = DEFAULT_PRESET
     settings: SetOption = None
@@ -211,7 +210,7 @@ class StudyChoices:
         for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
             names = parse_names(items)
             words += [flag, ",".join(names)] if names else []
-        words += seed_words(self.seeds) if self.seeds != DEFAULT_SEEDS else []
+        words += seed_words(self.seeds) if self.seeds != STUDY_SEEDS else []
         words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
@@ -231,7 +230,7 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
     counted = copy.copy(get_args(SeedsOption)[1])
-    counted.show_default = str(len(DEFAULT_SEEDS))
+    counted.show_default = str(len(STUDY_SEEDS))
     shared["seeds"] = shared["seeds"].replace(annotation=Annotated[tuple | None, counted], default=None)
     for name, text in helps.items():
         kind, option = get_args(shared[name].annotation)
@@ -245,7 +244,7 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     @functools.wraps(command)
     def with_options(**given: Any) -> None:
         arguments = {name: given.pop(name) for name in own}
-        given["seeds"] = chosen_seeds(given["seeds"], given.pop("seed_list"), DEFAULT_SEEDS)
+        given["seeds"] = chosen_seeds(given["seeds"], given.pop("seed_list"), STUDY_SEEDS)
         command(choices=StudyChoices(**given), **arguments)
 
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

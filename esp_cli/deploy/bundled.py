@@ -88,8 +88,8 @@ def open_policy(
         )
     if not there:
         known = [*task_names(), *(entry.name for entry in read_bundled(folder))]
-        if hint := did_you_mean(str(where), known):
-            raise ValueError(f"{where} does not exist{hint}")
+        hint = did_you_mean(str(where), known) or "; give a run folder, a policy file, or a task's or policy's name"
+        raise ValueError(f"{where} does not exist{hint}")
     return load_policy(where)
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from esp_cli.files.failures import attempting
+from esp_cli.files.failures import attempting, own_words
 from esp_cli.files.opening import read_regular
 from esp_cli.files.suggesting import nearest
 from esp_cli.files.writing import replace_file
@@ -195,7 +195,7 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
         return f"unknown setting '{name}'; {owner or section or 'it'} has {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"the setting '{name}' is missing"
-    message = first["msg"].removeprefix("Value error, ")
+    message = "it has to be a list, as [64,64]" if first["type"] == "tuple_type" else own_words(first["msg"])
     return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
 
 

@@ -1,4 +1,4 @@
-"""Failures of the file system: those that the user can correct, and those of the machine."""
+"""Failures in one sentence: of the file system, which the user can correct or not, and of values."""
 
 from __future__ import annotations
 
@@ -40,6 +40,11 @@ def sentence(error: OSError) -> str:
     place = f": {os.fsdecode(error.filename)}" if isinstance(error.filename, str | bytes) and error.filename else ""
     default = "check the path and its permissions" if is_correctable(error) else "check the disk and the machine"
     return f"{reason}{place}; {_ADVICE.get(error.errno or 0, default)}"
+
+
+def own_words(message: str) -> str:
+    """Return a message of ours without what pydantic writes before it."""
+    return message.replace("Value error, ", "")
 
 
 @contextlib.contextmanager

@@ -27,7 +27,8 @@ class PriorConfig(Strict):
         "esp", description="copies and losses, one of them alone, neither (plain), or auto: what holds in the task"
     )
     transforms: str = Field(
-        "d4", description="elements, a group, or discovered; paper: rot90; ours: measured best on navigation"
+        "d4",
+        description="elements, a group, or discovered; paper: rot90; ours: best on navigation; on own tasks: declared",
     )
     copies: Literal["draw", "all"] = Field(
         "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"

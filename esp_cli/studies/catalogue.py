@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import planned
-from esp_cli.defaults import EPISODES
+from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.formatting import file_name, format_count
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
@@ -38,7 +38,7 @@ class Request:
     tasks: Sequence[str] | None = None
     algorithms: Sequence[str] | None = None
     steps: Sequence[tuple[str | None, int]] | None = None
-    seeds: Sequence[int] = tuple(range(paper.NUM_SEEDS))
+    seeds: Sequence[int] = STUDY_SEEDS
     preset: str = "default"
     overrides: Settings = field(default_factory=dict)
     device: str = "cpu"
@@ -92,8 +92,10 @@ def without_effect(name: str, request: Request) -> list[str]:
 def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
     """Return the runs of a study as the user asked for them, before anything is measured for them."""
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
-    if not variants or len(set(variants)) < len(variants) or not set(variants) <= set(kind.variants):
-        raise ValueError(f"name each variant of this study once; they are {', '.join(map(repr, kind.variants))}")
+    unknown = next((name for name in variants if name not in kind.variants), None)
+    if unknown is not None or not variants or len(set(variants)) < len(variants):
+        fault = "name each variant of this study once" if unknown is None else f"this study has no variant '{unknown}'"
+        raise ValueError(f"{fault}; they are {', '.join(map(repr, kind.variants))}")
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
     for setting in request.overrides:
         if any(task_setting(setting, task) in kind.varies for task in tasks):

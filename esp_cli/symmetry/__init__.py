@@ -1,6 +1,6 @@
 """The mathematics of symmetry: groups, their representations on a task's spaces, and numeric checks."""
 
-from esp_cli.symmetry.admission import admit, carried_groups
+from esp_cli.symmetry.admission import admit, admit_declared, carried_groups, default_transforms
 from esp_cli.symmetry.checks import environment_errors, network_equivariance_error
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import (
@@ -27,10 +27,12 @@ __all__ = [
     "Transform",
     "TransformSet",
     "admit",
+    "admit_declared",
     "agent_permutations",
     "build_transform",
     "carried_groups",
     "cyclic",
+    "default_transforms",
     "dihedral",
     "direct_product",
     "environment_errors",

@@ -56,6 +56,45 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
     return tuple(name for name in (*names, *agents, *factors.orders) if _carries(name, spaces))
 
 
+def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
+    """Return the transforms of a task for which nobody chose any, as `admitted_elements` takes them.
+
+    d4 where the task carries it; else the planar part of its symmetry if that can be listed; else c4; else orders of
+    its agents or items. Where it declares nothing, d4, which `admit` refuses.
+
+    Args:
+        spaces: of the task.
+        weighed: whether each element counts by how nearly it holds; then d4 need not be declared.
+
+    Raises:
+        ValueError: its symmetry means nothing.
+    """
+    declared = _factors(_usable(spaces), spaces)
+    if weighed and not _carries("d4", spaces) and _carries("d4", unrestricted(spaces)):
+        return DISCOVERED + "d4"
+    listed = [name for name in declared[:1] if name != "so2"]
+    return next((name for name in ("d4", *listed, "c4", *declared) if _carries(name, spaces)), "d4")
+
+
+def admit_declared(spaces: Spaces) -> None:
+    """Refuse the symmetry that a task declares, or declares nearly, where its actions or layouts cannot carry it.
+
+    Raises:
+        ValueError: they cannot, or it means nothing.
+    """
+    for text in filter(None, (spaces.symmetry, spaces.nearly)):
+        for name in _factors(text, spaces):
+            found = parse_elements(name, spaces.num_agents)
+            admit(name, found, replace(spaces, symmetry=text, nearly=""))
+
+
+def _factors(symmetry: str, spaces: Spaces) -> list[str]:
+    """Return the factors of a symmetry that move something, the planar one first: "d4*agents" -> ["d4", "agents"]."""
+    factors = Factors.of(symmetry)
+    plane = [factors.plane] if factors.plane not in ("", "c1") else []
+    return [*plane, *(["agents"] if factors.agents and spaces.num_agents > 1 else []), *factors.orders]
+
+
 def exchangeable(spaces: Spaces) -> dict[str, int]:
     """Return the fields whose items may change places as far as layouts tell, each with how many it has.
 

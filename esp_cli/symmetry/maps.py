@@ -44,6 +44,11 @@ class Dense:
         return torch.bmm(rows, self.matrix.to(rows.dtype))
 
     @property
+    def is_identity(self) -> bool:
+        """Whether it leaves every row as it is."""
+        return torch.equal(self.matrix, torch.eye(self.width).to(self.matrix).expand_as(self.matrix))
+
+    @property
     def squared(self) -> Dense:
         """The map whose entries are squared: how variances of independent numbers move."""
         return Dense(self.matrix.square())
@@ -81,6 +86,12 @@ class Gather:
         """Return the rows signed, then in their old order."""
         signed = rows if self.sign is None else rows * self.sign[:, None, :].to(rows.dtype)
         return signed.gather(2, self.back[:, None, :].expand(rows.shape))
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it leaves every row as it is."""
+        stays = torch.equal(self.source, torch.arange(self.width).to(self.source).expand_as(self.source))
+        return stays and (self.sign is None or bool((self.sign == 1).all()))
 
     @property
     def squared(self) -> Gather:

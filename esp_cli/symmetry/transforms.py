@@ -56,6 +56,12 @@ class Transform:
         """Whether all rows of one seed are moved by the same element."""
         return True
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether it moves no number of the task, as a turn of scalars alone."""
+        maps = (self.obs_map, self.state_map, self.output_map)
+        return all(m.is_identity for m in maps) and (self.agents is None or self.agents.is_identity)
+
     def part(self, start: int, stop: int) -> Transform:
         """Return what acts on the rows from `start` to `stop` of a batch."""
         return self

@@ -19,7 +19,8 @@ from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
-from esp_envs.registry import make, task_class
+from esp_cli.symmetry import default_transforms
+from esp_envs.registry import TASKS, make, task_class
 from esp_envs.spec import TaskSpec
 
 SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
@@ -102,7 +103,9 @@ class RunConfig(Strict):
 
         What is the default of the command, or of the preset, is left out.
         """
-        plain = resolve_config(self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device)
+        # so that no world is made with other settings than the user's: what another task declares is said
+        declared = None if TASKS.ships(self.task) else {"prior.transforms": PriorConfig().transforms}
+        plain = resolve_config(self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device, declared)
         known, own = plain.model_dump(mode="json"), self.model_dump(mode="json")
         words = ["esp", "train", "--task", self.task, "--algo", self.algorithm]
         words += ["--preset", self.preset] if self.preset != "default" else []
@@ -171,6 +174,10 @@ def resolve_config(
         sections["prior"].pop("transforms", None)  # of a preset, for a prior that trusts all of them alike
 
     task_settings = resolve_task_settings(task, sections["task"])
+    kind = sections["prior"].get("kind")
+    if kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
+        spec = make(task, 1, (0,), task_settings).spec
+        sections["prior"]["transforms"] = default_transforms(spec, weighed=kind == "auto")
     algorithm_settings = validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
     values = {
         "task": task,

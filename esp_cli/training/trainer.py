@@ -177,7 +177,10 @@ class Trainer:
 
     def _require_a_seed_that_goes_on(self) -> None:
         if self.all_stopped:
-            raise ValueError("every seed stopped on a number that is not finite; try a smaller learning rate")
+            raise ValueError(
+                "every seed stopped on a number that is not finite; ask 'esp check task' whether the task has one, "
+                "or try a smaller learning rate"
+            )
 
     def _iterate(self) -> tuple[dict[str, Any], float]:
         """Collect, learn, freeze broken seeds, evaluate where it is time; return metrics and seconds of learning."""

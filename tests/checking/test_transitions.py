@@ -13,7 +13,7 @@ from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
-from esp_envs.spec import Field, Items, Kind, Spaces, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, layout
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
 HOLDS = FieldVerdict("position", "holds", 0.0, 0.1)
@@ -137,3 +137,13 @@ def test_what_no_action_carries_is_not_tried() -> None:
     assert "rot45" not in {element.name for element in candidates(spec)}
     with pytest.raises(ValueError, match="no transform can be tried on navigation: action 'left' turned by 45"):
         candidates(spec, "rot45")
+
+
+def test_what_moves_no_number_is_not_tried() -> None:
+    numbers = layout(Field("speed", Kind.SCALAR, 2))
+    push = Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("stay", "push"))
+    spaces = Spaces(num_agents=1, observation=numbers, state=numbers, action=push, symmetry="o2")
+    with pytest.raises(ValueError, match=r"no transform can be tried on the task: rot45 moves no number of it"):
+        candidates(spaces)
+    leaning = replace(spaces, observation=layout(Field("speed", Kind.SCALAR), Field("lean", Kind.PSEUDOSCALAR)))
+    assert {element.name[:4] for element in candidates(leaning)} == {"flip"}, "turns move nothing of it"

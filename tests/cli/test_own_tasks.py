@@ -152,6 +152,27 @@ def test_check_says_whether_a_task_is_what_it_claims(folder: Path) -> None:
     assert esp(folder, "check", "symmetry", "windy:Rendezvous", "--transforms", "flip-x").returncode == 0
 
 
+def test_check_says_where_a_task_raises_and_what_symmetry_is_none(folder: Path) -> None:
+    source = (folder / "rendezvous.py").read_text()
+    (folder / "slips.py").write_text(source.replace("return -distance.mean(-1)", "return -distanse.mean(-1)"))
+    found = json.loads(esp(folder, "check", "task", "slips:Rendezvous", "--json", "-", code=1).stdout)
+    assert any("NameError: name 'distanse' is not defined, in '_advance' (slips.py" in str(f["broken"]) for f in found)
+    (folder / "noname.py").write_text(source.replace('"o2*agents"', '"dihedral"'))
+    found = json.loads(esp(folder, "check", "task", "noname:Rendezvous", "--json", "-", code=1).stdout)
+    assert [f["promise"] for f in found if f["broken"]] == ["actions and layouts can carry the declared symmetry"]
+    assert "unknown transform 'dihedral'" in found[0]["broken"]
+
+
+def test_a_task_is_trained_with_the_symmetry_that_it_declares(folder: Path) -> None:
+    source = (folder / "rendezvous.py").read_text()
+    (folder / "mirrored.py").write_text(source.replace('"o2*agents"', '"flip-x"'))
+    short = ["--steps", "200", "--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2"]
+    told = esp(folder, "train", "--task", "mirrored:Rendezvous", *short, "--out", "mirrored").stderr
+    assert "prior esp (flip-x, c = 0.1)" in told
+    told = esp(folder, "train", "--task", "mirrored:Rendezvous", *short, "--prior", "auto", "--out", "weighed").stderr
+    assert "prior esp (discovered:d4, c = 0.1)" in told
+
+
 def test_check_measures_a_policy_too(folder: Path) -> None:
     words = ["check", "symmetry", TASK, "--transforms", "rot90,flip-x", "--policy", "run", "--json", "-"]
     result = json.loads(esp(folder, *words).stdout)

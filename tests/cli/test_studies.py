@@ -135,7 +135,7 @@ def test_a_study_of_breakings_is_run_in_pieces_and_runs_once_what_trains_the_sam
     more = esp(*study, "--broken-by", "mud", "--dry-run", "--jobs", 2)
     assert "4 runs to do" in more.stdout, "the unbroken ones are there"
     assert refused("ablate", "modules", "--broken-by", "wind") == "--broken-by is for esp ablate breaking; leave it out"
-    assert "name each variant of this study once" in refused(*study, "--methods", "luck")
+    assert "this study has no variant 'luck'; they are" in refused(*study, "--methods", "luck")
 
 
 def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
     [
         (["ablate", "colours"], "'colours' is not one of"),
         (["ablate", "modules", "--steps", "soon"], "'soon' is not a number of steps"),
-        (["ablate", "transforms", "--methods", "rot90, rot270"], "once; they are 'none', 'rot90', 'rot90, rot180', "),
+        (["ablate", "transforms", "--methods", "rot90, rot270"], "they are 'none', 'rot90', 'rot90, rot180', "),
         (["ablate", "modules", "--algo", "magic"], "unknown algorithm 'magic'"),
         (["ablate", "coefficient", "--set", "prior.consistency_coef=1"], "varies by itself"),
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from esp_cli.symmetry import carried_groups, transform_set
+from esp_cli.symmetry import admit_declared, carried_groups, default_transforms, transform_set
 from esp_cli.symmetry.admission import exchangeable
 from esp_envs.spec import Field, Items, Kind, Spaces, layout
 from tests.symmetry.toy_actions import FORCE, WHEEL_PAIRS
@@ -154,3 +154,38 @@ def test_each_carried_group_makes_a_set(make_spec) -> None:
         spec = make_spec(action=action)
         for name in carried_groups(spec):
             assert transform_set(name, spec).names
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "action", "chosen"),
+    [
+        ("o2*agents", None, "d4"),
+        ("c4", None, "c4"),
+        ("c8", FORCE, "c8"),
+        ("c8*agents", None, "c4"),  # four directions do not carry c8
+        ("so2*agents", FORCE, "c4"),
+        ("flip-y*agents", None, "flip-y"),
+        ("c1*agents", None, "agents"),
+        ("c1", None, "d4"),  # which is refused
+    ],
+)
+def test_where_nobody_chooses_a_task_gets_what_it_declares(make_spec, symmetry: str, action, chosen: str) -> None:
+    spec = make_spec(symmetry=symmetry, **({} if action is None else {"action": action}))
+    assert default_transforms(spec) == chosen
+
+
+def test_what_is_weighed_need_not_be_declared(make_spec) -> None:
+    assert default_transforms(make_spec(symmetry="c1"), weighed=True) == "discovered:d4"
+    assert default_transforms(make_spec(symmetry="o2"), weighed=True) == "d4"
+    assert transform_set("discovered:d4", make_spec(symmetry="c1")).size == 7
+
+
+def test_a_symmetry_that_means_nothing_or_cannot_act_is_refused(make_spec) -> None:
+    admit_declared(make_spec(symmetry="d4*agents"))
+    admit_declared(make_spec(1, symmetry="c1*agents"))
+    with pytest.raises(ValueError, match="unknown transform 'foo'"):
+        admit_declared(make_spec(symmetry="foo"))
+    with pytest.raises(ValueError, match="c8 cannot act on toy: action 'left' turned by 45 degrees"):
+        admit_declared(make_spec(symmetry="c8"))
+    with pytest.raises(ValueError, match="goals-3 cannot act on toy: it has no field 'goals'"):
+        admit_declared(replace(make_spec(symmetry="c4"), nearly="d4*goals-3"))

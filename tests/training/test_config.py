@@ -228,6 +228,7 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
         ),
         ({"overrides": {"mappo.gamma": float("nan")}}, "bad value nan for 'mappo.gamma': it has to be a finite number"),
         ({"overrides": {"network.hidden": "[64, wide]"}}, "bad value '[64, wide]' for 'network.hidden'"),
+        ({"overrides": {"network.hidden": "64"}}, "bad value 64 for 'network.hidden': it has to be a list, as [64,64]"),
         ({"overrides": {"network.hidden": [64, "wide"]}}, "bad value 'wide' for 'network.hidden.1'"),
         (
             {"overrides": {"mappo.learning_rate": "inf"}},

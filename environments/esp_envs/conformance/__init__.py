@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 from esp_envs.conformance import repeating, stepping
 from esp_envs.conformance.subject import Broken, NotAsked, Subject
+from esp_envs.installed import last_line, raised_in
 
 __all__ = ["PROMISES", "Broken", "Finding", "NotAsked", "Subject", "check"]
 
@@ -55,7 +56,8 @@ def check(subject: Subject) -> Iterator[Finding]:
         except NotAsked as reason:
             yield Finding(name, not_asked=str(reason))
         except Exception as failure:
-            said = str(failure) if isinstance(failure, Broken) else f"{type(failure).__name__}: {failure}"
-            yield Finding(name, broken=said)
+            place = raised_in(failure)
+            said = last_line(failure) + (f", in {place}" if place else "")
+            yield Finding(name, broken=str(failure) if isinstance(failure, Broken) else said)
         else:
             yield Finding(name)
