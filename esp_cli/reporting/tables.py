@@ -129,7 +129,8 @@ def statistics_table(results: Results) -> Table:
         texts = (_estimate(found.iqm), _mean_of(found.normalised), _mean_of(found.area))
         rows.append((cell.panel, cell.variant, str(seeds), *texts, duration))
     caption = (
-        "IQM: mean of the middle half of the seeds. Normalised: 0 is the random policy, 1 the best heuristic. "
+        "IQM: mean without the lowest and the highest quarter of the seeds, rounded down. Normalised: 0 is the random "
+        "policy, 1 the best heuristic. "
         "Mean over the run: area under the curve."
     )
     headings = ("panel", "run", "seeds>", "IQM>", "normalised>", "mean over the run>", "training>")
@@ -147,15 +148,17 @@ def steps_table(results: Results) -> Table | None:
             median, interval = median_steps(passing.per_seed)
             reached = (_within(mean, cell.step), _within(median, cell.step))
             span = f"[{', '.join(_within(end, cell.step) for end in interval)}]" if interval else NOTHING
-            share = f"{median / run.step:.2f}" if math.isfinite(median) and run.step else NOTHING
-            rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *reached, span, share))
+            its = [median_steps(p.per_seed)[0] for p in run.steps_to if p.threshold == passing.threshold]
+            shares = (_share(median, run.step), _share(median, its[0]) if its and run is not cell else "")
+            rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *reached, span, *shares))
     caption = (
         "Environment steps to what the reference ended with, or to a return that was asked for. Curves are of the "
-        "evaluations on the way; a run may stay below what it has in its final evaluation on new episodes. Mean: of "
-        "the mean curve. The interval is that of the median; its ends are seeds, of ten the second and the ninth. "
-        "Share: the median seed's steps as a share of the reference's whole run."
+        f"evaluations on the way{_on_the_way(results)}; a run may stay below what it has in its final evaluation on "
+        "new episodes. Mean: of the mean curve. The interval is that of the median; its ends are seeds, of ten the "
+        "second and the ninth. Of the run, of its steps: the median seed's steps as a share of the reference's whole "
+        "run, and of the steps of the reference's own median seed."
     )
-    headings = ("panel", "run", "return>", "mean>", "median seed>", "95 % interval>", "share>")
+    headings = ("panel", "run", "return>", "mean>", "median seed>", "95 % interval>", "of the run>", "of its steps>")
     return Table("Steps to a return", headings, tuple(rows), caption) if rows else None
 
 
@@ -193,8 +196,8 @@ def breaking_table(results: Results) -> Table | None:
                 short = _return_at(results, cell, early=True)
                 rows.append((one.name, f"{one.setting} {strength:g}", method, short, _short(results, cell), *beside))
     caption = (
-        "Mean ± standard error over seeds at the evaluation nearest to a fifth of the run and at its end; ahead: at "
-        "its end, by intervals."
+        f"Mean ± standard error over seeds at the evaluation nearest to a fifth of the run{_on_the_way(results)} and "
+        "at its end; ahead: at its end, by intervals."
     )
     headings = ("run", "breaking", "method", "at 20 %>", "at 100 %>", "ahead of plain", "ahead of ESP")
     return Table("Returns over the strength of breaking", headings, tuple(rows), caption) if rows else None
@@ -217,7 +220,8 @@ def methods_table(results: Results, early: bool = False) -> Table | None:
         label = breaking if shared else f"{name}, {breaking}"
         rows.append((label, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
     when = "at the evaluation nearest to a fifth of the run" if early else "at the end of the run"
-    caption = f"Mean ± standard error over seeds {when}; (*): the highest of its row, or not told apart from it."
+    few = _on_the_way(results) if early else ""
+    caption = f"Mean ± standard error over seeds {when}{few}; (*): the highest of its row, or not told apart from it."
     headings = (shared or "run", *(f"{method}>" for method in methods))
     return Table(f"Returns {when}", headings, tuple(rows), caption) if rows else None
 
@@ -322,6 +326,18 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
     """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
     symmetric = config.get("network.name") in ("equivariant", "empn") or config.get("network.symmetrise")
     return config.get("prior.kind") == "none" and not symmetric
+
+
+def _on_the_way(results: Results) -> str:
+    """Say how many episodes the evaluations of the curves have: " (32 episodes a seed)"."""
+    counts = {(results.config | cell.config).get("evaluation.episodes") for cell in results.cells}
+    known = {count for count in counts if isinstance(count, int)}
+    return f" ({format_span(known)} episodes a seed)" if known else ""
+
+
+def _share(steps: float, of: float) -> str:
+    """Return steps as a share of others, a dash where either never came."""
+    return f"{steps / of:.2f}" if math.isfinite(steps) and math.isfinite(of) and of else NOTHING
 
 
 def _within(steps: float, run: int) -> str:

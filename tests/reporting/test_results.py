@@ -86,14 +86,15 @@ def test_steps_to_where_the_reference_ended(results):
     assert column(results, "steps", "return>") == ["-150.00", "-150.00"]
     assert column(results, "steps", "mean>") == ["200", "100"]
     assert column(results, "steps", "median seed>") == ["200", "100"]
-    assert column(results, "steps", "share>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
+    assert column(results, "steps", "of the run>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
+    assert column(results, "steps", "of its steps>") == ["", "0.50"], "100 of 200 steps"
 
 
 def test_a_reference_that_has_only_begun_has_no_share(results):
     plain, esp = results.cells
     begun = plain.model_copy(update={"step": 0})
     found = results.model_copy(update={"cells": (begun, esp)})
-    assert column(found, "steps", "share>") == ["-", "-"]
+    assert column(found, "steps", "of the run>") == ["-", "-"]
 
 
 def test_two_seeds_give_no_verdict(tmp_path):
@@ -113,7 +114,7 @@ def test_seeds_that_never_get_there_count_as_infinitely_late(results):
     slower = slow.model_copy(update={"per_seed": (100, None, None)})
     never = results.model_copy(update={"cells": (plain, esp.model_copy(update={"steps_to": (slower,), "step": 200}))})
     assert column(never, "steps", "median seed>")[1] == "> 200"
-    assert column(never, "steps", "share>")[1] == "-"
+    assert column(never, "steps", "of its steps>")[1] == "-"
 
 
 @pytest.mark.parametrize(("seeds", "shown"), [((0, 1), "-"), ((0, 1, 2), "1.00")])
