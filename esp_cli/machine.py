@@ -42,8 +42,10 @@ def resolve_device(wanted: str) -> str:
     """Return "cpu" or "cuda" for what --device asks for.
 
     Raises:
-        ValueError: a GPU is asked for and there is none.
+        ValueError: a GPU is asked for and there is none, or something else is asked for.
     """
+    if wanted not in ("cpu", "cuda", "auto"):
+        raise ValueError(f"there is no device '{wanted}'; choose cpu, cuda or auto")
     import torch  # noqa: PLC0415 - takes a second
 
     available = torch.cuda.is_available()

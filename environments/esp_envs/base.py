@@ -105,6 +105,17 @@ def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
         raise ValueError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
 
 
+def require_flags(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
+    """Refuse a tensor of another shape, or of other numbers than flags.
+
+    Raises:
+        ValueError: says which.
+    """
+    require_shape(what, tensor, expected)
+    if tensor.dtype != torch.bool:
+        raise ValueError(f"the {what} is {tensor.dtype}, expected torch.bool")
+
+
 OTHER_SIZE = "the saved environment has other seeds, worlds or bodies than this one; use its settings"
 """What every task answers to the saved state of an environment of another size."""
 

@@ -25,10 +25,11 @@ from esp_envs.base import (
     Step,
     TaskSettings,
     generator_states,
+    require_flags,
     require_shape,
     restore_generators,
 )
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Discrete, TaskSpec
 
 World = dict[str, Tensor]
 """The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
@@ -142,7 +143,11 @@ class BatchedTask(LockstepTask):
         mask = self._allow(self.world)
         if (mask is not None) != self.spec.masks:
             raise ValueError(f"{self.spec.name}: implement '_allow' and set 'masks' in the spec, or do neither")
-        return None if mask is None else mask.contiguous().clone()
+        if mask is None:
+            return None
+        assert isinstance(self.spec.action, Discrete), "masks are for discrete actions"
+        require_flags("action mask", mask, (*self.action_shape[:3], self.spec.action.count))
+        return mask.contiguous().clone()
 
     def draw(self, *shape: int, generator: torch.Generator | None = None) -> Tensor:
         """Return numbers uniform in [-1, 1]: [E, *shape] from one generator, else [S, E, *shape] from each seed's."""
@@ -188,6 +193,8 @@ class BatchedTask(LockstepTask):
         if reward.dim() == 2:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
         require_shape("reward", reward, self.action_shape[:3])
+        for name, value in metrics.items():
+            require_shape(f"metric {name}", value, self.action_shape[:2])
         metrics = {name: value.float().contiguous().clone() for name, value in metrics.items()}
         return reward.float().contiguous().clone(), metrics
 
@@ -197,6 +204,8 @@ class BatchedTask(LockstepTask):
         alive = self._living(self.world)
         if (alive is not None) != self.spec.agents_end:
             raise ValueError(f"{self.spec.name}: implement '_living' and set 'agents_end' in the spec, or do neither")
+        if alive is not None:
+            require_flags("tensor of '_living'", alive, self.action_shape[:3])
         return Observation(obs, self._state(), self.action_mask(), None if alive is None else alive.clone())
 
     def _put(self, state: Tensor) -> None:

@@ -92,6 +92,11 @@ class Field:
     parts: tuple[Field, ...] = ()
 
     def __post_init__(self) -> None:
+        for name, kind, example in _FIELD_TYPES:
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"field '{self.name}': {name} is {getattr(self, name)!r}; give {example}")
+        if self.count < 0:
+            raise ValueError(f"field '{self.name}': count is {self.count}; give how many items it has")
         if (self.kind == Kind.PICTURE) != (self.pixels is not None):
             raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
         if (self.kind == Kind.RING) != (self.rays > 0):
@@ -124,6 +129,16 @@ class Field:
         return f"{self.kind.name}{size} x {self.count}"
 
 
+_FIELD_TYPES = (
+    ("name", str, "a text"),
+    ("kind", Kind, "a kind, as Kind.VECTOR"),
+    ("count", int, "a number of items"),
+    ("unit", str, "a text, as unit='m'"),
+    ("items", Items, "what items count over, as items=Items.OTHERS"),
+)
+"""What attributes of a field have to be; the fourth and fifth are easily confused."""
+
+
 @dataclass(frozen=True)
 class Layout:
     """A sequence of fields: the whole meaning of an observation, a state or a continuous action vector."""
@@ -131,6 +146,8 @@ class Layout:
     fields: tuple[Field, ...]
 
     def __post_init__(self) -> None:
+        if stranger := next((repr(f) for f in self.fields if not isinstance(f, Field)), None):
+            raise ValueError(f"a layout is made of fields, and {stranger} is none; write layout(Field(...), ...)")
         names = [f.name for f in self.fields]
         if len(set(names)) != len(names):
             raise ValueError(f"field names must differ, got {names}")

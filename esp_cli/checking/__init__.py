@@ -3,8 +3,9 @@
 from esp_cli.checking.candidates import candidates, found_group
 from esp_cli.checking.paired import check_paired
 from esp_cli.checking.policy import PolicyVerdict, check_policy
+from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.task import SymmetryReport, check_symmetry
-from esp_cli.checking.transitions import Transitions, check_transitions, collect
+from esp_cli.checking.transitions import check_transitions
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 
 __all__ = [

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 from esp_cli.checking.discovery import Discovery, default_candidates, judged_elements, named
 from esp_cli.checking.numbers import Moments, NumberMap, changing, done
 from esp_cli.checking.paired import MakeWorlds
-from esp_cli.checking.transitions import Transitions, collect, outputs_of
+from esp_cli.checking.recorded import Transitions, collect, outputs_of
 from esp_cli.checking.verdicts import NEGLIGIBLE, SIGNIFICANT, ElementVerdict, FieldVerdict, Outcome
 from esp_cli.symmetry import Element, build_transform
 from esp_envs.spec import Discrete, Spaces

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from esp_cli.checking.candidates import candidates, generate
 from esp_cli.checking.paired import MakeWorlds, check_paired
+from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.regression import TOLERATED, check_by_regression
-from esp_cli.checking.transitions import Transitions, collect
 from esp_cli.checking.verdicts import RANK, ElementVerdict
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import DISCOVERED, exchangeable

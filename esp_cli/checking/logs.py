@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from esp_cli.checking.transitions import FEWEST, Transitions
+from esp_cli.checking.recorded import Transitions
+from esp_cli.checking.transitions import FEWEST
 from esp_envs.spec import Discrete, Spaces
 
 _MOST_BYTES = 2**31

@@ -8,11 +8,11 @@ from functools import lru_cache
 
 from esp_cli.checking.discovery import discover_in_task
 from esp_cli.checking.paired import check_paired
+from esp_cli.checking.recorded import collect
 from esp_cli.checking.regression import check_by_regression
-from esp_cli.checking.transitions import collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Group, parse_elements
-from esp_cli.symmetry.admission import DISCOVERED, admitted_elements
+from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestricted
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment
 from esp_envs.registry import make, task_class
@@ -98,7 +98,7 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     """
     env = make_worlds(_WORLDS, [0])
     spec = env.spec
-    elements = admitted_elements(transforms, spec)
+    elements = admitted_elements(transforms, unrestricted(spec))  # what is weighed need not be declared
     if isinstance(elements, Group):
         raise ValueError(
             f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "

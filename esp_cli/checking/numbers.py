@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from esp_cli.checking.transitions import Transitions
+from esp_cli.checking.recorded import Transitions
 from esp_cli.checking.verdicts import SIGNIFICANT
 
 _LEAVES = 16

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.checking.transitions import Transitions, outputs_of, turned
+from esp_cli.checking.recorded import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.prior.regression import inputs_of, moments, ridge
 from esp_cli.symmetry import Element, build_transform

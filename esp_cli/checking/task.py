@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from esp_cli.checking.candidates import candidates, found_group
 from esp_cli.checking.paired import MakeWorlds, check_paired
-from esp_cli.checking.transitions import check_transitions, collect
+from esp_cli.checking.recorded import collect
+from esp_cli.checking.transitions import check_transitions
 from esp_cli.checking.verdicts import ElementVerdict
 
 _COPIES = 256

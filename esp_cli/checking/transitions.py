@@ -10,81 +10,23 @@ Starts that are not symmetric themselves say nothing about the dynamics: there t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
+from esp_cli.checking.recorded import Transitions, outputs_of, turned
+from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
 from esp_cli.prior.regression import moments, own_inputs, ridge
-from esp_cli.symmetry import Element, Transform, build_transform
-from esp_envs.base import Environment
+from esp_cli.symmetry import Element, build_transform
 from esp_envs.spec import Discrete, Spaces
 
-EPISODES = 2048
-STEPS = 8
-"""Steps of each episode that are looked at."""
 FEWEST = 64
 """Episodes (or single transitions) below which nothing can be told."""
 _ASYMMETRIC = 0.05
 """Shift of the starts, in standard deviations, from which an element is not covered."""
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """Steps of a policy that prefers no direction, such as the uniformly random one.
-
-    A vector whose numbers are uniform in [-1, 1] prefers the diagonals. Only quarter turns, and mirrors in the axes or
-    diagonals, keep that preference as it is.
-
-    Shape:
-        obs, next_obs: [M, T, N, D], M episodes from their starts, T steps of each.
-        action: [M, T, N] int64, or [M, T, N, width] float32.
-        reward: [M, T, N].
-        action_mask: [M, T, N, A] bool, the actions that were allowed; None where all always are.
-    """
-
-    obs: Tensor
-    action: Tensor
-    reward: Tensor
-    next_obs: Tensor
-    action_mask: Tensor | None = None
-
-    def episodes(self, where: slice) -> Transitions:
-        """Return some of the episodes."""
-        return Transitions(*(part[where] for part in vars(self).values() if part is not None))
-
-
-def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> Transitions:
-    """Return the first steps of episodes of the random policy.
-
-    An episode that ends earlier repeats its last transition.
-    """
-    found: list[list[tuple[Tensor, ...]]] = []
-    for _ in range(-(-episodes // (env.num_envs * env.num_seeds))):
-        observation = env.reset()
-        over = torch.zeros(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-        rows: list[tuple[Tensor, ...]] = []
-        for _ in range(min(steps, env.spec.horizon)):
-            action = env.random_action()
-            step = env.step(action)
-            row: tuple[Tensor, ...] = (observation.obs, action, step.reward, step.reached.obs)
-            row += () if observation.action_mask is None else (observation.action_mask,)
-            if rows:
-                row = tuple(
-                    torch.where(over.view(*over.shape, *(1,) * (new.dim() - 2)), old, new)
-                    for old, new in zip(rows[-1], row, strict=True)
-                )
-            rows.append(row)
-            over = over | step.ended
-            observation = step.next
-        found.append(rows)
-    parts = [
-        torch.cat([torch.stack(column, 2).flatten(0, 1) for column in columns]).cpu()
-        for columns in zip(*(zip(*rows, strict=True) for rows in found), strict=True)
-    ]
-    return Transitions(*parts)
 
 
 def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
@@ -98,6 +40,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     Raises:
         ValueError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
     """
+    data = _in_float32(data)
     _refuse_what_says_nothing(spaces, data)
     half = len(data.obs) // 2
     inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
@@ -105,10 +48,36 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     rows = half * data.obs.shape[1]
     model = ridge(gram / rows, cross / rows, strength=1e-3, floor=1e-6)
     held = data.episodes(slice(half, None))
-    return [_judge(element, spaces, held, model) for element in elements]
+    verdicts = [_judge(element, spaces, held, model) for element in elements]
+    exchanging = [element for element in elements if element.permutation is not None]
+    sharper = {verdict.element: verdict for verdict in check_by_regression(spaces, data, exchanging)}
+    return [_sharpened(verdict, sharper.get(verdict.element)) for verdict in verdicts]
+
+
+def _sharpened(verdict: ElementVerdict, by_regression: ElementVerdict | None) -> ElementVerdict:
+    """Return a verdict with the fields that a regression on what all agents see and do shows to be broken.
+
+    It sees a wrong order of agents in what an agent sees, of which the products of its own numbers show little.
+    """
+    if by_regression is None or not verdict.fields:
+        return verdict
+    broken = {f.field: f for f in by_regression.fields if f.gap > max(2 * TOLERATED, SIGNIFICANT * f.error)}
+    return replace(verdict, fields=tuple(broken.get(f.field, f) for f in verdict.fields))
+
+
+def _in_float32(data: Transitions) -> Transitions:
+    parts = [part for part in vars(data).values() if part is not None]
+    return Transitions(*(part.float() if part.is_floating_point() else part for part in parts))
 
 
 def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
+    lead = (*data.obs.shape[:2], spaces.num_agents)
+    width = () if isinstance(spaces.action, Discrete) else (spaces.action.width,)
+    seen = (*lead, spaces.observation.width)
+    for name, shape in (("obs", seen), ("action", (*lead, *width)), ("reward", lead), ("next_obs", seen)):
+        if (found := tuple(getattr(data, name).shape)) != shape or len(lead) != 3:
+            axes = "[episodes, steps, agents]" + (" and the width" if len(shape) > 3 else "")
+            raise ValueError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
     if len(data.obs) < FEWEST:
         raise ValueError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
     for name in ("obs", "action", "reward", "next_obs"):
@@ -148,36 +117,21 @@ def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: 
     return judged(name, gap[:, live] / here[..., where].flatten(1).std(0)[live].clamp_min(1e-6), 1.0, moved)
 
 
-def outputs_of(data: Transitions) -> Tensor:
-    """Return what a regression predicts of each agent, [M, T, N, D + 1]: change, reward and any mask."""
-    outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
-    outputs += [] if data.action_mask is None else [data.action_mask.float()]
-    return torch.cat(outputs, -1)
-
-
 def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
-    """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1]."""
+    """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1].
+
+    Inputs are what the agent sees and does, and what the others do: a wrong order of agents in what it sees shows
+    beside their actions alone.
+    """
     inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
     residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
     action = spaces.action
     acted = action.count - 1 if isinstance(action, Discrete) else action.width
     linear = inputs[..., : 1 + data.obs.shape[-1] + acted]  # a wrong order of actions shows beside actions alone
+    own, agents = linear[..., 1 + data.obs.shape[-1] :], range(spaces.num_agents)
+    others = [own[:, :, [j for j in agents if j != i]].flatten(2) for i in agents]
+    linear = torch.cat([linear, torch.stack(others, 2)], -1)
     return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
-
-
-def turned(data: Transitions, transform: Transform) -> Transitions:
-    """Return transformed transitions."""
-
-    def one(part: Tensor) -> Tensor:
-        return part.unsqueeze(0)
-
-    return Transitions(
-        transform.obs(one(data.obs))[0],
-        transform.action(one(data.action))[0],
-        transform.per_agent(one(data.reward))[0],
-        transform.obs(one(data.next_obs))[0],
-        None if data.action_mask is None else transform.push_outputs(one(data.action_mask))[0],
-    )
 
 
 def _asymmetry(start: Tensor, turned: Tensor) -> float:

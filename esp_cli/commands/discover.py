@@ -80,8 +80,8 @@ def _discovery(
             return discover_blindly(what, spec, data)
         return discover_in_transitions(what, spec, data, transforms)
     name = what
-    if task is not None:
-        raise ValueError(f"--task is for a file of transitions, and there is no file {what}; leave it out")
+    if task is not None and not path.is_dir():
+        raise ValueError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
     if path.is_dir():
         from esp_cli.training.loading import parse_config
         from esp_cli.training.run_folder import RunFolder

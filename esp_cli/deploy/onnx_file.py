@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -19,11 +20,12 @@ IR_VERSION = 8
 
 
 def library(name: str) -> Any:
-    """Import onnx or onnxruntime.
+    """Import onnx or onnxruntime; the latter reports nothing to its makers.
 
     Raises:
         ValueError: it is not installed.
     """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # else it writes to the home folder too
     try:
         return import_module(name)
     except ImportError:

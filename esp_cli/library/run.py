@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -215,7 +215,7 @@ def train(
     device: str = "cpu",
     out: str | os.PathLike[str] | None = None,
     init_from: str | os.PathLike[str] | None = None,
-    listener: Callable[[Progress], bool] | None = None,
+    listener: Listener | None = None,
     track: Sequence[str] = (),
 ) -> Run:
     """Train S seeds at once, as `esp train` does, and return the run.
@@ -230,7 +230,7 @@ def train(
         device: "cpu", "cuda", or "auto" for the latter where there is one.
         out: the run folder; by default a new one in runs/.
         init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
-        listener: told of progress after every update; False asks for a clean stop, after which `Run.train` goes on.
+        listener: told of progress after every update; where it returns False the run stops, and `Run.train` goes on.
         track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
 
     Raises:

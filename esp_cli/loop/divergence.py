@@ -57,6 +57,11 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
         if _commutes(transform, own.loc, here.transforms):
             return _normals_apart(transform, inner, own)
         return _samples_apart(transform, there, here, samples)
+    if isinstance(there, Tensor) != isinstance(here, Tensor):
+        raise ValueError(
+            f"the policy says {type(there).__name__} of the moved data, but of the originals (here) there is "
+            f"{type(here).__name__}; give both in one form"
+        )
     action = "discrete" if transform.action_index is not None else "continuous"
     raise ValueError(f"the policy's {type(there).__name__} is not known for {action} actions; give {_KNOWN}")
 

@@ -38,10 +38,13 @@ def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) 
     Raises:
         ValueError: another shape or type, or an action outside.
     """
+    _check_tensor("action", action)
     space, axes, shape = spaces.action, (*lead, *_agents(spaces)), list(action.shape)
     if not isinstance(space, Discrete):
         if action.shape != (*axes, space.width):
             raise ValueError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
+        if not action.is_floating_point():
+            raise ValueError(f"the action is {action.dtype}; give floating-point numbers")
         return transform.action(action)
     if action.shape == (*axes, space.count) and space.count > 1:
         return transform.push_outputs(action)
@@ -62,6 +65,7 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
     Raises:
         ValueError: another shape.
     """
+    _check_tensor(name, x)
     agents, tail = (*lead, *_agents(spaces)), x.shape[len(lead) :]
     if x.shape[: len(lead)] == lead and tail.numel() == 1:
         return x
@@ -69,6 +73,32 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
         return move(x.reshape(agents)).reshape(x.shape)
     reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
     raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
+
+
+def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Size, name: str) -> Tensor:
+    """Move what goes with its agent: a number as by `carry`, or an action mask.
+
+    Raises:
+        ValueError: another shape.
+    """
+    space = spaces.action
+    if isinstance(space, Discrete) and x.dtype == torch.bool and x.shape[-1:] == (space.count,) != (1,):
+        check_mask(spaces, x, lead)
+        return transform.push_outputs(x)
+    return carry(spaces, transform.per_agent, x, lead, name)
+
+
+def check_mask(spaces: Spaces, mask: Tensor, lead: torch.Size) -> None:
+    """Refuse what is no mask of discrete actions [..., N, A].
+
+    Raises:
+        ValueError: another shape or type, or continuous actions.
+    """
+    if not isinstance(spaces.action, Discrete):
+        raise ValueError("an action mask is for discrete actions; leave it out")
+    shape = [*lead, *_agents(spaces), spaces.action.count]
+    if list(mask.shape) != shape or mask.dtype != torch.bool:
+        raise ValueError(f"the action mask is {mask.dtype} {list(mask.shape)}, but torch.bool {shape} is needed")
 
 
 def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
@@ -89,6 +119,7 @@ def _check_rows(
     name: str, x: Tensor, layout: Layout, lead: torch.Size | None = None, agents: tuple[int, ...] = ()
 ) -> torch.Size:
     """Return the leading axes of rows [..., *agents, width] after checking that they are that."""
+    _check_tensor(name, x)
     cut = x.dim() - 1 - len(agents)
     found = x.shape[: max(cut, 0)]
     if x.shape[-1:] != (layout.width,):
@@ -101,6 +132,11 @@ def _check_rows(
     if not x.is_floating_point():
         raise ValueError(f"{name} is {x.dtype}; give floating-point numbers")
     return found
+
+
+def _check_tensor(name: str, x: object) -> None:
+    if not isinstance(x, Tensor):
+        raise ValueError(f"{name} is of type {type(x).__name__}; give a tensor")
 
 
 def _agents(spaces: Spaces) -> tuple[int, ...]:

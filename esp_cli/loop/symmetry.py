@@ -10,16 +10,25 @@ import torch
 from torch import Tensor
 
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import act, carry, check_alike, check_state, lead_of
+from esp_cli.loop.shapes import act, carry, carry_along, check_alike, check_mask, check_state, lead_of
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
 from esp_cli.symmetry.admission import unrestricted
-from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces, joint_layout
 
 if TYPE_CHECKING:
     from esp_cli.checking import ElementVerdict, Transitions
     from esp_envs.base import Environment
+
+
+_GIVEN = {
+    "observation": "layout(Field(...), ...)",
+    "action": "discrete_moves(...), Discrete or Continuous",
+    "group": 'a text, as "d4"',
+    "num_agents": "a number of agents",
+}
+"""What arguments of a symmetry are, for messages."""
 
 
 class Symmetry:
@@ -67,6 +76,10 @@ class Symmetry:
         copies: Literal["draw", "all"] = "draw",
         seed: int = 0,
     ) -> None:
+        kinds = {"observation": (observation, Layout), "action": (action, Discrete | Continuous), "group": (group, str)}
+        for name, (value, kind) in (kinds | {"num_agents": (num_agents, int)}).items():
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} is {value!r}; give {_GIVEN[name]}")
         if copies not in ("draw", "all"):
             raise ValueError(f"copies is {copies!r}; choose 'draw' or 'all'")
         if num_agents < 1:
@@ -114,7 +127,8 @@ class Symmetry:
             action: [..., N] indices of discrete actions, also [..., N, 1] or one-hot [..., N, A]; or [..., N, width].
             state: [..., Ds].
             per_agent: numbers [..., N] or [..., N, 1] that go with their agents (log-probability, advantage), or
-                [...] or [..., 1] of the whole team.
+                [...] or [..., 1] of the whole team; also flags [..., N, A] of the discrete actions (an action mask),
+                which go with the actions.
             dim: the leading axis along which copies are added: 0, or that of the batch where time comes first.
 
         Returns:
@@ -124,6 +138,8 @@ class Symmetry:
             ValueError: a shape that does not fit the layouts, or an action outside.
         """
         lead = lead_of(self.spaces, obs)
+        if isinstance(per_agent, Tensor):
+            raise ValueError("per_agent is one tensor; give a tuple of them, as per_agent=(log_prob, advantage)")
         if not 0 <= dim < len(lead):
             raise ValueError(
                 f"obs of shape {list(obs.shape)} has {len(lead)} leading axes; copies cannot go along {dim}"
@@ -136,7 +152,7 @@ class Symmetry:
         moved_obs = joined(obs, [g.obs(obs) for g in transforms])
         moved_action = joined(action, [act(self.spaces, g, action, lead) for g in transforms])
         numbers = tuple(
-            joined(x, [carry(self.spaces, g.per_agent, x, lead, f"per_agent[{i}]") for g in transforms])
+            joined(x, [carry_along(self.spaces, g, x, lead, f"per_agent[{i}]") for g in transforms])
             for i, x in enumerate(per_agent)
         )
         if state is None:
@@ -160,7 +176,12 @@ class Symmetry:
         return torch.cat(with_copies(self.spaces, data, self.transforms, roles)[0], 0)
 
     def policy_loss(
-        self, policy: Callable[[Tensor], Policy], obs: Tensor, here: Policy = None, mask: Tensor | None = None
+        self,
+        policy: Callable[..., Policy],
+        obs: Tensor,
+        here: Policy = None,
+        mask: Tensor | None = None,
+        action_mask: Tensor | None = None,
     ) -> Tensor:
         """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), averaged over rows, agents and elements.
 
@@ -169,6 +190,8 @@ class Symmetry:
             obs: [..., N, D]; of a recurrent policy, whole histories.
             here: what the policy says of `obs`, where it is known already; detached, it stays fixed.
             mask: [...] which rows count, as flags or as 0 and 1; the loss is 0 where none does.
+            action_mask: flags [..., N, A], which discrete actions are allowed; then the policy is asked for
+                `policy(obs, action_mask)`, of moved data with the moved mask.
 
         Returns:
             A scalar, 0 if and only if the policy turns with the scene.
@@ -176,9 +199,19 @@ class Symmetry:
         Raises:
             ValueError: a shape that does not fit, or a distribution that is not known.
         """
-        lead_of(self.spaces, obs)
-        here = policy(obs) if here is None else here
-        return _mean([policy_divergence(g, policy(g.obs(obs)), here) for g in self.transforms(obs)], mask)
+        lead = lead_of(self.spaces, obs)
+        if action_mask is not None:
+            check_mask(self.spaces, action_mask, lead)
+
+        def asked(x: Tensor, allowed: Tensor | None) -> Policy:
+            return policy(x) if allowed is None else policy(x, allowed)
+
+        here = asked(obs, action_mask) if here is None else here
+        gaps = []
+        for g in self.transforms(obs):
+            allowed = None if action_mask is None else g.push_outputs(action_mask)
+            gaps.append(policy_divergence(g, asked(g.obs(obs), allowed), here))
+        return _mean(gaps, mask)
 
     def value_loss(
         self,

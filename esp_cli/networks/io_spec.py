@@ -44,7 +44,7 @@ class IoSpec:
         group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.orders for element in group.elements):
             raise ValueError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
-        admit(name, group, self.spaces)
+        admit(name, group, self.spaces, instead="use another network")
         return group
 
     def inputs(self, group: FiniteGroup) -> list[Block]:

@@ -84,6 +84,11 @@ class PriorConfig(Strict):
         """c, or 0 where the consistency loss is off."""
         return self.consistency_coef if self.kind in ("esp", "consistency") else 0.0
 
+    @property
+    def needs_declaration(self) -> bool:
+        """Whether a task has to declare the elements: not where each is weighed, or a compass keeps every copy true."""
+        return self.trust == "full" and not self.compass
+
     def effective(self) -> PriorConfig:
         """Return this prior with every setting that has no effect set to its default.
 

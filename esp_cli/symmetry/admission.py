@@ -15,17 +15,21 @@ from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
 DISCOVERED = "discovered:"
 """Begins transforms that were found in data, and that the task need not declare."""
+_WITHOUT = "use --prior none, or let what holds be found: --prior auto, or --set prior.transforms=discovered"
+_FEW_ORDERS = 23
+"""Orders that are weighed beside d4, each of which takes about as long: those of four agents."""
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
 """The planar groups that `carried_groups` tries, smaller ones first."""
 
 
-def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> None:
+def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instead: str = "") -> None:
     """Refuse transforms that a task cannot carry.
 
     Args:
         text: what the user wrote, for the message.
         elements: what it means.
         spaces: of the task.
+        instead: what to do where the task carries no planar group; by default to use orders of agents or no prior.
 
     Raises:
         ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
@@ -35,10 +39,10 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces) -> Non
     reason = _reason(moved, spaces)
     if reason is None:
         return
-    advice = "use --prior none"
+    advice = instead or _WITHOUT
     if carried := carried_groups(spaces):
         plane = [name for name in carried if name in (*PLANE_GROUPS, Factors.of(_usable(spaces)).plane)]
-        advice = f"use a group within {plane[-1]}" if plane else f"use {carried[0]}"
+        advice = f"use a group within {plane[-1]}" if plane else instead or f"use {carried[0]}"
         if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
     raise ValueError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
@@ -57,23 +61,28 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
 
 
 def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
-    """Return the transforms of a task for which nobody chose any, as `admitted_elements` takes them.
+    """Return the transforms of a task for which nobody chose any, as `parse_elements` takes them.
 
     d4 where the task carries it; else the planar part of its symmetry if that can be listed; else c4; else orders of
     its agents or items. Where it declares nothing, d4, which `admit` refuses.
 
     Args:
         spaces: of the task.
-        weighed: whether each element counts by how nearly it holds; then d4 need not be declared.
+        weighed: whether each element counts by how nearly it holds, so that nothing has to be declared: then d4
+            wherever actions and layouts carry it, and such orders beside it.
 
     Raises:
         ValueError: its symmetry means nothing.
     """
     declared = _factors(_usable(spaces), spaces)
-    if weighed and not _carries("d4", spaces) and _carries("d4", unrestricted(spaces)):
-        return DISCOVERED + "d4"
     listed = [name for name in declared[:1] if name != "so2"]
-    return next((name for name in ("d4", *listed, "c4", *declared) if _carries(name, spaces)), "d4")
+    chosen = next((name for name in ("d4", *listed, "c4", *declared) if _carries(name, spaces)), "d4")
+    if not weighed or not _carries("d4", unrestricted(spaces)):
+        return chosen
+    found = parse_elements(chosen, spaces.num_agents)
+    if isinstance(found, Group) or len(found) > _FEW_ORDERS:
+        return "d4"
+    return f"d4,{chosen}" if all(element.in_place.is_identity for element in found) else "d4"
 
 
 def admit_declared(spaces: Spaces) -> None:

@@ -174,10 +174,10 @@ def resolve_config(
         sections["prior"].pop("transforms", None)  # of a preset, for a prior that trusts all of them alike
 
     task_settings = resolve_task_settings(task, sections["task"])
-    kind = sections["prior"].get("kind")
-    if kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
-        spec = make(task, 1, (0,), task_settings).spec
-        sections["prior"]["transforms"] = default_transforms(spec, weighed=kind == "auto")
+    prior = validated(PriorConfig, sections["prior"], "prior")
+    if prior.kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
+        chosen = default_transforms(make(task, 1, (0,), task_settings).spec, not prior.needs_declaration)
+        prior = prior.model_copy(update={"transforms": chosen})
     algorithm_settings = validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
     values = {
         "task": task,
@@ -188,7 +188,7 @@ def resolve_config(
         "task_settings": task_settings,
         "algorithm_settings": algorithm_settings.model_dump(),
         "network": validated(network, sections["network"], "network", f"the network {network_name}"),
-        "prior": validated(PriorConfig, sections["prior"], "prior"),
+        "prior": prior,
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
     }

@@ -78,7 +78,7 @@ class Progress:
     notes: tuple[str, ...] = ()
 
 
-Listener = Callable[[Progress], bool]
+Listener = Callable[[Progress], bool | None]
 """Told of progress; returns False to ask for a clean stop after this iteration."""
 
 
@@ -243,7 +243,7 @@ class Trainer:
         writer.write(self.step, values)
         notes = tuple(self.notes)
         self.notes.clear()
-        return listener(Progress(self.step, self.config.steps, values, notes))
+        return listener(Progress(self.step, self.config.steps, values, notes)) is not False
 
     def _checkpoint(self) -> float:
         """Write a checkpoint; return how many seconds that took."""

@@ -236,8 +236,8 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     empty = {name: np.zeros(shape, int if name == "action" else float) for name, shape in nothing.items()}
     assert "holds no number; record at least one step" in refused("discover", recorded(tmp_path, **empty))
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
-    assert "there is no file navigation" in refused("discover", "navigation", "--task", "navigation")
-    assert "is for a file of transitions" in refused("discover", tmp_path, "--task", "navigation")
+    assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
+    assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")
 
 
 def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:
@@ -297,6 +297,13 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
     found = resolve_config("navigation", overrides={"prior.transforms": "discovered:flip-x"})
     learner = build_learner(found)
     assert learner.prior.transforms.names == ("flip-x",)
+    weighed = {
+        "prior.transforms": "rot90",
+        "task.wind": 0.3,
+        "prior.trust": "measured",
+        "prior.weights": {"rot90": 0.5},
+    }
+    assert build_learner(resolve_config("navigation", overrides=weighed)).prior.transforms.names == ("rot90",)
     with pytest.raises(ValueError, match="45 degrees"):
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:rot45"}))
 

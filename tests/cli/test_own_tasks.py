@@ -170,7 +170,7 @@ def test_a_task_is_trained_with_the_symmetry_that_it_declares(folder: Path) -> N
     told = esp(folder, "train", "--task", "mirrored:Rendezvous", *short, "--out", "mirrored").stderr
     assert "prior esp (flip-x, c = 0.1)" in told
     told = esp(folder, "train", "--task", "mirrored:Rendezvous", *short, "--prior", "auto", "--out", "weighed").stderr
-    assert "prior esp (discovered:d4, c = 0.1)" in told
+    assert "prior esp (d4, c = 0.1)" in told
 
 
 def test_check_measures_a_policy_too(folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 
 from esp_envs import BatchedTask, Environment, Field, Kind, TaskSettings, generators_for, layout, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
+from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec
 from tests.own_tasks import lines_of, page_files, save_page_files
 
@@ -138,6 +140,36 @@ def test_a_start_of_another_shape_is_refused() -> None:
 
     with pytest.raises(ValueError, match=r"'position' has shape \(5, 2\) in what '_start' of plain drew"):
         worlds(Short).reset()
+
+
+@pytest.mark.parametrize(
+    ("method", "value", "sentence"),
+    [
+        ("_living", torch.ones(2, 5, 1, dtype=torch.bool), r"'_living' has shape \(2, 5, 1\), expected \(2, 5, 2\)"),
+        ("_living", torch.ones(2, 5, 2), "'_living' is torch.float32, expected torch.bool"),
+        ("_allow", torch.ones(2, 5, 1, 5, dtype=torch.bool), r"mask has shape \(2, 5, 1, 5\), expected \(2, 5, 2, 5\)"),
+        ("_allow", torch.ones(2, 5, 2, 5), "the action mask is torch.float32, expected torch.bool"),
+        (
+            "_advance",
+            (torch.zeros(2, 5, 2), {"met": torch.zeros(())}),
+            r"the metric met has shape \(\), expected \(2, 5\)",
+        ),
+    ],
+)
+def test_flags_and_metrics_of_another_shape_are_refused(method: str, value, sentence: str) -> None:
+    def describe(self) -> TaskSpec:
+        extras = {"_living": {"agents_end": True}, "_allow": {"masks": True, "action": MOVES}}
+        return replace(Plain._describe(self), **extras.get(method, {}))
+
+    cls = type("Odd", (Plain,), {"_describe": describe, method: lambda self, *_: value})
+
+    def play() -> None:
+        env = worlds(cls)
+        env.reset()
+        env.step(env.random_action())
+
+    with pytest.raises(ValueError, match=sentence):
+        play()
 
 
 def test_an_observation_of_another_width_is_refused() -> None:

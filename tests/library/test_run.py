@@ -89,6 +89,14 @@ def test_a_listener_stops_a_run_and_training_goes_on_bit_for_bit(run: Run, tmp_p
     assert np.array_equal(again.metrics["train/return"], run.metrics["train/return"], equal_nan=True)
 
 
+def test_a_listener_that_says_nothing_stops_nothing(tmp_path: Path) -> None:
+    told: list[int] = []
+    assert train(
+        "navigation", steps=200, settings=SMALL, out=tmp_path / "cn", listener=lambda p: told.append(p.step)
+    ).is_complete
+    assert told == [0, 100, 200]
+
+
 def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Path) -> None:
     result = run.evaluate(4)
     esp("eval", run.path, "--episodes", 4, "--json", tmp_path / "result.json")
@@ -109,6 +117,7 @@ def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Pat
         ({"settings": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"steps": 0}, "steps"),
         ({"seeds": 3}, r"not how many; write seeds=range\(3\)"),
+        ({"device": "cuda:1"}, "there is no device 'cuda:1'; choose cpu, cuda or auto"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_no_folder(

@@ -268,6 +268,17 @@ def zeros(*shape: int) -> Tensor:
             lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=(random(5, 2, 64),)),
             "a stored hidden state cannot be transformed; give whole histories",
         ),
+        (lambda s: s.augment(random(5, 2, 3).numpy(), zeros(5, 2)), "obs is of type ndarray; give a tensor"),
+        (lambda s: s.augment(random(5, 2, 3), [0] * 5), "the action is of type list|action is of type list"),
+        (lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=random(5, 2)), "per_agent is one tensor; give a"),
+        (
+            lambda s: s.policy_loss(lambda o: o, random(5, 2, 3), action_mask=torch.ones(5, 2, 3, dtype=torch.bool)),
+            r"the action mask is torch.bool \[5, 2, 3\], but torch.bool \[5, 2, 4\] is needed",
+        ),
+        (
+            lambda s: s.policy_loss(lambda o: torch.distributions.Categorical(logits=o), random(5, 2, 3), random(5, 2)),
+            "shape|form",
+        ),
         (lambda s: s.value_loss(lambda x: x), "takes either state or obs"),
         (lambda s: s.value_loss(lambda x: x, random(5, 6)), r"value has shape \[5, 6\], but \[5, 2\] or \[5\]"),
         (lambda s: s.policy_loss(lambda o: o, random(5, 2, 3)), r"shape \[5, 2, 3\], but there are 4 actions"),
@@ -278,6 +289,80 @@ def test_what_does_not_fit_is_told_in_one_sentence(call, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence) as caught:
         call(quarter(2))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"observation": SEEN.fields}, r"observation is \(Field.*; give layout\(Field"),
+        ({"action": 4}, "action is 4; give discrete_moves"),
+        ({"group": None}, "group is None; give a text"),
+        ({"num_agents": "3"}, "num_agents is '3'; give a number of agents"),
+    ],
+)
+def test_arguments_of_other_kinds_are_told(changed: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        Symmetry(**{"observation": SEEN, "action": MOVES, **changed})  # type: ignore[arg-type]
+
+
+def test_an_action_mask_turns_with_the_actions() -> None:
+    """A quarter turn takes right to up: who may only go right may only go up in the copy."""
+    allowed = torch.tensor([[True, False, False, False]])
+    _, action, (mask,) = quarter().augment(torch.tensor([[1.0, 2.0, 5.0]]), torch.tensor([0]), per_agent=(allowed,))
+    assert mask.tolist() == [[True, False, False, False], [False, True, False, False]]
+    assert mask.gather(1, action[:, None]).all()
+
+    def policy(o: Tensor, allowed: Tensor) -> Tensor:
+        vx, vy = o[..., 0], o[..., 1]
+        return torch.stack([vx, vy, -vx, -vy], -1).masked_fill(~allowed, -torch.inf)  # turns with the velocity
+
+    rows = random(6, 3)
+    some = torch.tensor([[True, True, False, False], [True, False, False, True]] * 3)
+    assert quarter().policy_loss(policy, rows, action_mask=some).item() == pytest.approx(0, abs=1e-6)
+    still = quarter().policy_loss(lambda o, a: policy(o.flip(-1), a), rows, action_mask=some)
+    assert math.isfinite(still.item())
+    assert still.item() > 0.01
+
+
+def test_a_check_says_which_shape_is_needed_and_takes_other_precisions() -> None:
+    symmetry, (m, t) = quarter(2), (64, 3)
+    data = Transitions(random(m, t, 2, 3), torch.randint(4, (m, t, 2)), random(m, t, 2), random(m, t, 2, 3))
+    double = Transitions(data.obs.double(), data.action, data.reward.double(), data.next_obs.double())
+    assert [v.outcome for v in symmetry.check(double)] == [v.outcome for v in symmetry.check(data)]
+    team = Transitions(data.obs, data.action, data.reward[..., 0], data.next_obs)
+    with pytest.raises(
+        ValueError, match=r"'reward' of the transitions has shape \[64, 3\]; give \[episodes, steps, agen"
+    ):
+        symmetry.check(team)
+    with pytest.raises(ValueError, match="'obs' of the transitions has shape"):
+        symmetry.check(Transitions(*(part[:, 0] for part in (data.obs, data.action, data.reward, data.next_obs))))
+
+
+def test_a_check_sees_a_wrong_order_of_agents() -> None:
+    """Each sees where the others are; a layout that forgets who they are holds nothing that exchanges agents."""
+    generator = torch.Generator().manual_seed(0)
+    place = torch.rand(400, 3, 2, generator=generator) * 2 - 1
+    ways = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    action = torch.randint(4, (400, 3), generator=generator)
+
+    def seen(position: Tensor) -> Tensor:
+        others = [[position[:, j] - position[:, i] for j in range(3) if j != i] for i in range(3)]
+        return torch.stack([torch.cat([position[:, i], *others[i]], -1) for i in range(3)], 1)
+
+    after = place + 0.2 * ways[action]
+    data = Transitions(*(x.unsqueeze(1) for x in (seen(place), action, -after.norm(dim=-1), seen(after))))
+    for items, outcomes in ((Items.OTHERS, {"holds"}), (Items.FIXED, {"holds", "broken"})):
+        shown = layout(Field("own", Kind.VECTOR), Field("others", Kind.VECTOR, 2, items=items))
+        found = Symmetry(observation=shown, action=MOVES, group="d4*agents", num_agents=3).check(data)
+        assert {verdict.outcome for verdict in found} == outcomes
+        assert {v.outcome for v in found if v.element in ("agents-1-2-0", "agents-2-0-1")} == outcomes - (
+            {"holds"} if len(outcomes) > 1 else set()
+        )
+
+
+def test_whole_numbers_are_no_forces() -> None:
+    with pytest.raises(ValueError, match=r"the action is torch\.int64; give floating-point numbers"):
+        Symmetry(observation=SEEN, action=FORCE, group="rot45").augment(random(5, 3), zeros(5, 2))
 
 
 def test_continuous_actions_of_another_width_are_refused() -> None:

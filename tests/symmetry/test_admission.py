@@ -8,7 +8,7 @@ import pytest
 
 from esp_cli.symmetry import admit_declared, carried_groups, default_transforms, transform_set
 from esp_cli.symmetry.admission import exchangeable
-from esp_envs.spec import Field, Items, Kind, Spaces, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, layout
 from tests.symmetry.toy_actions import FORCE, WHEEL_PAIRS
 
 UP_TO_D4 = ("c2", "d2", "c4", "d4")
@@ -175,9 +175,12 @@ def test_where_nobody_chooses_a_task_gets_what_it_declares(make_spec, symmetry: 
 
 
 def test_what_is_weighed_need_not_be_declared(make_spec) -> None:
-    assert default_transforms(make_spec(symmetry="c1"), weighed=True) == "discovered:d4"
-    assert default_transforms(make_spec(symmetry="o2"), weighed=True) == "d4"
-    assert transform_set("discovered:d4", make_spec(symmetry="c1")).size == 7
+    chosen = {"c1": "d4", "o2": "d4", "flip-x*agents": "d4", "agents": "d4,agents"}
+    for symmetry, transforms in chosen.items():
+        assert default_transforms(make_spec(symmetry=symmetry), weighed=True) == transforms
+    assert default_transforms(make_spec(6, symmetry="agents"), weighed=True) == "d4", "719 orders are too many"
+    skewed = Discrete(Kind.VECTOR, ((1.0, 0.0), (0.0, 1.0)), ("right", "up"))
+    assert default_transforms(make_spec(action=skewed, symmetry="agents"), weighed=True) == "agents"
 
 
 def test_a_symmetry_that_means_nothing_or_cannot_act_is_refused(make_spec) -> None:
