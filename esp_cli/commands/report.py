@@ -138,10 +138,11 @@ def report(
         document, folders = material.results.document(), material.runs
     else:
         _refuse_idle(films and out is None, plot is None and bool(of_the_picture))
-        command = _command(runs, at or [], limits, mode, out)
         steps, asked = [parse_count(text) for text in at or []], mode or "greedy"
         places = [_labelled(text) for text in runs]
         found = [curves.read_curve(path, label, asked) for label, path in places]
+        first, *others = (curve.config for curve in found)
+        command = _command(runs, at or [], limits, mode, out, first.own_words(*others))
         folders = {curve.label: path for curve, (_, path) in zip(found, places, strict=True)}
         material = loose.put_together(found, [path for _, path in places], command, asked, steps, limits)
         document = loose.comparison(material, limits)
@@ -183,10 +184,15 @@ def threshold_words(thresholds: Sequence[float]) -> list[str]:
 
 
 def _command(
-    runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: str | None, out: Path | None
+    runs: Sequence[str],
+    at: Sequence[str],
+    thresholds: Sequence[float],
+    mode: str | None,
+    out: Path | None,
+    own: Sequence[str],
 ) -> str:
     """Return the command line that gives the same report of the same runs."""
-    words = ["esp", "report", *runs, *(word for text in at for word in ("--at", text))]
+    words = ["esp", "report", *runs, *own, *(word for text in at for word in ("--at", text))]
     words += threshold_words(thresholds)
     words += ["--mode", mode] if mode else []
     return shlex.join(words + (["--out", str(out)] if out else []))

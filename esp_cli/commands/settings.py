@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, installed_tasks, register_tasks
+from esp_cli.commands.options import JsonOption, installed_tasks
 from esp_cli.settings_index import Section, Setting, read_index
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def settings(
     of: Annotated[
         str | None,
         typer.Argument(
-            help="Algorithm, task (also module:Class), network, 'prior' or 'evaluation'; by default all.",
+            help="Algorithm, task or network (also module:Class), 'prior' or 'evaluation'; by default all.",
             metavar="[ALGO|TASK|NETWORK]",
         ),
     ] = None,
@@ -52,10 +52,9 @@ def _sections(of: str | None) -> Sequence[Section]:
     if of is None or found:
         return found
     if ":" in of or of in installed_tasks():
-        from esp_cli.training.settings import task_section
+        from esp_cli.training.settings import own_section, task_section
 
-        register_tasks([of])
-        return [task_section(of)]
+        return [own_section(of) if ":" in of else task_section(of)]
     from esp_cli.files.suggesting import did_you_mean
 
     names = [section.name for section in built_in]

@@ -248,7 +248,7 @@ def _runner(name: str, folder: Path, program: Program) -> check.Runner:
 def _section(result: Export, job: _Job, c: CSource | None) -> str:
     """Return the README's section on a format."""
     remembers = job.program.memory_width > 0
-    use = _USE[result.name][remembers]
+    use = _USE[result.name][remembers] + (_MASKED.get(result.name, "") if job.program.masked else "")
     told = [f"## {', '.join(f'`{file}`' for file in result.files)}", "", use, ""]
     if result.agreement is None:
         told.append(f"Not compared with the policy: {result.note}.")
@@ -317,3 +317,11 @@ _USE = {
     "ros2": (_ROS2_USE, _ROS2_USE),
 }
 """How a format is used: by a policy that remembers nothing, and by one that does."""
+_MASKED = {
+    "onnx": " A further input, `action_mask` [rows, A] bool, says which actions each row may take.",
+    "torch": " It needs the keyword `action_mask` [rows, A] bool, which actions each row may take: "
+    "`module()(observation, ..., action_mask=action_mask)`.",
+    "c": " `allowed`, behind the observation, is 1 for each action that may be taken, else 0.",
+    "numpy": " `act` and `step` need `action_mask=` [..., A] bool, which actions each row may take.",
+}
+"""What a policy of a task with action masks needs besides."""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from esp_cli.files.documents import DocumentFormat, Strict
+from esp_cli.formatting import file_name
 
 MANIFEST_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
 MANIFEST = "manifest.json"
@@ -58,7 +59,7 @@ class Manifest(Strict):
 
 def standard_name(task: str, algorithm: str, prior: str) -> str:
     """Return the default name of a bundled policy."""
-    return f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
+    return file_name(f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}").replace(".", "-").replace("_", "-")
 
 
 def bundled_folder() -> Path:

@@ -90,9 +90,14 @@ def draw(
         watch: told how many frames of how many are drawn.
 
     Raises:
-        ValueError: another ending, no such seed, a view that cannot be drawn, or policies that cannot be compared.
+        ValueError: another ending, no such seed, a view that cannot be drawn, no episodes, no speed, or policies that
+            cannot be compared.
     """
     kind = check_target(out, episodes)
+    if episodes is not None and episodes < 1:
+        raise ValueError(f"episodes is {episodes}; a film has at least one")
+    if not speed > 0:
+        raise ValueError(f"speed is {speed}; give times real time, above 0")
     count = 1 if kind == PICTURE else episodes
     env = build_environment(trained.config, 1, "film")
     recorded = _recorded(trained, other, env, seed, count, greedy)

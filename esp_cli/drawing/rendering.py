@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from esp_cli.drawing.films import Frame, write_gif, write_mp4
 from esp_cli.drawing.frames import Moment, frame
@@ -37,6 +37,8 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
     Raises:
         ValueError: "3d", and the task has no view in space or the machine cannot draw it.
     """
+    if view not in get_args(View):
+        raise ValueError(f"there is no view '{view}'; choose {', '.join(get_args(View))}")
     own = None if view == "top" else env.painter(size)
     if own is None and view == "3d":
         raise ValueError(f"{env.spec.name} is a flat task without a view in space; leave out --view 3d")

@@ -78,7 +78,12 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy.
 
     A seed that stopped in training has an early policy. Its numbers are NaN, as in the metrics of its run.
+
+    Raises:
+        ValueError: there is less than one episode.
     """
+    if episodes < 1:
+        raise ValueError(f"episodes is {episodes}; play at least one")
     seeds = trained.config.seeds
     greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
     drawn = PolicyController(trained.policy, generators(seeds, _STREAM, "noise"))

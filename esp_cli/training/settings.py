@@ -13,7 +13,7 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.settings_index import Section, Setting
 from esp_cli.training.config import EvaluationConfig
-from esp_envs.registry import task_class, task_names
+from esp_envs.registry import TASKS, task_class, task_names
 
 _UNITS = {
     "_m": "m",
@@ -52,6 +52,28 @@ def task_section(name: str) -> Section:
         ValueError: there is no such task.
     """
     return Section(name, "task", _settings("task", task_class(name).Settings))
+
+
+def own_section(name: str) -> Section:
+    """Import a task, an algorithm or a network of the caller, named as "module:Class", and return its settings.
+
+    Raises:
+        ValueError: the module cannot be imported, or holds none of these by that name.
+    """
+    refusals = []
+    for registry in (TASKS, ALGORITHMS, NETWORKS):
+        try:
+            registry.register(name)
+        except ValueError as refusal:
+            refusals.append(str(refusal))
+            continue
+        if registry is ALGORITHMS:
+            return Section(name, "algorithm", _settings(name, ALGORITHMS[name].config_class))
+        if registry is NETWORKS:
+            return Section(name, "network", _settings("network", NETWORKS[name]))
+        return task_section(name)
+    strange = all("is not a" in refusal for refusal in refusals)
+    raise ValueError(f"'{name}' is no task, algorithm or network; check its base class" if strange else refusals[0])
 
 
 def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:

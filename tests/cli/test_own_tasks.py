@@ -152,6 +152,21 @@ def test_check_says_whether_a_task_is_what_it_claims(folder: Path) -> None:
     assert esp(folder, "check", "symmetry", "windy:Rendezvous", "--transforms", "flip-x").returncode == 0
 
 
+def test_settings_and_reports_of_what_is_not_installed(folder: Path) -> None:
+    assert "num_agents" in esp(folder, "settings", TASK).stdout
+    (folder / "learners.py").write_text(
+        "from esp_cli.algorithms.mappo import Mappo\nfrom esp_cli.networks.plain import MlpConfig\n"
+        "class Own(Mappo):\n    pass\nclass OwnNetwork(MlpConfig):\n    pass\n"
+    )
+    assert "learners:Own.learning_rate" in esp(folder, "settings", "learners:Own", "--json", "-").stdout
+    assert "network.hidden" in esp(folder, "settings", "learners:OwnNetwork", "--json", "-").stdout
+    assert "'rendezvous:RendezvousSettings' is no task, algorithm or network" in (
+        esp(folder, "settings", "rendezvous:RendezvousSettings", code=2).stderr
+    )
+    shown = esp(folder, "report", "a=run", "b=run", "--task", TASK).stdout
+    assert f"esp report a=run b=run --task {TASK}" in " ".join(shown.split())
+
+
 def test_check_says_where_a_task_raises_and_what_symmetry_is_none(folder: Path) -> None:
     source = (folder / "rendezvous.py").read_text()
     (folder / "slips.py").write_text(source.replace("return -distance.mean(-1)", "return -distanse.mean(-1)"))

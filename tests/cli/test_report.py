@@ -74,7 +74,7 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
     assert [run["step"] for run in result["runs"]] == [150, 150]
     passed = [row[1:] for row in table if {"-1000.00", "-0.50"} & {*row}]
     assert passed == [
-        [label, *texts]
+        [label, *texts, "" if label == "plain" else "-"]
         for label in ("plain", "ESP")
         for texts in (["-1000.00", "0", "0", "-", "0.00"], ["-0.50", "> 150", "> 150", "-", "-"])
     ]

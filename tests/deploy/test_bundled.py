@@ -16,7 +16,7 @@ from esp_cli.commands.options import parse_assignments
 from esp_cli.deploy import bundling, manifest
 from esp_cli.deploy.bundled import find, load_entry, open_policy
 from esp_cli.deploy.bundling import best_seed, bundle, play_greedily, score_of
-from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled
+from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundled, standard_name
 from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_cli.training.loading import TrainedPolicy
@@ -236,3 +236,8 @@ def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path) -> None:
     assert read_bundled(tmp_path) == ()
     with pytest.raises(ValueError, match="no policy fits navigation; no policy is bundled"):
         find("navigation", folder=tmp_path)
+
+
+def test_a_policy_of_a_task_that_is_not_installed_gets_a_name_that_can_be_written() -> None:
+    assert standard_name("mine.tasks:My_Task", "mappo", "none") == "mine-tasks-my-task-mappo-plain"
+    assert standard_name("navigation", "qmix", "esp") == "navigation-qmix-esp"

@@ -50,6 +50,8 @@ def test_exports_choose_among_allowed_actions_as_the_policy_does(kind: str, tmp_
         assert (result.agreement.other_actions or 0) <= 2
     assert "allowed" in (tmp_path / "policy.h").read_text()
     assert "action_mask" in (tmp_path / "policy.json").read_text()
+    readme = (tmp_path / "README.md").read_text()
+    assert readme.count("which actions each row may take") == 3, "onnx, torch and numpy"
 
 
 def test_an_export_that_ignores_masks_is_found() -> None:

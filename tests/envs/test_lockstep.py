@@ -172,6 +172,11 @@ def test_flags_and_metrics_of_another_shape_are_refused(method: str, value, sent
         play()
 
 
+def test_heuristics_are_a_tuple_of_names() -> None:
+    with pytest.raises(ValueError, match=r"Odd.heuristics is 'go'; give a tuple, as \('greedy',\)"):
+        worlds(type("Odd", (Plain,), {"heuristics": "go"}))
+
+
 def test_an_observation_of_another_width_is_refused() -> None:
     class Wide(Plain):
         def _observe(self, world):

@@ -110,6 +110,20 @@ def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
+    ("ask", "sentence"),
+    [
+        (lambda run, file: run.evaluate(0), "episodes is 0; play at least one"),
+        (lambda run, file: run.render(file, episodes=0), "episodes is 0; a film has at least one"),
+        (lambda run, file: run.render(file, speed=-1), "speed is -1; give times real time, above 0"),
+        (lambda run, file: run.render(file, episodes=1, view="side"), "no view 'side'; choose auto, top, 3d"),
+    ],
+)
+def test_what_cannot_be_played_or_drawn_is_refused(run: Run, tmp_path: Path, ask, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        ask(run, tmp_path / "cn.gif")
+
+
+@pytest.mark.parametrize(
     ("choice", "sentence"),
     [
         ({"task": "chess"}, "unknown task 'chess'"),
