@@ -98,7 +98,7 @@ def test_a_policy_that_was_chosen_by_its_task_is_named() -> None:
 
 def test_a_near_miss_of_a_policy_is_answered_by_the_one_that_is_meant() -> None:
     assert refused("eval", "formatio") == "formatio does not exist; did you mean 'formation'?"
-    assert "give the folder that esp train --out made" in refused("eval", "zzz")
+    assert "give a run folder, a policy file" in refused("eval", "zzz")
 
 
 def test_a_policy_file_gives_the_same_numbers_as_its_run_every_time(finished: Path) -> None:
