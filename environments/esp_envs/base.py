@@ -183,8 +183,10 @@ class Environment(ABC):
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         if num_envs < 1 or not generators:
             raise ValueError("an environment needs at least one world and one seed")
-        if not isinstance(self.heuristics, tuple):
-            raise ValueError(f"{type(self).__name__}.heuristics is {self.heuristics!r}; give a tuple, as ('greedy',)")
+        if not isinstance(self.heuristics, tuple) or not all(isinstance(name, str) for name in self.heuristics):
+            raise ValueError(
+                f"{type(self).__name__}.heuristics is {self.heuristics!r}; give a tuple of names, as ('greedy',)"
+            )
         self.settings = settings
         self.num_envs = num_envs
         self.generators = list(generators)

@@ -63,7 +63,7 @@ def _sections(of: str | None) -> Sequence[Section]:
 
 
 def _print(section: Section) -> None:
-    prefix = section.settings[0].name.partition(".")[0] if section.settings else section.name
+    prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
     chosen = {
         "task": f"--task {section.name}",
         "algorithm": f"--algo {section.name}",
@@ -73,7 +73,7 @@ def _print(section: Section) -> None:
         f", with {chosen[section.kind]}" if section.kind in chosen else ""
     )
     rows = [
-        (one.name.partition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
+        (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
         for one in section.settings
     ]
     console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)

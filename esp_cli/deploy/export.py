@@ -248,7 +248,8 @@ def _runner(name: str, folder: Path, program: Program) -> check.Runner:
 def _section(result: Export, job: _Job, c: CSource | None) -> str:
     """Return the README's section on a format."""
     remembers = job.program.memory_width > 0
-    use = _USE[result.name][remembers] + (_MASKED.get(result.name, "") if job.program.masked else "")
+    mask, meaning = _MASKS.get(result.name, ("", "")) if job.program.masked else ("", "")
+    use = _USE[result.name][remembers].format(mask=mask) + meaning
     told = [f"## {', '.join(f'`{file}`' for file in result.files)}", "", use, ""]
     if result.agreement is None:
         told.append(f"Not compared with the policy: {result.note}.")
@@ -280,10 +281,7 @@ def cost_lines(c: CSource, program: Program) -> list[str]:
     ]
 
 
-_NUMPY_USE = (
-    "Needs numpy alone. `import policy; action = policy.act(obs)` takes rows [..., D]; running the file checks its "
-    "worked example."
-)
+_NUMPY_USE = "Needs numpy alone; running the file checks its worked example. `import policy`, then "
 _ROBOT_USE = (
     " Positions of all robots in, wheel speeds out; robots stand still where a number is not finite. **It was run "
     "against a mocked interface over simulated robots, and never on hardware**: lift the robots before the first start."
@@ -296,32 +294,35 @@ _ROS2_USE = (
 )
 _USE = {
     "onnx": (
-        "Input `observation` [rows, D]; outputs `action` and `outputs` (of the last layer).",
-        "Inputs `observation` [rows, D] and `memory` [rows, H], zeros at first; outputs `action`, `outputs` (of the "
-        "last layer) and `memory_out`, the next step's `memory`.",
+        "Inputs: `observation` [rows, D]{mask}; outputs: `action` and `outputs` (of the last layer).",
+        "Inputs: `observation` [rows, D], `memory` [rows, H], zeros at first{mask}; outputs: `action`, `outputs` (of "
+        "the last layer) and `memory_out`, the next step's `memory`.",
     ),
     "torch": (
-        '`torch.export.load("policy.pt2").module()(observation)` returns action and outputs of the last layer.',
-        '`torch.export.load("policy.pt2").module()(observation, memory)` returns action, outputs of the last layer and '
-        "the next memory.",
+        '`torch.export.load("policy.pt2").module()(observation{mask})` returns action and outputs of the last layer.',
+        '`torch.export.load("policy.pt2").module()(observation, memory{mask})` returns action, outputs of the last '
+        "layer and the next memory.",
     ),
     "c": (
-        "C99, float32, no allocation: `esp_policy_act(observation, ...)`. Link with libm; "
+        "C99, float32, no allocation: `esp_policy_act(observation{mask}, ...)`. Link with libm; "
         "`cc policy_example.c policy.c -lm && ./a.out` checks the worked example.",
-        "C99, float32, no allocation: `esp_policy_reset(memory)` once an episode, then `esp_policy_act(observation, "
-        "memory, ...)`, with a memory for each agent. Link with libm; `cc policy_example.c policy.c -lm && ./a.out` "
-        "checks the worked example.",
+        "C99, float32, no allocation: `esp_policy_reset(memory)` once an episode, then `esp_policy_act(observation"
+        "{mask}, memory, ...)`, with a memory for each agent. Link with libm; `cc policy_example.c policy.c -lm && "
+        "./a.out` checks the worked example.",
     ),
-    "numpy": (_NUMPY_USE, f"{_NUMPY_USE} It remembers: `action, memory = policy.step(obs, memory)`."),
+    "numpy": (
+        f"{_NUMPY_USE}`action = policy.act(obs{{mask}})` with rows [..., D].",
+        f"{_NUMPY_USE}`memory = policy.initial_memory(num_agents)` once an episode, and each step `action, memory = "
+        "policy.step(obs, memory{mask})` with rows [num_agents, D].",
+    ),
     "webots": (_WEBOTS_USE, _WEBOTS_USE),
     "ros2": (_ROS2_USE, _ROS2_USE),
 }
-"""How a format is used: by a policy that remembers nothing, and by one that does."""
-_MASKED = {
-    "onnx": " A further input, `action_mask` [rows, A] bool, says which actions each row may take.",
-    "torch": " It needs the keyword `action_mask` [rows, A] bool, which actions each row may take: "
-    "`module()(observation, ..., action_mask=action_mask)`.",
-    "c": " `allowed`, behind the observation, is 1 for each action that may be taken, else 0.",
-    "numpy": " `act` and `step` need `action_mask=` [..., A] bool, which actions each row may take.",
+"""How a format is used: by a policy that remembers nothing, and by one that does; a mask stands where {mask} is."""
+_MASKS = {
+    "onnx": (", `action_mask` [rows, A] bool", " `action_mask` says which actions each row may take."),
+    "torch": (", action_mask=action_mask", " `action_mask` [rows, A] bool says which actions each row may take."),
+    "c": (", allowed", " `allowed` is 1 for each action that may be taken, else 0."),
+    "numpy": (", action_mask", " `action_mask` [..., A] bool says which actions each row may take."),
 }
-"""What a policy of a task with action masks needs besides."""
+"""Format -> how its calls name the mask of a policy that has one, and what it means."""

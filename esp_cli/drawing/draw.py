@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from esp_envs.drawing import TopPainter
 from esp_envs.scene import Painter
 
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
+SLOWEST = 0.01
+"""Speed of a film, times real time."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,7 @@ def draw(
         episodes: of a film; by default as many as last about 8 s.
         view: see `open_painter`.
         size: of the longer side of a scene, pixels; caption, axes and legend come on top.
-        speed: times real time.
+        speed: times real time, 0.01 or more.
         fps: most frames per second; by default 25.
         greedy: whether the policy takes its most probable actions, or draws them.
         watch: told how many frames of how many are drawn.
@@ -96,8 +99,8 @@ def draw(
     kind = check_target(out, episodes)
     if episodes is not None and episodes < 1:
         raise ValueError(f"episodes is {episodes}; a film has at least one")
-    if not speed > 0:
-        raise ValueError(f"speed is {speed}; give times real time, above 0")
+    if not SLOWEST <= speed < math.inf:  # false for what is no number
+        raise ValueError(f"speed is {speed}; give times real time, {SLOWEST:g} or more")
     count = 1 if kind == PICTURE else episodes
     env = build_environment(trained.config, 1, "film")
     recorded = _recorded(trained, other, env, seed, count, greedy)

@@ -72,12 +72,12 @@ def own_section(name: str) -> Section:
         if registry is NETWORKS:
             return Section(name, "network", _settings("network", NETWORKS[name]))
         return task_section(name)
-    strange = all("is not a" in refusal for refusal in refusals)
-    raise ValueError(f"'{name}' is no task, algorithm or network; check its base class" if strange else refusals[0])
+    strange = f"'{name}' is no task, algorithm or network; check its base class"
+    raise ValueError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
 
 
 def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
-    """Return the settings of a model, in its order; a name that cannot be another is no setting."""
+    """Return the settings of a model, in its order; the name of a network is no setting of it."""
     schema = model.model_json_schema()["properties"]
     return tuple(
         Setting(
@@ -91,7 +91,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             tasks=_changes(section, name, TUNED),
         )
         for name, field in model.model_fields.items()
-        if "const" not in schema[name]
+        if (section, name) != ("network", "name")
     )
 
 

@@ -159,7 +159,18 @@ def test_settings_and_reports_of_what_is_not_installed(folder: Path) -> None:
         "class Own(Mappo):\n    pass\nclass OwnNetwork(MlpConfig):\n    pass\n"
     )
     assert "learners:Own.learning_rate" in esp(folder, "settings", "learners:Own", "--json", "-").stdout
-    assert "network.hidden" in esp(folder, "settings", "learners:OwnNetwork", "--json", "-").stdout
+    listed = esp(folder, "settings", "learners:OwnNetwork", "--json", "-").stdout
+    assert "network.hidden" in listed
+    assert "network.name" not in listed
+    (folder / "mine").mkdir()
+    (folder / "mine" / "learners.py").write_text(
+        "from esp_cli.algorithms.learner import Learner\nfrom learners import Own\nclass Half(Learner):\n    pass\n"
+    )
+    shown = esp(folder, "settings", "mine.learners:Own").stdout
+    assert "--set mine.learners:Own.NAME=VALUE" in shown
+    assert "learners:Own." not in shown.replace("learners:Own.NAME", "")
+    assert "the algorithm 'mine.learners:Half' lacks" in esp(folder, "settings", "mine.learners:Half", code=2).stderr
+    assert "cannot import the module 'learners.x'" in esp(folder, "settings", "learners.x:Own", code=2).stderr
     assert "'rendezvous:RendezvousSettings' is no task, algorithm or network" in (
         esp(folder, "settings", "rendezvous:RendezvousSettings", code=2).stderr
     )

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import re
+import runpy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from esp_cli.deploy import check
+from esp_cli.deploy import check, onnx_file
 from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.check import compare, take_sample
 from esp_cli.deploy.export import export
@@ -41,7 +45,9 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @needs_cc
 @pytest.mark.parametrize("kind", MASKED)
-def test_exports_choose_among_allowed_actions_as_the_policy_does(kind: str, tmp_path: Path) -> None:
+def test_exports_choose_among_allowed_actions_as_the_policy_does(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     results = export(drawn_policy(kind), ("numpy", "c", "onnx", "torch"), tmp_path).formats
     for result in results:
         assert result.agreement is not None
@@ -50,8 +56,28 @@ def test_exports_choose_among_allowed_actions_as_the_policy_does(kind: str, tmp_
         assert (result.agreement.other_actions or 0) <= 2
     assert "allowed" in (tmp_path / "policy.h").read_text()
     assert "action_mask" in (tmp_path / "policy.json").read_text()
-    readme = (tmp_path / "README.md").read_text()
-    assert readme.count("which actions each row may take") == 3, "onnx, torch and numpy"
+    monkeypatch.chdir(tmp_path)
+    _run_calls((tmp_path / "README.md").read_text(), json.loads((tmp_path / "policy.json").read_text())["example"])
+
+
+def _run_calls(page: str, example: dict) -> None:
+    """Run the calls of a README on its worked example, in the folder of the export."""
+    rows = {name: np.asarray([example[name]], np.float32) for name in ("observation", "memory")}
+    rows["action_mask"] = np.asarray([example["action_mask"]])
+    policy = SimpleNamespace(**runpy.run_path("policy.py"))
+    scope = {"policy": policy, "num_agents": 1, "obs": rows["observation"], "action_mask": rows["action_mask"]}
+    for call in re.findall(r"`([^`]* = policy\.[^`]*)`", page):
+        exec(call, scope)  # noqa: S102 - the export's own lines
+    assert scope["action"].tolist() == [example["action"]]
+    (call,) = re.findall(r"`(torch\.export[^`]*)`", page)
+    given = {"torch": torch} | {name: torch.from_numpy(array) for name, array in rows.items()}
+    action = eval(call, given)[0]  # noqa: S307 - likewise
+    assert action.tolist() == [example["action"]]
+    (told,) = re.findall(r"Inputs: (.*); outputs", page)
+    read = {name: rows[name] for name in re.findall(r"`(\w+)`", told)}
+    session = onnx_file.library("onnxruntime").InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
+    assert session.run(["action"], read)[0].tolist() == [example["action"]]
+    assert "esp_policy_act(observation, allowed, " in page
 
 
 def test_an_export_that_ignores_masks_is_found() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -172,9 +173,11 @@ def test_flags_and_metrics_of_another_shape_are_refused(method: str, value, sent
         play()
 
 
-def test_heuristics_are_a_tuple_of_names() -> None:
-    with pytest.raises(ValueError, match=r"Odd.heuristics is 'go'; give a tuple, as \('greedy',\)"):
-        worlds(type("Odd", (Plain,), {"heuristics": "go"}))
+@pytest.mark.parametrize("given", ["go", ["go"], (1,)])
+def test_heuristics_are_a_tuple_of_names(given) -> None:
+    told = re.escape(f"Odd.heuristics is {given!r}; give a tuple of names, as ('greedy',)")
+    with pytest.raises(ValueError, match=told):
+        worlds(type("Odd", (Plain,), {"heuristics": given}))
 
 
 def test_an_observation_of_another_width_is_refused() -> None:

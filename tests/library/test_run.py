@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +115,9 @@ def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Pat
     [
         (lambda run, file: run.evaluate(0), "episodes is 0; play at least one"),
         (lambda run, file: run.render(file, episodes=0), "episodes is 0; a film has at least one"),
-        (lambda run, file: run.render(file, speed=-1), "speed is -1; give times real time, above 0"),
+        (lambda run, file: run.render(file, speed=-1), "speed is -1; give times real time, 0.01 or more"),
+        (lambda run, file: run.render(file, speed=math.inf), "speed is inf; give times real time"),
+        (lambda run, file: run.render(file, episodes=1, speed=1e-4), "speed is 0.0001; give times real time"),
         (lambda run, file: run.render(file, episodes=1, view="side"), "no view 'side'; choose auto, top, 3d"),
     ],
 )
