@@ -8,6 +8,8 @@ EPISODES = 320
 """Of an evaluation, per seed."""
 STUDY_SEEDS = tuple(range(10))
 """Of a study: as many as the paper has."""
+SLOWEST = 0.01
+"""Speed of a film, times real time, at least."""
 MAX_STEPS = 10**12
 """Steps that one run may take; the fastest machine needs years for them."""
 MAX_SEEDS = 1000

@@ -19,7 +19,7 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
 from esp_cli.checking.regression import TOLERATED, check_by_regression
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
-from esp_cli.prior.regression import moments, own_inputs, ridge
+from esp_cli.prior.regression import moments, orders_of_others, own_inputs, ridge
 from esp_cli.symmetry import Element, build_transform
 from esp_envs.spec import Discrete, Spaces
 
@@ -128,9 +128,8 @@ def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
     action = spaces.action
     acted = action.count - 1 if isinstance(action, Discrete) else action.width
     linear = inputs[..., : 1 + data.obs.shape[-1] + acted]  # a wrong order of actions shows beside actions alone
-    own, agents = linear[..., 1 + data.obs.shape[-1] :], range(spaces.num_agents)
-    others = [own[:, :, [j for j in agents if j != i]].flatten(2) for i in agents]
-    linear = torch.cat([linear, torch.stack(others, 2)], -1)
+    own = linear[..., 1 + data.obs.shape[-1] :]
+    linear = torch.cat([linear, *(own[:, :, order] for order in orders_of_others(spaces.num_agents))], -1)
     return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
 
 

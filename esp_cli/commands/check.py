@@ -65,21 +65,21 @@ def check(
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(task, num_envs, seeds, chosen)
 
-    make_worlds(1, [0])  # a mistake in task or settings is the user's, not a broken promise
+    spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
     if what == "task":
         if transforms is not None or policy is not None:
             raise ValueError("--transforms and --policy belong to 'esp check symmetry'; leave them out")
-        holds = _check_task(task, make_worlds, json)
+        holds = _check_task(task, spec, make_worlds, json)
     else:
         holds = _check_symmetry(make_worlds, transforms, policy, json)
     if not holds:
         raise typer.Exit(1)
 
 
-def _check_task(task: str, make_worlds: MakeWorlds, json: str | None) -> bool:
+def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | None) -> bool:
     from esp_envs.conformance import Subject, check
 
-    findings = [_of_the_symmetry(make_worlds(1, [0]).spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
+    findings = [_of_the_symmetry(spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
     if json != "-":
         rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
                 for f in findings]  # fmt: skip

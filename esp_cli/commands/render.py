@@ -24,6 +24,7 @@ from esp_cli.commands.options import (
     register_learners,
     register_tasks,
 )
+from esp_cli.defaults import SLOWEST
 
 EPILOG = """Examples:\n
     esp render formation -o f.gif\n
@@ -44,7 +45,7 @@ def parse_speed(value: str | float) -> float:
         speed = float(str(value).strip().lower().removesuffix("x"))
     except ValueError:
         speed = math.nan
-    if not 0.01 <= speed <= 100:  # false for what is no number
+    if not SLOWEST <= speed <= 100:  # false for what is no number
         raise typer.BadParameter(f"'{value}' is no speed; write a number from 0.01 to 100, as 0.5 or 4x")
     return speed
 

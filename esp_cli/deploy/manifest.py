@@ -59,7 +59,8 @@ class Manifest(Strict):
 
 def standard_name(task: str, algorithm: str, prior: str) -> str:
     """Return the default name of a bundled policy."""
-    return file_name(f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}").replace(".", "-").replace("_", "-")
+    name = f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
+    return file_name(name.replace(".", " "))
 
 
 def bundled_folder() -> Path:

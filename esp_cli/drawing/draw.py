@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from esp_cli.defaults import SLOWEST
 from esp_cli.drawing import films, rendering
 from esp_cli.drawing.figures import summary
 from esp_cli.drawing.recording import Episode, framed, record, record_both
@@ -21,8 +22,6 @@ from esp_envs.drawing import TopPainter
 from esp_envs.scene import Painter
 
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
-SLOWEST = 0.01
-"""Speed of a film, times real time."""
 
 
 @dataclass(frozen=True)

@@ -81,9 +81,9 @@ def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Siz
     Raises:
         ValueError: another shape.
     """
+    _check_tensor(name, x)
     space = spaces.action
-    if isinstance(space, Discrete) and x.dtype == torch.bool and x.shape[-1:] == (space.count,) != (1,):
-        check_mask(spaces, x, lead)
+    if isinstance(space, Discrete) and x.dtype == torch.bool and x.shape == (*lead, *_agents(spaces), space.count):
         return transform.push_outputs(x)
     return carry(spaces, transform.per_agent, x, lead, name)
 

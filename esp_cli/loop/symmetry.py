@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from esp_envs.base import Environment
 
 
-_GIVEN = {
-    "observation": "layout(Field(...), ...)",
-    "action": "discrete_moves(...), Discrete or Continuous",
-    "group": 'a text, as "d4"',
-    "num_agents": "a number of agents",
+_ARGUMENTS = {
+    "observation": (Layout, "layout(Field(...), ...)"),
+    "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),
+    "group": (str, 'a text, as "d4"'),
+    "num_agents": (int, "a number of agents"),
 }
-"""What arguments of a symmetry are, for messages."""
+"""What arguments of a symmetry are, and what a message says to give."""
 
 
 class Symmetry:
@@ -76,10 +76,10 @@ class Symmetry:
         copies: Literal["draw", "all"] = "draw",
         seed: int = 0,
     ) -> None:
-        kinds = {"observation": (observation, Layout), "action": (action, Discrete | Continuous), "group": (group, str)}
-        for name, (value, kind) in (kinds | {"num_agents": (num_agents, int)}).items():
-            if not isinstance(value, kind):
-                raise ValueError(f"{name} is {value!r}; give {_GIVEN[name]}")
+        given = {"observation": observation, "action": action, "group": group, "num_agents": num_agents}
+        for name, (kind, example) in _ARGUMENTS.items():
+            if not isinstance(given[name], kind):
+                raise ValueError(f"{name} is {given[name]!r}; give {example}")
         if copies not in ("draw", "all"):
             raise ValueError(f"copies is {copies!r}; choose 'draw' or 'all'")
         if num_agents < 1:

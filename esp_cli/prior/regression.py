@@ -33,10 +33,15 @@ def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
         [M, T, N, features].
     """
     columns = _columns(spaces, obs, action)
-    agents = range(spaces.num_agents)
-    known = columns if (len(agents) - 1) * len(columns) <= _WIDEST_OTHERS else columns[spaces.observation.width :]
-    others = zip(*([j for j in agents if j != i] for i in agents), strict=True)
-    return _side_by_side(columns, [known[..., list(order)] for order in others])
+    orders = orders_of_others(spaces.num_agents)
+    known = columns if len(orders) * len(columns) <= _WIDEST_OTHERS else columns[spaces.observation.width :]
+    return _side_by_side(columns, [known[..., order] for order in orders])
+
+
+def orders_of_others(num_agents: int) -> list[list[int]]:
+    """Return who is each agent's first other, second other and so on, in index order: N - 1 lists of N agents."""
+    each = ([j for j in range(num_agents) if j != i] for i in range(num_agents))
+    return [list(order) for order in zip(*each, strict=True)]
 
 
 def _columns(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:

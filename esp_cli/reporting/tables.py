@@ -130,8 +130,7 @@ def statistics_table(results: Results) -> Table:
         rows.append((cell.panel, cell.variant, str(seeds), *texts, duration))
     caption = (
         "IQM: mean without the lowest and the highest quarter of the seeds, rounded down. Normalised: 0 is the random "
-        "policy, 1 the best heuristic. "
-        "Mean over the run: area under the curve."
+        "policy, 1 the best heuristic. Mean over the run: area under the curve."
     )
     headings = ("panel", "run", "seeds>", "IQM>", "normalised>", "mean over the run>", "training>")
     return Table("Seeds and scale", headings, tuple(rows), caption)
@@ -220,8 +219,9 @@ def methods_table(results: Results, early: bool = False) -> Table | None:
         label = breaking if shared else f"{name}, {breaking}"
         rows.append((label, *(f"{texts.get(one, NOTHING)}{' (*)' if one in best else ''}" for one in methods)))
     when = "at the evaluation nearest to a fifth of the run" if early else "at the end of the run"
-    few = _on_the_way(results) if early else ""
-    caption = f"Mean ± standard error over seeds {when}{few}; (*): the highest of its row, or not told apart from it."
+    episodes = _on_the_way(results) if early else ""
+    compared = "(*): the highest of its row, or not told apart from it"
+    caption = f"Mean ± standard error over seeds {when}{episodes}; {compared}."
     headings = (shared or "run", *(f"{method}>" for method in methods))
     return Table(f"Returns {when}", headings, tuple(rows), caption) if rows else None
 

@@ -240,4 +240,5 @@ def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path) -> None:
 
 def test_a_policy_of_a_task_that_is_not_installed_gets_a_name_that_can_be_written() -> None:
     assert standard_name("mine.tasks:My_Task", "mappo", "none") == "mine-tasks-my-task-mappo-plain"
+    assert standard_name("pkg._tasks:T", "mappo", "esp") == "pkg-tasks-t-mappo-esp"
     assert standard_name("navigation", "qmix", "esp") == "navigation-qmix-esp"
