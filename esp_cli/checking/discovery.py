@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from esp_cli.checking.candidates import candidates, generate
 from esp_cli.checking.paired import MakeWorlds, check_paired
 from esp_cli.checking.recorded import Transitions, collect
-from esp_cli.checking.regression import TOLERATED, check_by_regression
+from esp_cli.checking.regression import MATERIAL, check_by_regression
 from esp_cli.checking.verdicts import RANK, ElementVerdict
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import DISCOVERED, exchangeable
@@ -94,7 +94,7 @@ def discover_in_transitions(source: str, spaces: Spaces, data: Transitions, tran
     """Find the symmetries of transitions of any policy; see `discover_in_task`."""
     elements = default_candidates(spaces, transforms)
     verdicts = check_by_regression(spaces, data, elements)
-    return _concluded(source, "transitions", elements, verdicts, 2 * TOLERATED)
+    return _concluded(source, "transitions", elements, verdicts, MATERIAL)
 
 
 def accepted_of(p_values: Sequence[float]) -> list[bool]:

@@ -26,6 +26,8 @@ from esp_envs.spec import Spaces
 
 TOLERATED = 2e-3
 """Gap below which an element counts as a symmetry of transitions."""
+MATERIAL = 2 * TOLERATED
+"""Gap that matters: what is shown to lie below is accepted as found, what is shown to lie above is broken."""
 _ROWS = 4
 """Rows for each feature, below which more rows improve a fit whether they are true or not."""
 _STILL = 1e-10

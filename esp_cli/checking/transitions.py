@@ -17,7 +17,7 @@ from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.regression import TOLERATED, check_by_regression
+from esp_cli.checking.regression import MATERIAL, check_by_regression
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
 from esp_cli.prior.regression import moments, orders_of_others, own_inputs, ridge
 from esp_cli.symmetry import Element, build_transform
@@ -61,7 +61,7 @@ def _sharpened(verdict: ElementVerdict, by_regression: ElementVerdict | None) ->
     """
     if by_regression is None or not verdict.fields:
         return verdict
-    broken = {f.field: f for f in by_regression.fields if f.gap > max(2 * TOLERATED, SIGNIFICANT * f.error)}
+    broken = {f.field: f for f in by_regression.fields if f.gap > max(MATERIAL, SIGNIFICANT * f.error)}
     return replace(verdict, fields=tuple(broken.get(f.field, f) for f in verdict.fields))
 
 

@@ -154,7 +154,7 @@ def readme(alone: TrainedPolicy, description: dict[str, Any], sections: list[str
         width = description["memory"]["hidden"] + description["memory"]["previous_action"]
         lines += [f"The policy remembers: {width} numbers an agent, zeros when an episode begins.", ""]
     lines += ["## Worked example", "", "| | |", "|---|---|"]
-    names = ["observation", "outputs", "action"]
+    names = [name for name in example if not name.startswith("memory")]
     lines += [f"| {name} | {_shortly(example[name])} |" for name in names]
     lines += [
         "",

@@ -78,6 +78,7 @@ def _run_calls(page: str, example: dict) -> None:
     session = onnx_file.library("onnxruntime").InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
     assert session.run(["action"], read)[0].tolist() == [example["action"]]
     assert "esp_policy_act(observation, allowed, " in page
+    assert f"| action_mask | {', '.join(str(int(allowed)) for allowed in example['action_mask'])} |" in page
 
 
 def test_an_export_that_ignores_masks_is_found() -> None:
