@@ -28,7 +28,7 @@ def format_interval(interval: Sequence[float] | None) -> str:
 def file_name(text: str) -> str:
     """Return a name for a folder: "rot90, rot180" -> "rot90-rot180", "mine:Task" -> "mine-task"; ASCII alone."""
     words = "".join(c if (c.isascii() and c.isalnum()) or c == "." else " " for c in text.lower()).split()
-    return "-".join(words) or "unnamed"
+    return "-".join(word.strip(".") for word in words if word.strip(".")) or "unnamed"
 
 
 def format_span(counts: Collection[int]) -> str:

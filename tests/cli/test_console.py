@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from esp_cli import console
 from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.formatting import file_name
 
 
 class Model(BaseModel):
@@ -103,6 +104,18 @@ def test_means_and_intervals() -> None:
     assert format_mean(3.0) == "3.00"
     assert format_interval((-125.041, -119.958)) == "[-125.04, -119.96]"
     assert [format_span(counts) for counts in ([160, 32, 64], {10})] == ["32 to 160", "10"]
+
+
+def test_names_of_folders_hold_words_in_ascii() -> None:
+    texts = ["rot90, rot180", "mine._tasks:Task", "1.5M", "..", "é", ""]
+    assert [file_name(text) for text in texts] == [
+        "rot90-rot180",
+        "mine-tasks-task",
+        "1.5m",
+        "unnamed",
+        "unnamed",
+        "unnamed",
+    ]
 
 
 class Clock:
