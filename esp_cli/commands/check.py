@@ -15,8 +15,7 @@ from esp_cli.commands.options import (
     OwnNetworkOption,
     TaskSetOption,
     parse_task_settings,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 
 if TYPE_CHECKING:
@@ -58,8 +57,10 @@ def check(
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
-    register_tasks([task])
-    register_learners(algo or [], network or [])
+    if what == "task" and any((transforms, policy, algo, network)):
+        names = "--transforms, --policy, --algo and --network"
+        raise ValueError(f"{names} belong to 'esp check symmetry'; leave them out")
+    register_named([task], algo, network)
     chosen = resolve_task_settings(task, parse_task_settings(settings or []))
 
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
@@ -67,8 +68,6 @@ def check(
 
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
     if what == "task":
-        if transforms is not None or policy is not None:
-            raise ValueError("--transforms and --policy belong to 'esp check symmetry'; leave them out")
         holds = _check_task(task, spec, make_worlds, json)
     else:
         holds = _check_symmetry(make_worlds, transforms, policy, json)
@@ -80,12 +79,10 @@ def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | 
     from esp_envs.conformance import Subject, check
 
     findings = [_of_the_symmetry(spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
-    if json != "-":
-        rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
-                for f in findings]  # fmt: skip
-        console.table(("promise", "result", "what happens"), rows, title=f"What {task} promises as a task")
-    if json is not None:
-        console.write_json(json, findings)
+    rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
+            for f in findings]  # fmt: skip
+    title = f"What {task} promises as a task"
+    console.result(json, findings, lambda: console.table(("promise", "result", "what happens"), rows, title=title))
     return not any(finding.broken for finding in findings)
 
 
@@ -110,10 +107,8 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
         from esp_cli.deploy.bundled import open_policy
 
         measured = check_policy(open_policy(policy), make_worlds, transforms)
-    if json != "-":
-        _print(report, measured)
-    if json is not None:
-        console.write_json(json, {"report": report, "holds": report.holds, "policy": measured})
+    found = {"report": report, "holds": report.holds, "policy": measured}
+    console.result(json, found, lambda: _print(report, measured))
     return report.holds
 
 

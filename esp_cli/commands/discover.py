@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_tasks
+from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_named
 
 if TYPE_CHECKING:
     from esp_cli.checking.discovery import Discovery
@@ -29,7 +29,10 @@ def discover(
     task: Annotated[
         str | None,
         typer.Option(
-            "--task", "-t", help="Task whose layout the transitions of a file have; without it --blind.", metavar="TASK"
+            "--task",
+            "-t",
+            help="Task whose layout the transitions of a file have (without it --blind), or a run's own module:Class.",
+            metavar="TASK",
         ),
     ] = None,
     transforms: Annotated[
@@ -53,10 +56,7 @@ def discover(
     if blind and transforms is not None:
         raise ValueError("--blind searches for maps by itself; leave --transforms out")
     found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, blind)
-    if json != "-":
-        _print(found)
-    if json is not None:
-        console.write_json(json, found)
+    console.result(json, found, lambda: _print(found))
 
 
 def _discovery(
@@ -67,9 +67,13 @@ def _discovery(
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
-    register_tasks([task or "", what if ":" in what and not Path(what).exists() else ""])
+    register_named([task, None if Path(what).exists() else what])
     path = Path(what)
     if path.suffix == ".npz" or path.is_file():
+        if settings and task is None:
+            raise ValueError(f"--set is for a task, and {what} is a file; add --task, or leave --set out")
+        if logs:
+            raise ValueError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
         spec = None if task is None else make(task, 1, [0], resolve_task_settings(task, settings)).spec
         data = read_transitions(path, spec)
         if spec is None or blind:
@@ -88,7 +92,8 @@ def _discovery(
 
         config = parse_config(RunFolder.open(path).config, path)
         name, settings = config.task, config.task_settings | settings
-
+        if task not in (None, name):
+            raise ValueError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
     settings = resolve_task_settings(name, settings)
 
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:

@@ -17,8 +17,7 @@ from esp_cli.commands.options import (
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 from esp_cli.defaults import EPISODES
 
@@ -51,16 +50,13 @@ def evaluate(
     from esp_cli.evaluation.final import evaluate as evaluate_policy
     from esp_cli.training.loading import transfer
 
-    register_tasks(task)
-    register_learners([algo], network or [])
+    register_named(task, [algo], network)
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
     result = evaluate_policy(trained, episodes)
-    if json != "-":
-        _print(result, trained.source.stem if trained.source.is_file() else str(trained.source))
-    if json is not None:
-        console.write_json(json, result)
+    source = trained.source
+    console.result(json, result, lambda: _print(result, source.stem if source.is_file() else str(source)))
 
 
 def _print(result: FinalEvaluation, policy: str) -> None:

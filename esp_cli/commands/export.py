@@ -17,8 +17,7 @@ from esp_cli.commands.options import (
     OwnNetworkOption,
     OwnTaskOption,
     PolicyArgument,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 from esp_cli.defaults import EPISODES
 
@@ -88,24 +87,17 @@ def export(
         raise ValueError("--name is for -f policy alone; leave it out")
     if seed is not None and episodes is not None and "policy" not in formats:
         raise ValueError("--episodes finds the best seed, and --seed names one; leave one of them out")
-    register_tasks(task)
-    register_learners([algo], network or [])
+    register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
     if "policy" in formats:
         entry = bundle(trained, out, episodes or EPISODES, seed, name, force)
-        _announce(entry, out)
-        if json is not None:
-            console.write_json(json, entry.model_dump(mode="json"))
+        console.result(json, entry, lambda: _announce(entry, out))
         return
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
     exported = write(single_seed(trained, chosen), formats, out, force)
-    if json != "-":
-        _print(exported, f"{policy}, seed {chosen}")
-        console.note(f"{out} has a README, and the worked example in policy.json")
-    if json is not None:
-        console.write_json(json, exported)
+    console.result(json, exported, lambda: _print(exported, f"{policy}, seed {chosen}", out))
 
 
 def _announce(entry: Entry, out: Path) -> None:
@@ -126,7 +118,7 @@ def _best(trained: TrainedPolicy, episodes: int) -> int:
     return best
 
 
-def _print(exported: Exported, title: str) -> None:
+def _print(exported: Exported, title: str, out: Path) -> None:
     rows = []
     for result in exported.formats:
         numbers = ("-", "-", "-")
@@ -143,3 +135,4 @@ def _print(exported: Exported, title: str) -> None:
         costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and about 1 kB of code")]
         costs += [("RAM of the C source, bytes", exported.c.ram_bytes)]
     console.table(("cost", "value>"), costs)
+    console.note(f"{out} has a README, and the worked example in policy.json")

@@ -93,29 +93,23 @@ def installed_tasks() -> list[str]:
     return [entry.name for entry in entry_points(group="esp.tasks")]
 
 
-def register_tasks(names: Iterable[str] | None) -> None:
-    """Admit the tasks that this command line names as module:Class; a name of any other form needs nothing.
+def register_named(
+    tasks: Iterable[object] | None, algorithms: Iterable[object] | None = None, networks: Iterable[object] | None = None
+) -> None:
+    """Admit what this command line names as module:Class; a name of any other form needs nothing.
 
     Raises:
-        ValueError: a module cannot be imported, or holds no such task.
-    """
-    from esp_envs.registry import register
-
-    for name in names or ():
-        register(name)
-
-
-def register_learners(algorithms: Iterable[str | None], networks: Iterable[object] = ()) -> None:
-    """Admit the algorithms and networks that this command line names as module:Class.
-
-    Raises:
-        ValueError: a module cannot be imported, or holds no such algorithm or network.
+        ValueError: a module cannot be imported, or holds no such class.
     """
     from esp_envs.installed import load
 
-    homes = {"esp_cli.algorithms.registry:ALGORITHMS": algorithms, "esp_cli.networks.build:NETWORKS": networks}
+    homes = {
+        "esp_envs.registry:TASKS": tasks,
+        "esp_cli.algorithms.registry:ALGORITHMS": algorithms,
+        "esp_cli.networks.build:NETWORKS": networks,
+    }
     for home, names in homes.items():
-        for name in names:
+        for name in names or ():
             if isinstance(name, str) and ":" in name:
                 load(home).register(name)
 

@@ -28,17 +28,18 @@ def policies(
     found = [entry for entry in read_bundled() if task in (None, entry.task)]
     if not found:
         raise ValueError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
-    if json != "-":
-        with console.paged():
-            _print(found)
-        for entry in found if task else ():
-            console.say(f"{entry.name}: {entry.command}")
-        console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
-    if json is not None:
-        console.write_json(json, [entry.model_dump(mode="json") for entry in found])
+    console.result(json, found, lambda: _print(found, commands=task is not None))
 
 
-def _print(entries: Sequence[Entry]) -> None:
+def _print(entries: Sequence[Entry], commands: bool) -> None:
+    with console.paged():
+        _print_tables(entries)
+    for entry in entries if commands else ():
+        console.say(f"{entry.name}: {entry.command}")
+    console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
+
+
+def _print_tables(entries: Sequence[Entry]) -> None:
     """Print a table for each convention of returns, within which alone they compare."""
     groups: dict[tuple[str, int, str, int], list[Entry]] = {}
     for entry in entries:

@@ -21,8 +21,7 @@ from esp_cli.commands.options import (
     PolicyArgument,
     TaskSetOption,
     parse_task_settings,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 from esp_cli.defaults import SLOWEST
 
@@ -98,8 +97,7 @@ def render(
     from esp_cli.training.loading import transfer
 
     kind = check_target(out, episodes, fps)
-    register_tasks(task)
-    register_learners([algo], network or [])
+    register_named(task, [algo], network)
     changed = parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
     opened = [transfer(open_policy(where, algo, prior), changed) for where in named]

@@ -20,8 +20,7 @@ from esp_cli.commands.options import (
     OwnTaskOption,
     check_finite,
     not_over_a_run,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 
 if TYPE_CHECKING:
@@ -111,8 +110,7 @@ def report(
     from esp_cli.studies.tuning import TUNING_FORMAT
     from esp_cli.training.folder_names import FRESH, TUNING
 
-    register_tasks(task)
-    register_learners(algo or [], network or [])
+    register_named(task, algo, network)
     of_the_picture = reference or y_limits
     of_runs = any((out, films, results, at, threshold, of_the_picture, mode, plot, csv, json))
     if not runs and (of_runs or fill is None):
@@ -146,11 +144,12 @@ def report(
         folders = {curve.label: path for curve, (_, path) in zip(found, places, strict=True)}
         material = loose.put_together(found, [path for _, path in places], command, asked, steps, limits)
         document = loose.comparison(material, limits)
-    if json != "-":
+
+    def show() -> None:
         with console.paged():
             print_tables(material.results)
-    if json is not None:
-        console.write_json(json, document)
+
+    console.result(json, document, show)
     if csv is not None:
         console.note(f"{write_csv(csv, folders)} rows -> {csv}")
     if plot is not None:

@@ -33,12 +33,7 @@ def settings(
 ) -> None:
     """List the settings that --set and --config change: default, values, unit and meaning."""
     found = _sections(of)
-    if json != "-":
-        with console.paged():
-            for section in found:
-                _print(section)
-    if json is not None:
-        console.write_json(json, found)
+    console.result(json, found, lambda: _print(found))
 
 
 def _sections(of: str | None) -> Sequence[Section]:
@@ -62,7 +57,13 @@ def _sections(of: str | None) -> Sequence[Section]:
     raise ValueError(f"nothing with settings is called '{of}'{hint}")
 
 
-def _print(section: Section) -> None:
+def _print(sections: Sequence[Section]) -> None:
+    with console.paged():
+        for section in sections:
+            _print_section(section)
+
+
+def _print_section(section: Section) -> None:
     prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
     chosen = {
         "task": f"--task {section.name}",

@@ -23,8 +23,7 @@ from esp_cli.commands.options import (
     SeedsOption,
     SetOption,
     parse_assignments,
-    register_learners,
-    register_tasks,
+    register_named,
 )
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
 
@@ -188,8 +187,7 @@ class StudyChoices:
         from esp_cli.studies.catalogue import Request
 
         overrides = parse_assignments(self.settings or [])
-        register_tasks(parse_names(self.tasks))
-        register_learners(parse_names(self.algos) or (), [overrides.get("network.name")])
+        register_named(parse_names(self.tasks), parse_names(self.algos), [overrides.get("network.name")])
         return Request(
             tasks=parse_names(self.tasks),
             algorithms=parse_names(self.algos),

@@ -185,10 +185,7 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
     from esp_cli.reporting.collect import collect
 
     results = collect(folder, mode, thresholds).results
-    if json != "-":
-        print_tables(results)
-    if json is not None:
-        console.write_json(json, results.document())
+    console.result(json, results.document(), lambda: print_tables(results))
     first, *others = (cell.config for cell in folder.study.cells)
     words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")
@@ -224,10 +221,7 @@ def _dry_run(folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, json
 
     with measuring(len(folder.study.cells)) as listener:
         found = forecast(folder, others, jobs, listener)
-    if json is not None:
-        console.write_json(json, found)
-    if json != "-":
-        _print_forecast(found)
+    console.result(json, found, lambda: _print_forecast(found))
 
 
 def _print_forecast(found: Forecast) -> None:

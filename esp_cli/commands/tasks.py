@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import JsonOption, installed_tasks, register_tasks
+from esp_cli.commands.options import JsonOption, installed_tasks, register_named
 
 CARDS = Path(__file__).with_name("task_cards.json")
 """What `describe` returns for the built-in tasks: the command imports no torch. docs/make_task_cards.py writes it."""
@@ -29,13 +29,7 @@ def tasks(
     names = [task] if task else list(dict.fromkeys((*built_in, *installed_tasks())))
     found = [built_in[name] if name in built_in else describe(name) for name in names]
     shown = [{key: value for key, value in card.items() if key != "card"} for card in found]
-    if json != "-":
-        if task:
-            _print_card(found[0])
-        else:
-            _print_list(found)
-    if json is not None:
-        console.write_json(json, shown[0] if task else shown)
+    console.result(json, shown[0] if task else shown, lambda: _print_card(found[0]) if task else _print_list(found))
 
 
 def describe(name: str) -> dict[str, Any]:
@@ -44,7 +38,7 @@ def describe(name: str) -> dict[str, Any]:
     from esp_envs.registry import make, task_class
     from esp_envs.spec import describe_action
 
-    register_tasks([name])
+    register_named([name])
     spec, cls = make(name, 1, [0]).spec, task_class(name)
     return {
         "task": name,

@@ -25,8 +25,7 @@ from esp_cli.commands.options import (
     TransformsOption,
     note_without_effect,
     parse_assignments,
-    register_learners,
-    register_tasks,
+    register_named,
     was_given,
 )
 from esp_cli.commands.stopping import stop_requests
@@ -125,8 +124,7 @@ def train(
     from esp_cli.training.run_folder import RUN_FORMAT
 
     trackers = tuple(track or ())
-    register_tasks([task])
-    register_learners([algo], [network, named.get("network.name")])
+    register_named([task], [algo], [network, named.get("network.name")])
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])

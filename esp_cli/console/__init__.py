@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 
@@ -56,6 +56,14 @@ def table(
         target.print(part)
     if caption:
         target.print(Text(caption, style="dim"), soft_wrap=not out.is_terminal)
+
+
+def result(json: str | None, value: object, show: Callable[[], object]) -> None:
+    """Show a result and, where `--json` was given, write it as JSON; "-" leaves nothing else on standard output."""
+    if json != "-":
+        show()
+    if json is not None:
+        write_json(json, value)
 
 
 def write_json(path: str | Path, value: object) -> None:

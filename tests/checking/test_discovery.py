@@ -238,6 +238,8 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
     assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")
+    assert "add --task, or leave --set out" in refused("discover", recorded(tmp_path), "--set", "task.wind=0.3")
+    assert "leave --logs out" in refused("discover", recorded(tmp_path), "--logs")
 
 
 def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:
@@ -290,6 +292,7 @@ def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settin
         == "discovered:flip-x*agents*landmarks-3"
     )
     assert "found flip-x*agents*landmarks-3" in esp("discover", folder).stdout
+    assert "is a run of navigation, and --task says wildlife" in refused("discover", folder, "--task", "wildlife")
     esp("train", "--resume", folder)
 
 

@@ -207,5 +207,6 @@ def test_check_measures_a_policy_too(folder: Path) -> None:
 
 
 def test_check_refuses_what_it_does_not_take(folder: Path) -> None:
-    words = ["check", "task", TASK, "--transforms", "d4"]
-    assert "belong to 'esp check symmetry'" in esp(folder, *words, code=2).stderr
+    for words in (["--transforms", "d4"], ["--policy", "run"], ["--network", "mine:Network"]):
+        told = esp(folder, "check", "task", "navigation", *words, code=2).stderr
+        assert "belong to 'esp check symmetry'" in told
