@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 
 from esp_cli.commands.tasks import CARDS, describe
+from esp_envs.registry import TASKS
 
-BUILT_IN = ("navigation", "predator-prey", "formation", "wildlife")
+BUILT_IN = tuple(name for name in TASKS if TASKS.ships(name))
 
 
 def text() -> str:

@@ -1,7 +1,8 @@
-"""The documentation keeps its word: relative links lead somewhere, and every `esp` command line parses."""
+"""The documentation keeps its word: links lead somewhere, names of code exist, every `esp` command line parses."""
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ _FENCE = re.compile(r"^(```|~~~).*?^\1", re.MULTILINE | re.DOTALL)
 _CODE_SPAN = re.compile(r"`[^`\n]*`")
 _LINK = re.compile(r"\]\(<?([^)\s>]+)>?(?:\s+\"[^\"]*\")?\)")
 _ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:", re.IGNORECASE)
+_NAMES_IN_A_FILE = re.compile(r"\[((?:`[^`\n]+`(?:, )?)+)\]\(([^)#\s]+\.py)\)")
 _HEADING = re.compile(r"^#{1,6}\s+(.+?)\s*#*$", re.MULTILINE)
 
 
@@ -55,6 +57,28 @@ def broken_links(page: Path) -> list[str]:
         ):
             broken.append(link)
     return broken
+
+
+def missing_names(page: Path) -> list[str]:
+    """Return the names that a page links to a Python file, [`module:Class.method`](file.py), which the file lacks."""
+    missing = []
+    for names, file in _NAMES_IN_A_FILE.findall(page.read_text(encoding="utf-8")):
+        target = page.parent / file
+        defined = names_of(target) if target.exists() else set[str]()
+        told = [name for name in re.findall(r"`([^`]+)`", names) if not name.endswith(".py") and "/" not in name]
+        missing += [f"{name} in {file}" for name in told if re.split("[.:]", name)[-1] not in defined]
+    return missing
+
+
+def names_of(source: Path) -> set[str]:
+    """Return the names of all functions, classes, variables and attributes that a file defines."""
+    names = set[str]()
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.id if isinstance(node, ast.Name) else node.attr)
+    return names
 
 
 def command_lines(text: str) -> Iterator[str]:
@@ -93,6 +117,11 @@ def test_command_lines_parse(page: Path) -> None:
     assert {line: reason for line, reason in complaints.items() if reason} == {}
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_names_of_code_are_in_the_files_that_they_link_to(page: Path) -> None:
+    assert missing_names(page) == []
+
+
 def test_the_readme_is_among_the_pages() -> None:
     assert ROOT / "README.md" in PAGES
 
@@ -106,6 +135,15 @@ def test_a_broken_link_and_a_missing_anchor_are_found(tmp_path: Path) -> None:
         "```\n[k](block.md)\n```\n"
     )
     assert broken_links(page) == ["lost.png", "gone.md", "other.md#no-heading", "#bottom"]
+
+
+def test_a_name_that_a_file_lacks_is_found(tmp_path: Path) -> None:
+    (tmp_path / "code.py").write_text("LIMIT = 1\nclass Learner:\n    def step(self):\n        self.count = LIMIT\n")
+    page = tmp_path / "page.md"
+    page.write_text(
+        "[`a.code:LIMIT`, `Learner.step`, `Learner.count`](code.py), [`code:Learner.leap`](code.py), [`x`](no.py)"
+    )
+    assert missing_names(page) == ["code:Learner.leap in code.py", "x in no.py"]
 
 
 def test_command_lines_are_found_where_they_stand() -> None:
