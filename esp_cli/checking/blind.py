@@ -20,10 +20,10 @@ from torch.nn import functional as F
 
 from esp_cli.checking.discovery import Discovery, default_candidates, judged_elements, named
 from esp_cli.checking.numbers import Moments, NumberMap, changing, done
-from esp_cli.checking.paired import MakeWorlds
 from esp_cli.checking.recorded import Transitions, collect, outputs_of
 from esp_cli.checking.verdicts import NEGLIGIBLE, SIGNIFICANT, ElementVerdict, FieldVerdict, Outcome
 from esp_cli.symmetry import Element, build_transform
+from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.spec import Discrete, Spaces
 
 BLIND = "transitions whose numbers nobody explained"

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from esp_cli.checking.candidates import candidates, generate
-from esp_cli.checking.paired import MakeWorlds, check_paired
+from esp_cli.checking.paired import check_paired
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.regression import MATERIAL, check_by_regression
 from esp_cli.checking.verdicts import RANK, ElementVerdict
@@ -21,6 +21,7 @@ from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import DISCOVERED, exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.parse import parse_elements
+from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.spec import Spaces
 
 FALSE_DISCOVERIES = 0.05

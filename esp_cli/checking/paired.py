@@ -21,9 +21,9 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.verdicts import RANK, ElementVerdict, FieldVerdict, judged
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
+from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.spec import Layout, TaskSpec
 
-MakeWorlds = Callable[[int, Sequence[int]], Environment]
 _MOST_WORLDS = 256
 _NUMBERS = 1 << 18
 """Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""

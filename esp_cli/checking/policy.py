@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import candidates
-from esp_cli.checking.paired import MakeWorlds
 from esp_cli.symmetry import build_transform
 from esp_cli.training.loading import TrainedPolicy
+from esp_envs.conformance.subject import MakeWorlds
 
 _WORLDS = 64
 _CLOSE = 0.1

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from esp_cli.checking.candidates import candidates, found_group
-from esp_cli.checking.paired import MakeWorlds, check_paired
+from esp_cli.checking.paired import check_paired
 from esp_cli.checking.recorded import collect
 from esp_cli.checking.transitions import check_transitions
 from esp_cli.checking.verdicts import ElementVerdict
+from esp_envs.conformance.subject import MakeWorlds
 
 _COPIES = 256
 """Worlds of a task that cannot be set to a state."""

@@ -20,9 +20,9 @@ from esp_cli.commands.options import (
 
 if TYPE_CHECKING:
     from esp_cli.checking import PolicyVerdict, SymmetryReport
-    from esp_cli.checking.paired import MakeWorlds
     from esp_envs import Environment
     from esp_envs.conformance import Finding
+    from esp_envs.conformance.subject import MakeWorlds
     from esp_envs.spec import TaskSpec
 
 EPILOG = """Examples:\n

@@ -58,7 +58,9 @@ def settings(context: typer.Context, incomplete: str) -> list[str]:
 
 def trackers(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the trackers."""
-    return _starting(incomplete, ["tensorboard", "wandb", "mlflow"])
+    from esp_cli.trackers import TRACKERS
+
+    return _starting(incomplete, [*TRACKERS])
 
 
 def policies(_: typer.Context, incomplete: str) -> list[str]:

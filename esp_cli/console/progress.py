@@ -127,10 +127,6 @@ class TrainingProgress:
         (first_s, first), (last_s, last) = self._history[0], self._history[-1]
         return (last - first) * self.num_seeds / (last_s - first_s) if last_s > first_s else 0.0
 
-    def status(self) -> str:
-        """Return steps, rate, time left and metrics in one line."""
-        return "  ".join(self.parts())
-
     def parts(self) -> list[str]:
         """Return steps, rate and time left together, then each metric."""
         rate = self.rate()
@@ -144,4 +140,4 @@ class TrainingProgress:
     def _print_line(self) -> None:
         self._shown = self._done
         share = self._done / self.total if self.total else 1.0
-        note(f"{self.description}  {share:4.0%}  {self.status()}")
+        note(f"{self.description}  {share:4.0%}  {'  '.join(self.parts())}")

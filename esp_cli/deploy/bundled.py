@@ -21,19 +21,18 @@ _PRIORS = ("esp", "none", "augment", "consistency")
 """In the order in which a task's policies are preferred; algorithms are in that of their registry."""
 
 
-def find(name: str, algo: str | None = None, prior: str | None = None, folder: Path | None = None) -> Entry:
+def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
     """Find a bundled policy.
 
     Args:
         name: its own, or that of a task; of a task's policies MAPPO's and those with the prior come first.
         algo: only those that this algorithm trained.
         prior: only those that this kind of prior helped to train ("none": the plain learner).
-        folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: there is none.
     """
-    entries = read_bundled(folder)
+    entries = read_bundled()
     named = [e for e in entries if e.name == name]
     asked = named or [e for e in entries if e.task == name]
     found = [e for e in asked if algo in (None, e.algorithm) and prior in (None, e.prior)]
@@ -51,9 +50,7 @@ def _rank(entry: Entry) -> tuple[bool, int, int]:
     return not entry.is_standard, algorithm, _PRIORS.index(entry.prior)
 
 
-def open_policy(
-    where: Path, algo: str | None = None, prior: str | None = None, folder: Path | None = None
-) -> TrainedPolicy:
+def open_policy(where: Path, algo: str | None = None, prior: str | None = None) -> TrainedPolicy:
     """Open a run folder, a policy file, or a bundled policy by its name or its task's.
 
     An existing path goes before a bundled policy of that name, unless algorithm or prior is given.
@@ -62,7 +59,6 @@ def open_policy(
         where: path or name.
         algo: of the bundled policies, only those that this algorithm trained; module:Class chooses none.
         prior: likewise this kind of prior.
-        folder: of the manifest; by default that of this installation.
 
     Raises:
         ValueError: nothing there, damaged, or of another version.
@@ -76,9 +72,9 @@ def open_policy(
         raise ValueError(f"there is no policy {shortened(str(where))}: {error.strerror}") from None
     if there and not choosy:
         return load_policy(where)
-    if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled(folder)):
-        entry = find(str(where), algo, prior, folder)
-        trained = load_entry(entry, folder)
+    if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled()):
+        entry = find(str(where), algo, prior)
+        trained = load_entry(entry)
         if entry.name == str(where):
             return trained
         return replace(trained, notes=(*trained.notes, f"{where}: taking the bundled policy {entry.name}"))
@@ -87,19 +83,19 @@ def open_policy(
             f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out"
         )
     if not there:
-        known = [*task_names(), *(entry.name for entry in read_bundled(folder))]
+        known = [*task_names(), *(entry.name for entry in read_bundled())]
         hint = did_you_mean(str(where), known) or "; give a run folder, a policy file, or a task's or policy's name"
         raise ValueError(f"{where} does not exist{hint}")
     return load_policy(where)
 
 
-def load_entry(entry: Entry, folder: Path | None = None) -> TrainedPolicy:
+def load_entry(entry: Entry) -> TrainedPolicy:
     """Load a bundled policy.
 
     Raises:
         ValueError: its file is missing, another than the manifest names, or of another version.
     """
-    trained = load_policy((folder or manifest.bundled_folder()) / entry.file, entry.sha256)
+    trained = load_policy(manifest.bundled_folder() / entry.file, entry.sha256)
     described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
     if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
         raise ValueError(f"{trained.source} does not hold the policy that its manifest describes; get both again")

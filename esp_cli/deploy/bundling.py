@@ -7,12 +7,10 @@ import os
 import re
 from pathlib import Path
 
-import numpy as np
-
 from esp_cli import __version__
 from esp_cli.deploy.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
-from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.evaluation.spread import spread_over_episodes
 from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import Episodes, PolicyController
@@ -28,13 +26,12 @@ def best_seed(trained: TrainedPolicy, episodes: int) -> int:
 
 
 def score_of(episodes: Episodes) -> Score:
-    """Return mean, standard error and 95 % bootstrap interval over the episodes of one seed."""
+    """Return mean, standard error and 95 % interval over the episodes of one seed."""
     returns = episodes.returns[0].double().numpy()
-    mean, sem = mean_and_sem(returns)
-    interval = bootstrap_interval(returns)
-    if sem is None or interval is None or np.ptp(returns) == 0:
+    spread = spread_over_episodes(returns)
+    if spread.sem is None or spread.ci95 is None:
         raise ValueError("these episodes all brought the same return, or there is only one; a score needs more of them")
-    return Score(mean=mean, sem=sem, ci95=(float(interval[0]), float(interval[1])), episodes=returns.size)
+    return Score(mean=float(returns.mean()), sem=spread.sem, ci95=spread.ci95, episodes=returns.size)
 
 
 def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:

@@ -154,7 +154,7 @@ def _variants(
                 variant=variant,
                 config=config,
                 reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
-                paper=place if paper.reported(place or None) and _comparable(config, {}) else None,
+                paper=place if paper.reported(place) and _comparable(config, {}) else None,
             )
 
 

@@ -32,7 +32,7 @@ def reported(key: tuple[str, ...] | None) -> Reported | None:
     None where the paper has no such number.
     """
     place: Any = _content()
-    for part in key or (None,):
+    for part in key or ():
         place = place.get(part) if isinstance(place, dict) else None
     return Reported(*place) if isinstance(place, list) else None
 

@@ -178,21 +178,17 @@ class Scheduler:
             return
         try:
             run_folder = folder.prepare(cell)
-        except (ValueError, OSError) as error:
-            run.status, run.message = "failed", str(error)
-            return
-        if is_held(run_folder.lock_path):
-            run.status = "elsewhere"
-            return
-        path = str(run_folder.path)
-        if folder.is_trained(cell):
-            run.status = "evaluating"
-            arguments = ["eval", path, "--episodes", str(folder.study.episodes)]
-            arguments += ["--json", str(folder.evaluation_path(cell))]
-        else:
-            run.status, arguments = "training", ["train", "--resume", path]
-        arguments += cell.config.own_words()  # a job imports what the study's command line names, not its folder
-        try:
+            if is_held(run_folder.lock_path):
+                run.status = "elsewhere"
+                return
+            path = str(run_folder.path)
+            if folder.is_trained(cell):
+                run.status = "evaluating"
+                arguments = ["eval", path, "--episodes", str(folder.study.episodes)]
+                arguments += ["--json", str(folder.evaluation_path(cell))]
+            else:
+                run.status, arguments = "training", ["train", "--resume", path]
+            arguments += cell.config.own_words()  # a job imports what the study's command line names, not its folder
             if run.status != "training":  # a damaged evaluation is made again, and a link there is not followed
                 remove_file(folder.evaluation_path(cell))
             run.job = self.engine.start(arguments, folder.log_path(cell))

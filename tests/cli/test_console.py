@@ -154,4 +154,4 @@ def test_the_rate_forgets_what_is_half_a_minute_old() -> None:
 
 def test_progress_before_its_first_update_promises_nothing() -> None:
     with TrainingProgress(total=1000, clock=Clock()) as progress:
-        assert progress.status() == "0/1k  0 steps/s  ? left"
+        assert progress.parts() == ["0/1k  0 steps/s  ? left"]

@@ -92,7 +92,7 @@ def test_the_box_is_beside_the_packages_or_in_the_wheel(tmp_path: Path, monkeypa
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Drawn policies in a manifest: two of navigation, one with a name of its own, and one by another algorithm."""
     folder = tmp_path_factory.mktemp("bundled")
     bundle(drawn_policy("choice", seeds=(3, 7)), folder, 4)
@@ -101,11 +101,18 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def small(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of `made`, as that of this installation."""
+    monkeypatch.setattr(manifest, "bundled_folder", lambda: made)
+    return made
+
+
 def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
-    entry = find("navigation", folder=small)
+    entry = find("navigation")
     assert (entry.name, entry.file) == ("navigation-mappo-esp", "navigation-mappo-esp.safetensors")
     assert (entry.chosen_from, entry.score.episodes, entry.step) == (2, 4, 100)
-    alone = load_entry(entry, small)
+    alone = load_entry(entry)
     assert alone.config.seeds == (entry.seed,)
     assert score_of(play_greedily(alone, 4)) == entry.score
     assert evaluate(alone, 4).greedy.mean == pytest.approx(entry.score.mean)
@@ -132,8 +139,8 @@ def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
     ],
 )
 def test_a_policy_is_found_by_task_algorithm_and_prior(small: Path, asked: tuple, name: str) -> None:
-    assert find(*asked, folder=small).name == name
-    assert open_policy(Path(asked[0]), *asked[1:], small).source.name == f"{name}.safetensors"
+    assert find(*asked).name == name
+    assert open_policy(Path(asked[0]), *asked[1:]).source.name == f"{name}.safetensors"
 
 
 @pytest.mark.parametrize(
@@ -148,15 +155,15 @@ def test_a_policy_is_found_by_task_algorithm_and_prior(small: Path, asked: tuple
 )
 def test_what_is_not_there_is_told_in_one_sentence(small: Path, asked: tuple, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        open_policy(Path(asked[0]), *asked[1:], small)
+        open_policy(Path(asked[0]), *asked[1:])
 
 
 def test_a_folder_of_the_name_goes_before_the_box(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("navigation").mkdir()
     with pytest.raises(ValueError, match="navigation is no run folder"):
-        open_policy(Path("navigation"), folder=small)
-    assert open_policy(Path("navigation"), "mappo", folder=small).source.parent == small
+        open_policy(Path("navigation"))
+    assert open_policy(Path("navigation"), "mappo").source.parent == small
 
 
 def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
@@ -192,22 +199,28 @@ def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monke
     assert [entry.name for entry in read_bundled(tmp_path)] == ["other", "own"]
 
 
-def test_a_file_that_is_not_the_manifests_is_refused(small: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small, tmp_path / "bundled"))
+def test_a_file_that_is_not_the_manifests_is_refused(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "bundled"))
+    monkeypatch.setattr(manifest, "bundled_folder", lambda: folder)
     shutil.copy(folder / "navigation-vectors.safetensors", folder / "navigation-mappo-esp.safetensors")
     with pytest.raises(ValueError, match="is not the file that its manifest names: their SHA-256 differ"):
-        open_policy(Path("navigation"), folder=folder)
+        open_policy(Path("navigation"))
     (folder / "navigation-mappo-esp.safetensors").unlink()
     with pytest.raises(ValueError, match="does not exist"):
-        open_policy(Path("navigation"), folder=folder)
+        open_policy(Path("navigation"))
 
 
-def test_a_manifest_that_says_something_else_of_a_file_is_refused(small: Path, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(small, tmp_path / "bundled"))
-    entry = find("navigation", folder=folder)
+def test_a_manifest_that_says_something_else_of_a_file_is_refused(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Path(shutil.copytree(made, tmp_path / "bundled"))
+    monkeypatch.setattr(manifest, "bundled_folder", lambda: folder)
+    entry = find("navigation")
     manifest.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
     with pytest.raises(ValueError, match="does not hold the policy that its manifest describes"):
-        open_policy(Path("navigation"), folder=folder)
+        open_policy(Path("navigation"))
 
 
 @pytest.mark.parametrize(
@@ -232,10 +245,11 @@ def test_a_damaged_manifest_is_told_in_one_sentence(small: Path, tmp_path: Path,
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path) -> None:
-    assert read_bundled(tmp_path) == ()
+def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(manifest, "bundled_folder", lambda: tmp_path)
+    assert read_bundled() == ()
     with pytest.raises(ValueError, match="no policy fits navigation; no policy is bundled"):
-        find("navigation", folder=tmp_path)
+        find("navigation")
 
 
 def test_a_policy_of_a_task_that_is_not_installed_gets_a_name_that_can_be_written() -> None:

@@ -1,7 +1,7 @@
 """Many copies of one environment, stepped here or in worker processes, with all numbers in shared memory.
 
 A `Board` holds what goes to and comes from every copy; a `Stepper` steps some copies and knows nothing of processes.
-`HereCopies` and `WorkerCopies` are two ways to drive steppers, with the same results bit for bit.
+One stepper steps all copies here, or `WorkerCopies` shares them out among many, with the same results bit for bit.
 """
 
 from __future__ import annotations
@@ -109,27 +109,13 @@ class Board:
 class Stepper(Protocol):
     """What resets and steps the copies of a board that are `active`."""
 
+    board: Board
+
     def reset(self) -> None:
         """Start an episode in the active copies."""
 
     def step(self) -> None:
         """Advance the active copies by one step, and reset those whose episode ends."""
-
-
-class HereCopies:
-    """All copies in this process."""
-
-    def __init__(self, sizes: Sizes, make_stepper: Callable[[Board, range], Stepper]) -> None:
-        self.board = Board(sizes)
-        self._stepper = make_stepper(self.board, range(sizes.copies))
-
-    def reset(self) -> None:
-        """Start an episode in the active copies."""
-        self._stepper.reset()
-
-    def step(self) -> None:
-        """Advance the active copies by one step."""
-        self._stepper.step()
 
 
 class WorkerCopies:

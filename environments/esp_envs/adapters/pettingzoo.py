@@ -22,7 +22,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import seed_of
-from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, HereCopies, Sizes, WorkerCopies, can_fork
+from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
 from esp_envs.base import (
     OTHER_SIZE,
@@ -85,7 +85,7 @@ class ParallelTask(CopyHooks, Environment):
         )
         one.require_spaces()
         one.close()
-        self._copies: HereCopies | WorkerCopies | None = None
+        self._copies: Stepper | None = None
         lead = (self.num_seeds, num_envs)
         self._base = torch.zeros(lead, dtype=torch.int64)
         self._begun, self._time = torch.zeros_like(self._base), torch.zeros_like(self._base)
@@ -159,7 +159,7 @@ class ParallelTask(CopyHooks, Environment):
                 "cannot go on bit for bit; let 'reset(seed)' decide all that chance does in the environment"
             )
 
-    def _started(self) -> HereCopies | WorkerCopies:
+    def _started(self) -> Stepper:
         """Return the copies, made when they are first needed."""
         if self._copies is None:
             count, workers = self._base.numel(), self.settings.workers
@@ -179,7 +179,7 @@ class ParallelTask(CopyHooks, Environment):
             if workers and can_fork():
                 self._copies = WorkerCopies(sizes, self._stepper, min(workers, count))
             else:
-                self._copies = HereCopies(sizes, self._stepper)
+                self._copies = self._stepper(Board(sizes), range(count))
         return self._copies
 
     def _stepper(self, board: Board, copies: range) -> CopyStepper:

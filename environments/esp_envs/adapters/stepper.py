@@ -141,7 +141,7 @@ class CopyStepper:
     """Steps some copies of a board."""
 
     def __init__(self, task: CopyHooks, board: Board, copies: range) -> None:
-        self._task, self._board = task, board
+        self._task, self.board = task, board
         self._copies = {k: Copy(task) for k in copies}
         self._seen: dict[int, Mapping[str, Any]] = {}
         self._infos: dict[int, Mapping[str, Any]] = {}
@@ -151,26 +151,26 @@ class CopyStepper:
     def reset(self) -> None:
         """Start an episode in the active copies."""
         for k in self._copies:
-            if self._board.active[k]:
+            if self.board.active[k]:
                 self._start(k)
 
     def step(self) -> None:
         """Advance the active copies by one step, and reset those whose episode ends."""
         for k, copy in self._copies.items():
-            if self._board.active[k]:
+            if self.board.active[k]:
                 self._step(k, copy)
 
     def _start(self, k: int) -> None:
-        seed = int(self._board.seed[k])
+        seed = int(self.board.seed[k])
         self._dice[k] = np.random.default_rng(seed)
         with self._naming(k, "reset"):
             self._seen[k], self._infos[k] = self._copies[k].env.reset(seed=seed)
         self._gone[k] = set()
-        board = self._board
+        board = self.board
         self._write(k, board.obs, board.state, board.mask, board.alive)
 
     def _step(self, k: int, copy: Copy) -> None:
-        task, board, seen = self._task, self._board, self._seen[k]
+        task, board, seen = self._task, self.board, self._seen[k]
         gone = self._gone[k]
         chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name not in gone}
         chosen |= {name: task.opponent(name, seen[name], self._dice[k]) for name in copy.rest if name in seen}
@@ -204,10 +204,10 @@ class CopyStepper:
         task = self._task
         if over and terminated and task.terminates:
             return TERMINATED
-        if over and not self._board.cut[k]:
+        if over and not self.board.cut[k]:
             way = "set 'terminates = True' in the class" if terminated else "give both the same number of steps"
             raise ValueError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
-        return TRUNCATED if self._board.cut[k] else 0
+        return TRUNCATED if self.board.cut[k] else 0
 
     def _write(self, k: int, obs: Array, state: Array, mask: Array, alive: Array) -> None:
         """Write what the agents of a copy see; zeros, and everything allowed, for one that is there no more."""

@@ -40,8 +40,7 @@ class Physics(ABC):
     """
 
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
-        self.arena, self.num_worlds = arena, num_worlds
-        self.control_period_s, self.num_threads = control_period_s, num_threads
+        self.arena, self.num_worlds, self.control_period_s = arena, num_worlds, control_period_s
 
     @abstractmethod
     def place(self, bodies: Bodies) -> None:
