@@ -22,6 +22,14 @@ def learner(algorithm, task="navigation", seeds=(0, 1), **overrides):
     return build_learner(resolve_config(task, algorithm, steps=10_000, seeds=seeds, overrides=settings))
 
 
+def small_learner(task, algorithm, hidden=(8, 8), **overrides):
+    """A learner of a task of a few steps; settings as "network__name", or as they are written."""
+    small = {"num_envs": 4, "num_steps": 6} if algorithm == "mappo" else SMALL
+    settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": list(hidden)}
+    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
+    return build_learner(resolve_config(task, algorithm, steps=1000, seeds=(0, 1), overrides=settings))
+
+
 def networks(trained):
     return {
         name: tensor.clone()

@@ -12,12 +12,10 @@ from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_see
 from esp_cli.checking import check_symmetry
 from esp_cli.prior import mean_per_seed
 from esp_cli.symmetry import transform_set
-from esp_cli.training.build import build_learner
-from esp_cli.training.config import resolve_config
 from esp_envs import make, register
 from esp_envs.conformance import Subject, check
 from esp_envs.registry import TASKS
-from tests.algorithms.off_policy import SMALL
+from tests.algorithms.off_policy import small_learner
 from tests.cli.running import esp
 from tests.leaving import Leaving, Returning
 
@@ -32,11 +30,7 @@ def registered(monkeypatch):
 
 
 def learner(algorithm, **overrides):
-    small = {"num_envs": 4, "num_steps": 6} if algorithm == "mappo" else SMALL
-    settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": [8, 8]}
-    settings["prior.transforms"] = "flip-x"
-    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
-    return build_learner(resolve_config(TASK, algorithm, steps=1000, seeds=(0, 1), overrides=settings))
+    return small_learner(TASK, algorithm, **{"prior__transforms": "flip-x"} | overrides)
 
 
 def test_the_mean_over_the_living_by_hand():

@@ -14,13 +14,11 @@ from esp_cli.networks.exploration import EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import Categorical, masked
 from esp_cli.symmetry import transform_set
 from esp_cli.training import loading
-from esp_cli.training.build import build_learner
-from esp_cli.training.config import resolve_config
 from esp_envs import Discrete, Kind, make, register
 from esp_envs.base import random_choice
 from esp_envs.conformance import Subject, check
 from esp_envs.registry import TASKS
-from tests.algorithms.off_policy import SMALL
+from tests.algorithms.off_policy import small_learner
 from tests.cli.running import esp
 from tests.fenced import Fenced, Gated, Nothing, OneSided
 
@@ -45,10 +43,7 @@ def head_of(cls):
 
 
 def learner(algorithm, task=TASK, **overrides):
-    small = {"num_envs": 4, "num_steps": 6} if algorithm == "mappo" else SMALL
-    settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": [8, 8]}
-    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
-    return build_learner(resolve_config(task, algorithm, steps=1000, seeds=(0, 1), overrides=settings))
+    return small_learner(task, algorithm, **overrides)
 
 
 def test_probabilities_entropy_and_gradient_of_a_masked_choice_by_hand():

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking import check_symmetry
-from esp_cli.training.build import build_learner
-from esp_cli.training.config import resolve_config
 from esp_envs import (
     BatchedTask,
     Discrete,
@@ -25,7 +23,7 @@ from esp_envs import (
     to_others,
 )
 from esp_envs.registry import TASKS
-from tests.algorithms.off_policy import SMALL
+from tests.algorithms.off_policy import small_learner
 
 TASK = f"{__name__}:Scouts"
 MOVES = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
@@ -91,9 +89,7 @@ def registered(monkeypatch):
 
 
 def learner(algorithm, **overrides):
-    small = {"num_envs": 4, "num_steps": 5} if algorithm == "mappo" else SMALL
-    settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": [16]}
-    return build_learner(resolve_config(TASK, algorithm, steps=1000, seeds=(0, 1), overrides=settings | overrides))
+    return small_learner(TASK, algorithm, hidden=[16], **overrides)
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])

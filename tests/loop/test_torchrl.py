@@ -139,7 +139,14 @@ def test_a_key_that_does_not_fit_is_named(change: dict[str, torch.Tensor], sente
     data["agents"].update(change)
     with pytest.raises(ValueError, match=sentence):
         symmetry().augment_tensordict(data)
-    assert "hidden" not in change or symmetry().augment_tensordict(data, {"hidden": "drop"}) is not None
+
+
+def test_a_key_of_the_role_drop_is_left_out() -> None:
+    data = rows()
+    data["agents", "hidden"] = torch.zeros(ROWS, AGENTS, 64)
+    both = symmetry().augment_tensordict(data, {"hidden": "drop"})
+    assert set(data["agents"].keys()) - set(both["agents"].keys()) >= {"hidden"}
+    assert both["agents", "observation"].shape[0] > ROWS
 
 
 def test_a_tensordict_without_observations_is_refused() -> None:
