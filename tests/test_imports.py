@@ -44,6 +44,7 @@ RANKS = {
     "": 7.7,  # esp_cli itself: the version, and what other programs use of deploy
     "commands": 8,
     "app": 9,
+    "__main__": 10,
 }
 """A part may import parts of a lower rank, and itself; parts of one rank do not know each other."""
 CONTRACT_ONLY_UP_TO = RANKS["algorithms"]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+import time
 import types
 from pathlib import Path
 from typing import Annotated
@@ -20,6 +22,7 @@ from esp_cli.app import app
 from esp_cli.commands import COMMANDS
 from esp_cli.commands.options import SeedsOption, StepsOption
 
+ROOT = Path(__file__).parents[2]
 runner = CliRunner()
 
 
@@ -93,6 +96,25 @@ def test_defaults_pass_through_the_parsers(commands: None) -> None:
 def test_a_failure_becomes_one_sentence_and_a_code(commands: None, kind: str, code: int, sentence: str) -> None:
     result = runner.invoke(app, ["toy", kind])
     assert (result.exit_code, result.stderr, result.stdout) == (code, sentence + "\n", "")
+
+
+def test_an_interrupt_in_the_middle_of_an_import_leaves_at_once(tmp_path: Path) -> None:
+    """A library may swallow the exception and go on half imported."""
+    (tmp_path / "slow.py").write_text(
+        "import pathlib, time\npathlib.Path('begun').touch()\n"
+        "try:\n    time.sleep(60)\nexcept BaseException:\n    pass\n"
+    )
+    words = [sys.executable, "-m", "esp_cli", "train", "--task", "slow:Task"]
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
+    process = subprocess.Popen(
+        words, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True
+    )
+    while not (tmp_path / "begun").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=30)
+    assert (process.returncode, told) == (130, "interrupted\n")
 
 
 def test_a_bug_keeps_its_traceback(commands: None) -> None:

@@ -26,6 +26,6 @@ def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: flo
     try:
         engine: type[Physics] = load(ENGINES[name])
     except ImportError as error:
-        package = (error.name or "").partition(".")[0]
+        package = (error.name or name.partition("-")[0]).partition(".")[0]
         raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
     return engine(arena, num_worlds, control_period_s, num_threads)
