@@ -61,3 +61,18 @@ class Returning(Leaving):
 
     def _living(self, world: dict[str, Tensor]) -> Tensor:
         return super()._living(world) | (self._time % 3 == 2)
+
+
+class BriefSettings(LeavingSettings):
+    shared: bool = True
+
+
+class Brief(Leaving):
+    """All agents end with the first step, which costs the team 1; nothing is paid behind it: the return is -1."""
+
+    Settings = BriefSettings
+
+    def _advance(self, world: dict[str, Tensor], action: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        reward = torch.where(self._living(world), -1.0, 0.0)
+        world["position"] = world["position"] + torch.tensor([4.0, 0.0])
+        return reward, {"arrived": 1 - self._living(world).float().mean(-1)}

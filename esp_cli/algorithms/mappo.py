@@ -151,7 +151,9 @@ class Mappo(Learner):
         advantage = gae(reward, value, next_value, terminated, ended, config.gamma, config.gae_lambda)
         target = advantage + value
         self.normaliser.update(target, valid)
-        per_agent = normalise_per_seed(advantage, valid=valid).expand(rollout.log_prob.shape)
+        if rollout.alive is not None:
+            advantage = advantage.expand(rollout.log_prob.shape)
+        per_agent = normalise_per_seed(advantage, valid=rollout.alive).expand(rollout.log_prob.shape)
         fields = (
             rollout.obs,
             rollout.state,
@@ -261,8 +263,8 @@ class Mappo(Learner):
         value_error = value_loss(
             copies.learned(values), batch.target, config.huber_delta, old_value, config.clip_epsilon
         )
-        loss = config.value_coef * mean_per_seed(value_error, batch.mask) - mean_per_seed(objective, batch.mask)
-        loss = loss - entropy_coef * mean_per_seed(entropy, batch.mask)
+        loss = config.value_coef * mean_per_seed(value_error, batch.valued(self.num_values))
+        loss = loss - mean_per_seed(objective, batch.mask) - entropy_coef * mean_per_seed(entropy, batch.mask)
         if sums is not None:
             originals = (copies.original(outputs.detach()), copies.original(values.detach()))
             self._watch(copies.originals, *originals, weight, sums)
@@ -282,7 +284,9 @@ class Mappo(Learner):
             "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon),
             "value_loss": value_loss(values, batch.target, config.huber_delta, old_value, config.clip_epsilon),
         }
-        _add(sums, weight, **{name: mean_per_seed(part, batch.mask) for name, part in parts.items()})
+        masks = {"value_loss": batch.valued(self.num_values)}
+        means = {name: mean_per_seed(part, masks.get(name, batch.mask)) for name, part in parts.items()}
+        _add(sums, weight, **means)
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""

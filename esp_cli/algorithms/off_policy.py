@@ -190,8 +190,8 @@ class OffPolicyLearner(Learner):
             copies: the batch.
         """
         error = huber(copies.learned(values) - copies.inherited(target), self.config.huber_delta)
-        loss = mean_per_seed(error, copies.batch.mask) + copies.penalty(value=values)
-        valid = copies.originals.mask
+        loss = mean_per_seed(error, copies.batch.valued(values.shape[-1])) + copies.penalty(value=values)
+        valid = copies.originals.valued(values.shape[-1])
         return loss, {
             "td_loss": mean_per_seed(copies.original(error), valid),
             "value": mean_per_seed(copies.original(values), valid),

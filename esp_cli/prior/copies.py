@@ -123,19 +123,23 @@ class Copies(Generic[Rows]):
         if policy is not None:
             head, outputs = policy
             gaps["policy"] = self._mean(
-                outputs, lambda g, moved, here: policy_consistency_loss(head.divergence, g.pull_back(moved), here, stop)
+                outputs,
+                lambda g, moved, here: policy_consistency_loss(head.divergence, g.pull_back(moved), here, stop),
+                self.originals.mask,
             )
         if value is not None:
             gaps["value"] = self._mean(
-                value, lambda g, moved, here: value_consistency_loss(g.values(moved), here, stop)
+                value,
+                lambda g, moved, here: value_consistency_loss(g.values(moved), here, stop),
+                self.originals.valued(value.shape[-1]),
             )
         return gaps
 
     def _pushed(self, x: Tensor, push: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
         return torch.cat([x, *(push(g)(x) for g in self.transforms)], 1) if self.transforms else x
 
-    def _mean(self, x: Tensor, gap: Callable[[Transform, Tensor, Tensor], Tensor]) -> Tensor:
-        """Return the mean [S] over the copies of the gap between each and the originals."""
+    def _mean(self, x: Tensor, gap: Callable[[Transform, Tensor, Tensor], Tensor], mask: Tensor | None) -> Tensor:
+        """Return the mean [S], over the copies and what a mask counts, of the gap between each and the originals."""
         here, *moved = x.split(self.originals.count, 1)
         parts = zip(self.transforms, moved, strict=True)
-        return torch.stack([mean_per_seed(gap(g, copy, here), self.originals.mask) for g, copy in parts]).mean(0)
+        return torch.stack([mean_per_seed(gap(g, copy, here), mask) for g, copy in parts]).mean(0)

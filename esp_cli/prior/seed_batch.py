@@ -50,6 +50,19 @@ class SeedBatch:
         """[S, B, T] which rows count, or [S, B, T, N] of which agents; None where all do."""
         return self.alive
 
+    @property
+    def played(self) -> Tensor | None:
+        """[S, B, T] which rows belong to an episode, whoever lives in them; None where all do."""
+        return None
+
+    def valued(self, count: int) -> Tensor | None:
+        """Return which of C = `count` values of each row count.
+
+        A value per agent counts up to the agent's end. That of a world counts in every row of the episode: the reward
+        that its agents share goes on behind the end of the last, and what is bootstrapped has to be learned.
+        """
+        return self.mask if count > 1 else self.played
+
     def map(self: Rows, function: Callable[[Tensor], Tensor]) -> Rows:
         """Return the batch with every tensor put through a function."""
         return type(self)(**{name: function(tensor) for name, tensor in self.tensors.items()})

@@ -17,7 +17,7 @@ from esp_envs.conformance import Subject, check
 from esp_envs.registry import TASKS
 from tests.algorithms.off_policy import small_learner
 from tests.cli.running import esp
-from tests.leaving import Leaving, Returning
+from tests.leaving import Brief, Leaving, Returning
 
 TASK = "tests.leaving:Leaving"
 
@@ -101,6 +101,50 @@ def collected(**overrides):
     assert bool(rollout.alive.any())
     assert not bool(rollout.alive.all())
     return trained, rollout
+
+
+def test_a_value_of_the_world_counts_behind_the_end_of_its_agents_and_a_value_per_agent_does_not():
+    _, rollout = collected(task__shared=True)
+    batch = learner("mappo", task__shared=True).prepare(rollout)[0]
+    assert batch.valued(1) is None
+    assert batch.valued(3) is batch.alive
+    episodes, _ = learner("qmix", task__shared=True).collector.collect()
+    assert episodes.valued(1) is episodes.valid
+    assert torch.equal(episodes.valued(3), episodes.alive[:, :, :-1])
+
+
+def test_advantages_of_the_living_are_standardised_where_the_reward_is_shared_too():
+    trained, rollout = collected(task__shared=True)
+    batch, _ = trained.prepare(rollout)
+    for advantage, alive in zip(batch.advantage, batch.alive, strict=True):
+        assert float(advantage[alive].mean()) == pytest.approx(0, abs=1e-5)
+        assert float(advantage[alive].std(correction=0)) == pytest.approx(1, abs=1e-3)
+        assert not advantage[~alive].any()
+
+
+def test_mappo_learns_that_a_state_in_which_nobody_lives_any_more_is_worth_nothing():
+    """The first step costs 1 and nothing is paid behind it. Where the end is not learned, V = -1 + V / 2 is -2."""
+    slow = {"prior.kind": "none", "mappo.num_envs": 16, "mappo.gamma": 0.5}
+    trained = small_learner(register(Brief), "mappo", hidden=(32, 32), **slow)
+    for _ in range(80):
+        trained.iterate(0.0)
+    rollout = trained.collector.collect(6)
+    value = trained.normaliser.denormalise(trained.critic.unroll(rollout.obs, rollout.state)).detach()
+    assert float(value[:, :, 0].mean()) == pytest.approx(-1, abs=0.1)
+    assert float(value[:, :, 1:].mean()) == pytest.approx(0, abs=0.1)
+
+
+@pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
+def test_an_off_policy_learner_learns_that_a_state_in_which_nobody_lives_any_more_is_worth_nothing(algorithm):
+    slow = {"prior.kind": "none", f"{algorithm}.learning_rate": 5e-3, f"{algorithm}.gamma": 0.5}
+    trained = small_learner(register(Brief), algorithm, **slow)
+    for _ in range(150):
+        trained.iterate(0.0)
+    with torch.no_grad():
+        value = trained.answers(trained.replay.sample(5, trained.generators["learner"]))["value"]
+    first, beyond = float(value[:, :, 0].mean()), float(value[:, :, 1:].mean())
+    assert first < -0.5
+    assert beyond / first == pytest.approx(0, abs=0.1)
 
 
 def test_a_rollout_says_who_has_ended():
