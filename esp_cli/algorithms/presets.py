@@ -178,6 +178,10 @@ FAST: dict[str, dict[str, Sections]] = {
 }
 
 
+PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_steps": 300}}}}
+"""What a task changes in the preset `paper`, whose recurrent MAPPO needs whole episodes."""
+
+
 def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
     """Return the settings of a preset on a task, layer by layer; a later one has the last word.
 
@@ -193,4 +197,5 @@ def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
         raise ValueError(
             f"{algorithm} has no preset '{preset}'; it has {', '.join([*presets, *['fast'][: len(fast)]])}"
         )
-    return [presets[preset], TUNED.get(algorithm, {}).get(task, {})] if preset == "default" else [presets[preset]]
+    of_task = {"default": TUNED, "paper": PAPER}.get(preset, {})
+    return [presets[preset], of_task.get(algorithm, {}).get(task, {})]

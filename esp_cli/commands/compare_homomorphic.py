@@ -50,5 +50,7 @@ def compare_homomorphic(
     words += [word for limit in limits for word in ("--threshold", f"{limit:g}")]
     request = choices.request("homomorphic", "compare-homomorphic", *words)
     board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
+    if twice := sorted(board.keys() & request.overrides.keys()):
+        raise ValueError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
     request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
     run_study("homomorphic", request, choices, mode, limits)

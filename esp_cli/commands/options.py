@@ -127,6 +127,15 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     return parser
 
 
+def _named_class(value: str) -> str:
+    if ":" not in value:
+        raise ValueError(f"'{value}' is no module:Class; only a class of yours has to be named, so leave it out")
+    return value
+
+
+_own_class = _option_parser(_named_class, "module:Class")
+
+
 def not_over_a_run(context: typer.Context, path: T) -> T:
     """Return the path of an option that writes a table or results, unless it is what a run or a study needs.
 
@@ -157,7 +166,12 @@ TaskOption = Annotated[
 ]
 OwnTaskOption = Annotated[
     list[str] | None,
-    typer.Option("--task", help="Import this task of yours, which the run or policy is of.", metavar="MODULE:CLASS"),
+    typer.Option(
+        "--task",
+        parser=_own_class,
+        help="Import this task of yours, which the run or policy is of.",
+        metavar="MODULE:CLASS",
+    ),
 ]
 AlgoOption = Annotated[
     str,
@@ -165,11 +179,18 @@ AlgoOption = Annotated[
 ]
 OwnAlgoOption = Annotated[
     list[str] | None,
-    typer.Option("--algo", help="Import this algorithm of yours, which trained the run.", metavar="MODULE:CLASS"),
+    typer.Option(
+        "--algo",
+        parser=_own_class,
+        help="Import this algorithm of yours, which trained the run.",
+        metavar="MODULE:CLASS",
+    ),
 ]
 OwnNetworkOption = Annotated[
     list[str] | None,
-    typer.Option("--network", help="Import this network of yours, which the run has.", metavar="MODULE:CLASS"),
+    typer.Option(
+        "--network", parser=_own_class, help="Import this network of yours, which the run has.", metavar="MODULE:CLASS"
+    ),
 ]
 PresetOption = Annotated[
     str,

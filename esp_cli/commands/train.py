@@ -247,5 +247,9 @@ def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
+    if not getattr(trainer.learner, "updates", 1):
+        console.note(
+            "nothing was learned: the run ended within its warm-up; take more --steps or fewer warmup_episodes"
+        )
     words = shlex.join([str(path), *config.own_words()])
     console.note(f"next: esp eval {words}" + (f"    esp render {words} -o out.gif" if trainer.can_be_drawn else ""))

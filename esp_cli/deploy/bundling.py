@@ -7,6 +7,8 @@ import os
 import re
 from pathlib import Path
 
+import torch
+
 from esp_cli import __version__
 from esp_cli.deploy.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.evaluation.final import play_batches
@@ -21,8 +23,10 @@ def best_seed(trained: TrainedPolicy, episodes: int) -> int:
     """Return the seed with the largest mean greedy return over episodes that no evaluation uses."""
     if len(trained.config.seeds) == 1:
         return trained.config.seeds[0]
-    returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns
-    return trained.config.seeds[int(returns.mean(1).argmax())]
+    returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns.mean(1)
+    if len(trained.stopped) < len(returns):
+        returns[list(trained.stopped)] = -torch.inf
+    return trained.config.seeds[int(returns.argmax())]
 
 
 def score_of(episodes: Episodes) -> Score:

@@ -86,7 +86,7 @@ class PriorConfig(Strict):
 
     @property
     def needs_declaration(self) -> bool:
-        """Whether a task has to declare the elements: not where each is weighed, or a compass keeps every copy true."""
+        """Whether a task has to declare the elements: not where each is weighed, or a compass keeps copies true."""
         return self.trust == "full" and not self.compass
 
     def effective(self) -> PriorConfig:

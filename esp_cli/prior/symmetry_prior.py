@@ -12,7 +12,7 @@ from esp_cli.prior.copies import Copies, Divergent
 from esp_cli.prior.gate import Gate, gated, moved_share
 from esp_cli.prior.seed_batch import Rows, SeedBatch
 from esp_cli.symmetry import Transform, carried_groups, transform_set
-from esp_cli.symmetry.admission import unrestricted
+from esp_cli.symmetry.admission import under_a_compass, unrestricted
 from esp_envs.spec import Spaces
 
 if TYPE_CHECKING:
@@ -54,7 +54,9 @@ class SymmetryPrior:
         self._stores = config.augments and replays and config.replay == "stored"
         self.augments = config.augments and not self._stores
         active = config.augments or config.coefficient > 0
-        admitting = spaces if config.needs_declaration else unrestricted(spaces)
+        admitting = spaces
+        if not config.needs_declaration:
+            admitting = under_a_compass(spaces) if config.compass else unrestricted(spaces)
         self.transforms = transform_set(config.transforms, admitting, device) if active else None
         if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
             raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")

@@ -13,9 +13,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from esp_cli.files.opening import read_regular
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.tables import TABLES
 
+_MOST_BYTES = 1 << 24
 _BLOCK = re.compile(
     r"^(<!-- results: (?P<files>\S+(?: \S+)*) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)",
     re.DOTALL | re.MULTILINE,
@@ -29,9 +31,12 @@ def filled(page: Path) -> str:
         ValueError: the page, a file or a table is not there, a file is damaged, or the page has no such comments.
     """
     try:
-        text = page.read_text(encoding="utf-8")
+        content = read_regular(page, _MOST_BYTES)
+        text = (content or b"").decode()
     except OSError as error:
         raise ValueError(f"cannot read {page}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{page} is no text in UTF-8; give a page of Markdown") from None
 
     def compute(match: re.Match[str]) -> str:
         name = match["table"]

@@ -125,6 +125,11 @@ def unrestricted(spaces: Spaces) -> Spaces:
     return replace(spaces, nearly=Factors("o2", True, exchangeable(spaces)).name)
 
 
+def under_a_compass(spaces: Spaces) -> Spaces:
+    """Return spaces whose agents see a compass and labels: whatever moves plane and agents holds, of items what did."""
+    return replace(spaces, nearly=Factors("o2", True, Factors.of(_usable(spaces)).items).name)
+
+
 def _carries(name: str, spaces: Spaces) -> bool:
     found = parse_elements(name, spaces.num_agents)
     return _reason(found.generators() if isinstance(found, Group) else found, spaces) is None

@@ -280,6 +280,10 @@ def _read(value: object) -> object:
         return value
 
 
+_LARGEST = 1e30
+"""Largest number that a setting takes: products of two still have room in float64, and one in float32."""
+
+
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
     """Build `model`, turning pydantic's report into one sentence.
 
@@ -294,8 +298,11 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
         taken = list(_numbers(getattr(built, name)))
         if any(not abs(number) < 2**63 for number in taken if not isinstance(number, float)):
             raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has more than 64 bits")
-        if not all(map(math.isfinite, taken)):
-            raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number")
+        if not all(abs(number) <= _LARGEST for number in taken):  # false for what is no number
+            raise ValueError(
+                f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number of at most "
+                f"{_LARGEST:g}"
+            )
         # pydantic takes true for 1
         if _count_flags(_numbers(value)) > _count_flags(taken):
             raise ValueError(f"bad value {json.dumps(value)} for '{section}.{name}': it has to be a number")

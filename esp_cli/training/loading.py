@@ -186,7 +186,11 @@ def _build(
     network = _at_default(config.network, "compiled")  # whoever uses a policy needs no compiler
     policy = build(spec, network, generators(config.seeds, "shape")).to(config.device).eval()
     _fill(policy, tensors, path, misfit)
-    return TrainedPolicy(config, policy, spec, step, path, notes, _stopped(meta, len(config.seeds)))
+    stopped = _stopped(meta, len(config.seeds))
+    if stopped:
+        seeds = ", ".join(str(config.seeds[k]) for k in stopped)
+        notes = (*notes, f"{path}: training of seed {seeds} stopped early on a number that is not finite")
+    return TrainedPolicy(config, policy, spec, step, path, notes, stopped)
 
 
 def _stopped(meta: Mapping[str, Any], seeds: int) -> tuple[int, ...]:

@@ -1,10 +1,11 @@
-"""The preset `fast` is the preset `default` of a task with the changes that its table states."""
+"""The preset `fast` is `default` with the changes that its table states; `paper` goes with the paper's tasks."""
 
 from __future__ import annotations
 
 import pytest
 
 from esp_cli.algorithms.presets import FAST, PRESETS, preset_layers
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
 
@@ -45,3 +46,11 @@ def test_a_learner_without_fast_settings_is_told_what_it_has(monkeypatch: pytest
     with pytest.raises(ValueError, match=r"^qmix has no preset 'fast'; it has default, paper$"):
         preset_layers("navigation", "qmix", "fast")
     assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"]]
+
+
+@pytest.mark.parametrize("task", ["navigation", "predator-prey", "formation"])
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_the_papers_settings_go_together_on_the_papers_tasks(task: str, algorithm: str) -> None:
+    small = {"mappo.num_envs": 1} if algorithm == "mappo" else {f"{algorithm}.replay_episodes": 32}
+    learner = build_learner(resolve_config(task, algorithm, "paper", seeds=(0,), overrides=small))
+    assert learner.policy.actor.memory_width == 64

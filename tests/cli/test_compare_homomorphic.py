@@ -145,3 +145,8 @@ def test_a_film_of_drones_and_poacher(tmp_path: Path) -> None:
     for name in ("film.gif", "film.png"):
         esp("render", tmp_path / "run", "-o", tmp_path / name, "--size", 64)
         assert (tmp_path / name).stat().st_size > 200
+
+
+def test_a_setting_that_an_option_says_is_refused() -> None:
+    told = refused("compare-homomorphic", "--drones", 4, "--set", "task.num_agents=2", "--dry-run")
+    assert told == "--drones and --grid say what task.num_agents is; leave --set task.num_agents out"

@@ -159,6 +159,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--set", "mappo.speed=1"], "unknown setting 'mappo.speed'; mappo has num_envs"),
         (["--set", "mappo.gamma=2"], "bad value 2 for 'mappo.gamma': input should be less than or equal to 1"),
         (["--set", "mappo.learning_rate=fast"], "bad value 'fast' for 'mappo.learning_rate'"),
+        (["--set", "mappo.huber_delta=1e39"], "it has to be a finite number of at most 1e+30"),
         (["--set", "mappo.learning_rate=Infinity"], "it has to be a finite number"),
         (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is not a setting"),
         (["--set", "task.prey=still"], "unknown setting 'task.prey'"),

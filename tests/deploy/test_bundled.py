@@ -7,6 +7,7 @@ import json
 import math
 import shlex
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,13 @@ def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
     for seed in (3, 7):
         (small / f"seed-{seed}.safetensors").unlink()
     manifest.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
+
+
+def test_a_seed_that_stopped_is_not_the_best_unless_all_did() -> None:
+    trained = drawn_policy("choice", seeds=(3, 7))
+    best = trained.config.seeds.index(best_seed(trained, 64))
+    assert best_seed(replace(trained, stopped=(best,)), 64) == trained.config.seeds[1 - best]
+    assert best_seed(replace(trained, stopped=(0, 1)), 64) == trained.config.seeds[best]
 
 
 @pytest.mark.parametrize(

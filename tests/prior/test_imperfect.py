@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -215,6 +216,15 @@ def test_the_compass_turns_with_every_element_and_no_two_elements_show_the_same(
     assert build_transform([mirror(0)], spec).obs(frame)[0, 0, -4:].tolist() == [1, 0, 0, -1]
     images = [tuple(build_transform([e], spec).obs(frame)[0, 0, -4:].tolist()) for e in parse_elements("d16", 3)]
     assert len(set(images)) == len(images) == 31
+
+
+def test_a_compass_tells_directions_and_agents_apart_but_no_items() -> None:
+    spec = replace(make("navigation", 1, [0]).spec, symmetry="d1", nearly="")
+    for declared, transforms in (("d1*landmarks-3", "landmarks-3"), ("d1", "rot90"), ("d1", "d4*agents")):
+        config = PriorConfig(transforms=transforms, compass=1.0)
+        assert SymmetryPrior(config, framed(replace(spec, symmetry=declared))).transforms is not None
+    with pytest.raises(ValueError, match="landmarks-3 cannot act on navigation"):
+        SymmetryPrior(PriorConfig(transforms="landmarks-3", compass=1.0), framed(spec))
 
 
 BROKEN = [{"wind": 0.3}, {"gust_mean": 1.0}, {"wind": 0.3, "gust_mean": 2.0}]

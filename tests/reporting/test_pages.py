@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 
@@ -91,3 +92,12 @@ def test_studies_that_do_not_go_together_are_refused(page):
     page.write_text(page.read_text().replace("a.json", "b.json", 1))
     with pytest.raises(ValueError, match="navigation-200-mappo-esp stands in two of the results files, with different"):
         filled(page)
+
+
+def test_a_page_that_is_none_is_told_in_one_sentence(tmp_path):
+    (tmp_path / "weights.md").write_bytes(b"\xf8\x00")
+    with pytest.raises(ValueError, match=r"weights.md is no text in UTF-8"):
+        filled(tmp_path / "weights.md")
+    os.mkfifo(tmp_path / "pipe.md")
+    with pytest.raises(ValueError, match=r"cannot read .*pipe.md: .*regular file"):
+        filled(tmp_path / "pipe.md")

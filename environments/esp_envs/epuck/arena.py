@@ -31,6 +31,8 @@ class Arena:
     pillar_radius_m: float
 
     def __post_init__(self) -> None:
+        if self.reach_m <= 0:
+            raise ValueError(f"a robot does not fit into an arena of {self.side_m:g} m; make it larger")
         gap = 4 * self.reach_m * 2 / max(self.num_robots, 1) - 2 * BODY_RADIUS_M
         if self.num_robots > 1 and gap < 0.1:
             raise ValueError(

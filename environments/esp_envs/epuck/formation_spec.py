@@ -69,8 +69,8 @@ class FormationSettings(TaskSettings):
     )
     arrival_radius_m: float = Setting(0.05, gt=0, description="r_arrival, distance at which a robot has arrived, m")
     start_noise_m: float = Setting(0.01, ge=0, le=0.01, description="posts are missed by up to this along x and y, m")
-    sensor_noise_m: float = Setting(0.0, ge=0, description="standard deviation of each seen coordinate, m")
-    heading_noise_rad: float = Setting(0.0, ge=0, description="standard deviation of the seen heading, rad")
+    sensor_noise_m: float = Setting(0.0, ge=0, le=1e3, description="standard deviation of each seen coordinate, m")
+    heading_noise_rad: float = Setting(0.0, ge=0, le=1e3, description="standard deviation of the seen heading, rad")
     action_delay: int = Setting(0, ge=0, le=20, description="control steps until a chosen action acts")
     wheel_mismatch: float = Setting(
         0.0, ge=0, le=0.5, description="standard deviation of each wheel's own factor on its speed, drawn per episode"

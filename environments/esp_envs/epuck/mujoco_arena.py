@@ -18,6 +18,7 @@ from esp_envs.epuck.physics import Bodies, Physics, num_substeps
 from esp_envs.epuck.robot import BODY_RADIUS_M, Array
 
 TIMESTEP_S = 0.01
+mujoco.set_mju_user_warning(lambda _: None)  # by default warnings go to a file in the working directory
 
 
 class MujocoWorlds(Physics):

@@ -57,6 +57,8 @@ def test_any_number_of_robots_starts_on_the_edge_and_its_goals_are_antipodal(rob
 def test_robots_or_pillars_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="16 robots do not fit around an arena"):
         make("formation", 1, [0], {"num_agents": 16, "arena_m": 0.5})
+    with pytest.raises(ValueError, match=r"a robot does not fit into an arena of 0.01 m"):
+        make("formation", 1, [0], {"num_agents": 1, "num_obstacles": 0, "arena_m": 0.01})
     with pytest.raises(ValueError, match=r"8 pillars of radius .* overlap"):
         make("formation", 1, [0], {"num_obstacles": 8, "obstacle_radius_m": 0.3})
     with pytest.raises(ValueError, match=r"pillars of radius 0.9 m reach the posts"):
