@@ -198,7 +198,7 @@ class Trainer:
         return row, seconds
 
     def _evaluate(self) -> dict[str, Tensor]:
-        """Play greedy and stochastic episodes; every seed's worlds depend on its seed and the step alone."""
+        """Play greedy and stochastic episodes; every seed's worlds depend on its seed, the step and the mode."""
         reach("evaluation")
         env, row = self._eval_env, {}
         for mode in ("greedy", "stochastic"):
