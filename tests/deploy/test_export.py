@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 import torch
 
+from esp_cli.commands import export as command
 from esp_cli.deploy import check, onnx_file
 from esp_cli.deploy.c_source import c_source
 from esp_cli.deploy.check import compare, take_sample
-from esp_cli.deploy.export import WRITERS, export
+from esp_cli.deploy.export import export
+from esp_cli.deploy.formats import FORMATS
 from esp_cli.deploy.layers import Affine, Recurrent
 from esp_cli.deploy.runtime.numpy_policy import NumpyPolicy
 from esp_cli.deploy.translate import program_of
@@ -179,7 +181,7 @@ def test_the_worked_example_in_c_fails_where_the_weights_are_others(tmp_path: Pa
 
 def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
     alone = drawn_policy("wheel pairs")
-    export(alone, [name for name in WRITERS if name != "torch"], tmp_path)
+    export(alone, [name for name in FORMATS if name != "torch"], tmp_path)
     said = json.loads((tmp_path / "policy.json").read_text())
     fields = [(row["index"], row["field"], row["unit"]) for row in said["observation"]]
     assert fields == [
@@ -228,3 +230,7 @@ def test_what_is_in_the_way_is_not_written_over(tmp_path: Path) -> None:
 def test_robots_take_policies_of_formation_alone(kind: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="drive e-pucks, but this policy is for navigation"):
         export(drawn_policy(kind), ["webots"], tmp_path)
+
+
+def test_the_command_lists_every_format() -> None:
+    assert (*FORMATS, "policy") == command.FORMATS
