@@ -189,6 +189,11 @@ class Learner(ABC):
             if name in self.modules:
                 self.modules[name].load_state_dict(policy)
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether it took any gradient step; one that first fills a replay may not have."""
+        return True
+
     def bytes_to_come(self, steps: int) -> int:
         """Return by how many bytes the state of a run will grow over its steps per seed: by what a replay collects."""
         return 0

@@ -211,6 +211,11 @@ class OffPolicyLearner(Learner):
         """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""
         return {}
 
+    @property
+    def has_learned(self) -> bool:
+        """Whether the warm-up is over."""
+        return self.updates > 0
+
     def bytes_to_come(self, steps: int) -> int:
         """Return by how many bytes the replay will grow; see `Learner.bytes_to_come`."""
         episodes = min(self.replay.capacity, steps // self.spec.horizon * (1 + self.prior.num_stored))

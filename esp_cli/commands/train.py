@@ -247,7 +247,7 @@ def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
     caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
-    if not getattr(trainer.learner, "updates", 1):
+    if not trainer.learner.has_learned:
         console.note(
             "nothing was learned: the run ended within its warm-up; take more --steps or fewer warmup_episodes"
         )

@@ -281,7 +281,7 @@ def _read(value: object) -> object:
 
 
 _LARGEST = 1e30
-"""Largest number that a setting takes: products of two still have room in float64, and one in float32."""
+"""Largest number that a setting takes; float32, in which most of them are used, ends at 3.4e38."""
 
 
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:

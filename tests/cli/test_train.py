@@ -348,3 +348,11 @@ def test_two_equal_command_lines_give_equal_runs(finished: Path, tmp_path: Path)
 def test_a_moved_run_goes_on_in_its_new_place(copied: Path, tmp_path: Path) -> None:
     shutil.move(copied, tmp_path / "moved")
     assert "is complete" in esp("train", "--resume", tmp_path / "moved").stderr
+
+
+def test_a_run_that_ends_within_its_warm_up_says_so(tmp_path: Path) -> None:
+    words = ("train", "--algo", "qmix", "--set", "qmix.num_envs=1", "--set", "evaluation.episodes=1", "--steps")
+    warm = "nothing was learned: the run ended within its warm-up"
+    assert warm in esp(*words, 100, "--out", tmp_path / "short").stderr
+    longer = ("--set", "qmix.warmup_episodes=1", "--set", "qmix.batch_episodes=1", "--set", "network.hidden=[8]")
+    assert warm not in esp(*words, 100, *longer, "--out", tmp_path / "longer").stderr
