@@ -129,6 +129,7 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
 
     Raises:
         RuntimeError: they do not agree, which is a bug.
+        ValueError: they cannot agree, since the rounding of the observations moves the outputs as far.
     """
     action, outputs, after = runner(sample.obs, sample.memory, sample.mask)
     largest = max(1.0, float(np.abs(sample.outputs).max()))
@@ -145,9 +146,21 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
     if sample.after.size:
         gap = max(gap, float(np.abs(after[same] - sample.after[same]).max()))
     if not gap <= TOLERANCE * largest or not ties:
+        _refuse_ill_conditioned(sample, runner, outputs, max(gap / 10, TOLERANCE * largest))
         raise RuntimeError(f"the export differs from the policy by {gap:g} of {largest:g}; this is a bug")
     others = int(differing.sum()) if sample.action.dtype.kind == "i" else None
     return Agreement(len(sample.obs), gap, others)
+
+
+def _refuse_ill_conditioned(sample: Sample, runner: Runner, outputs: Floats, most: float) -> None:
+    """Raise a ValueError where the rounding of float32 in observations moves an output by more than `most`."""
+    rounded = np.nextafter(sample.obs, np.float32(np.inf))
+    moved = float(np.abs(runner(rounded, sample.memory, sample.mask)[1] - outputs).max())
+    if moved > most:
+        raise ValueError(
+            f"the policy says {moved:g} more or less for observations that differ by the rounding of float32, so no "
+            "export can agree with it; train it with a smaller learning rate"
+        )
 
 
 def numpy_runner(file: Path) -> Runner:

@@ -234,3 +234,16 @@ def test_robots_take_policies_of_formation_alone(kind: str, tmp_path: Path) -> N
 
 def test_the_command_lists_every_format() -> None:
     assert (*FORMATS, "policy") == command.FORMATS
+
+
+def test_a_policy_that_the_rounding_of_its_observations_moves_is_no_bug_of_the_export() -> None:
+    sample = take_sample(alone := drawn_policy("choice"), program_of(alone.policy), 100)
+    seen = sample.obs.copy()
+
+    def steep(obs: np.ndarray, memory: np.ndarray, mask: np.ndarray | None) -> tuple:
+        return sample.action, sample.outputs + 1 + 1e6 * (obs - seen)[:, :1], sample.after
+
+    with pytest.raises(ValueError, match="differ by the rounding of float32, so no export can agree"):
+        compare(sample, steep)
+    with pytest.raises(RuntimeError, match="this is a bug"):
+        compare(sample, lambda obs, memory, mask: (sample.action, sample.outputs + 1, sample.after))
