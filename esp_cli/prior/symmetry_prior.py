@@ -85,8 +85,11 @@ class SymmetryPrior:
         if self.config.trust == "full":
             return [1.0] * len(names)
         if set(self.config.weights) != set(names) and names:
-            told, trust = ", ".join(names), self.config.trust
-            raise ValueError(f"prior.trust is {trust}, but prior.weights does not weigh just these elements: {told}")
+            told = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+            raise ValueError(
+                f"prior.trust is {self.config.trust}, but prior.weights does not weigh just these elements: {told}; "
+                "weigh each, or have them weighed by --set prior.weights={}"
+            )
         return [self.config.weights[name] for name in names]
 
     @property
