@@ -195,7 +195,7 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
         return f"unknown setting '{name}'; {owner or section or 'it'} has {', '.join(model.model_fields)}"
     if first["type"] == "missing":
         return f"the setting '{name}' is missing"
-    if not first["loc"]:  # of settings that do not go together
+    if not first["loc"] and isinstance(first["input"], Mapping):  # settings that do not go together
         return f"bad settings{f' for {section}' if section else ''}: {own_words(first['msg'])}"
     message = "it has to be a list, as [64,64]" if first["type"] == "tuple_type" else own_words(first["msg"])
     return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
