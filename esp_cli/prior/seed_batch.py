@@ -48,7 +48,7 @@ class SeedBatch:
     @property
     def mask(self) -> Tensor | None:
         """[S, B, T] which rows count, or [S, B, T, N] of which agents; None where all do."""
-        return self.alive
+        return self.played if self.alive is None else self.alive
 
     @property
     def played(self) -> Tensor | None:

@@ -45,7 +45,7 @@ def test_a_learner_without_fast_settings_is_told_what_it_has(monkeypatch: pytest
     monkeypatch.setitem(FAST, "qmix", {})
     with pytest.raises(ValueError, match=r"^qmix has no preset 'fast'; it has default, paper$"):
         preset_layers("navigation", "qmix", "fast")
-    assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"]]
+    assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"], {}]
 
 
 @pytest.mark.parametrize("task", ["navigation", "predator-prey", "formation"])

@@ -25,7 +25,7 @@ class Masked(SeedBatch):
     """Rows of which the last of every seed does not count."""
 
     @property
-    def mask(self):
+    def played(self):
         mask = torch.ones(self.obs.shape[:3], dtype=torch.bool)
         mask[:, -1] = False
         return mask
