@@ -107,7 +107,12 @@ def test_an_interrupt_in_the_middle_of_an_import_leaves_at_once(tmp_path: Path) 
     words = [sys.executable, "-m", "esp_cli", "train", "--task", "slow:Task"]
     paths = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
     process = subprocess.Popen(
-        words, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True
+        words,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
     )
     while not (tmp_path / "begun").exists():
         assert process.poll() is None
