@@ -104,15 +104,12 @@ def test_an_interrupt_in_the_middle_of_an_import_leaves_at_once(tmp_path: Path) 
         "import pathlib, time\npathlib.Path('begun').touch()\n"
         "try:\n    time.sleep(60)\nexcept BaseException:\n    pass\n"
     )
-    words = [sys.executable, "-m", "esp_cli", "train", "--task", "slow:Task"]
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"  # a background job ignores it
+    start = f"{heard}; from esp_cli.__main__ import main; main()"
+    words = [sys.executable, "-c", start, "train", "--task", "slow:Task"]
     paths = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
     process = subprocess.Popen(
-        words,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": paths},
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job ignores it
+        words, cwd=tmp_path, env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True
     )
     while not (tmp_path / "begun").exists():
         assert process.poll() is None
