@@ -282,11 +282,10 @@ class Mappo(Learner):
             "kl": ratio - 1 - log_ratio,
             "entropy": head.entropy(outputs),
             "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon),
-            "value_loss": value_loss(values, batch.target, config.huber_delta, old_value, config.clip_epsilon),
         }
-        masks = {"value_loss": batch.valued(self.num_values)}
-        means = {name: mean_per_seed(part, masks.get(name, batch.mask)) for name, part in parts.items()}
-        _add(sums, weight, **means)
+        error = value_loss(values, batch.target, config.huber_delta, old_value, config.clip_epsilon)
+        means = {name: mean_per_seed(part, batch.mask) for name, part in parts.items()}
+        _add(sums, weight, **means, value_loss=mean_per_seed(error, batch.valued(self.num_values)))
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""

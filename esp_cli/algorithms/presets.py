@@ -1,8 +1,9 @@
 """Presets: what `--preset` and the task change in the defaults of an algorithm, a network, the prior and evaluation.
 
 `PRESETS` holds settings by algorithm, preset and section. `TUNED` holds what the preset `default` changes on a task:
-the settings that measured best there. `FAST` holds what the preset `fast` changes in `default` on a task: fewer
-seconds to the same return. A setting that no table names keeps the default of its config class.
+the settings that measured best there; `PAPER` is the same for the preset `paper`. `FAST` holds what the preset `fast`
+changes in `default` on a task: fewer seconds to the same return. A setting that no table names keeps the default of its
+config class.
 """
 
 from __future__ import annotations

@@ -67,8 +67,8 @@ def _discovery(
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
-    register_named([task, None if Path(what).exists() else what])
     path = Path(what)
+    register_named([task, None if path.exists() else what])
     if path.suffix == ".npz" or path.is_file():
         if settings and task is None:
             raise ValueError(f"--set is for a task, and {what} is a file; add --task, or leave --set out")

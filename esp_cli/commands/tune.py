@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuner import Outcome, Trials
     from esp_cli.studies.tuning import Goal, Tuning
+    from esp_cli.studies.tuning_forecast import SearchForecast
 
 EPILOG = """Examples:\n
     esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
@@ -208,10 +209,13 @@ def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, out
         ]
     found = {name: sum(getattr(one, name) for one in searches) for name in ("likely_s", "at_most_s", "disk_bytes")}
     found["disk_peak_bytes"] = found["disk_bytes"] + jobs * max(one.peak_bytes for one in searches)
-    if json is not None:
-        console.write_json(json, {"command": tuning.command, "searches": searches, **found, "jobs": jobs})
-    if json == "-":
-        return
+    document = {"command": tuning.command, "searches": searches, **found, "jobs": jobs}
+    console.result(json, document, lambda: _print_forecast(searches, found, tuning.command, jobs, out))
+
+
+def _print_forecast(
+    searches: Sequence[SearchForecast], found: Mapping[str, Any], title: str, jobs: int, out: Path
+) -> None:
     rows = [
         (
             one.prior,
@@ -221,7 +225,7 @@ def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, out
         )
         for one in searches
     ]
-    console.table(("prior", "trials>", "default>", "mean>", "longest>", "settings"), rows, title=tuning.command)
+    console.table(("prior", "trials>", "default>", "mean>", "longest>", "settings"), rows, title=title)
     console.say(
         f"on one core about {console.format_duration(found['likely_s'])} if pruning saves half of the steps, at most "
         f"{console.format_duration(found['at_most_s'])}, the best settings on fresh seeds included; {jobs} runs side "

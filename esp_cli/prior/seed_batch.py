@@ -52,7 +52,7 @@ class SeedBatch:
 
     @property
     def played(self) -> Tensor | None:
-        """[S, B, T] which rows belong to an episode, whoever lives in them; None where all do."""
+        """[S, B, T] which rows belong to an episode; None where all do."""
         return None
 
     def valued(self, count: int) -> Tensor | None:
