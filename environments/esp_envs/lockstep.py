@@ -222,7 +222,6 @@ class BatchedTask(LockstepTask):
 
 def to_others(position: Tensor) -> Tensor:
     """Return where each agent sees each other agent, in index order: [..., N, N - 1, w] from positions [..., N, w]."""
-    count = position.shape[-2]
-    each = [[j for j in range(count) if j != i] for i in range(count)]
-    others = torch.tensor(each, dtype=torch.long, device=position.device)  # of one agent there is no number to tell
+    index = torch.arange(position.shape[-2], device=position.device)
+    others = index[:-1] + (index[:-1] >= index.unsqueeze(-1))
     return position[..., others, :] - position.unsqueeze(-2)

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from esp_cli.algorithms.learner import Learner
@@ -67,6 +68,24 @@ class NoWaiting(TorchDispatchMode):
         return func(*args, **given)
 
 
+class NothingSent(TorchFunctionMode):
+    """Refuse tensors that are made on the device from numbers of Python; dispatch does not see them."""
+
+    def __torch_function__(
+        self, func: Any, _: Sequence[type], args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        given = dict(kwargs or {})
+        assert func not in (torch.tensor, torch.as_tensor) or given.get("device") != META, WAITED
+        return func(*args, **given)
+
+
+@contextmanager
+def no_waiting() -> Iterator[None]:
+    """Refuse all that a GPU would be waited for."""
+    with NoWaiting(), NothingSent():
+        yield
+
+
 @pytest.fixture
 def meta(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the device stand in for a GPU."""
@@ -89,7 +108,7 @@ def learner(task: str, algorithm: str, device: str, **others: object) -> Learner
 def test_an_iteration_reads_nothing_back(algorithm: str, task: str) -> None:
     with NoWaiting(copies=True):
         trained = learner(task, algorithm, "meta")
-    with NoWaiting():
+    with no_waiting():
         trained.iterate(0.0)
         result = trained.iterate(0.5)
     assert result.finite.device == META, "else this test would say nothing"
@@ -102,7 +121,7 @@ def test_nor_does_one_with_memory_or_all_copies(name: str) -> None:
     others: dict[str, object] = {"network.name": name, "prior.copies": "all", "prior.transforms": "c4"}
     with NoWaiting(copies=True):
         trained = learner("navigation", "mappo", "meta", **others)
-    with NoWaiting():
+    with no_waiting():
         result = trained.iterate(0.0)
     assert result.finite.device == META, "else this test would say nothing"
 
@@ -117,17 +136,18 @@ READS: Mapping[str, Callable[[torch.Tensor], object]] = {
     "a copy": lambda x: x.cpu(),
     "a copy from the processor": lambda x: torch.ones(3).to(x.device),
     "numbers written from the processor": lambda x: x.copy_(torch.ones(3)),
+    "numbers of Python": lambda x: x * torch.tensor([1.0, 2.0, 3.0], device=x.device),
 }
 
 
 @pytest.mark.parametrize("what", READS)
 def test_reading_back_is_found(what: str) -> None:
-    with NoWaiting(), pytest.raises((RuntimeError, NotImplementedError, AssertionError)):
+    with no_waiting(), pytest.raises((RuntimeError, NotImplementedError, AssertionError)):
         READS[what](torch.empty(3, device=META))
 
 
 def test_what_is_queued_is_not_refused() -> None:
-    with NoWaiting():
+    with no_waiting():
         x = torch.ones(3).to(META, non_blocking=True)
         assert torch.where(x > 0, x, 0.0).sum().device == META
 

@@ -1,6 +1,6 @@
 """Measure how fast MAPPO trains, and what share of the machine's own matrix rate that is.
 
-    python tests/benchmarks/train_speed.py [--seeds 10 --seeds 1] [--threads 2] [--json speed.json]
+    python tests/benchmarks/train_speed.py [--seeds 10 --seeds 1] [--threads 2] [--device cuda] [--json speed.json]
 
 A seed-step is one environment step of one seed. The floating-point work is counted, not guessed: the matrix products of
 actor and critic, forward and backward, in the rollout and in all epochs (a product with an [in, out] matrix is
@@ -58,34 +58,36 @@ def flops_per_step(learner: Mappo) -> float:
     return work
 
 
-def matrix_rate(seeds: int, rows: int, precision: str, repeats: int = 20) -> float:
+def matrix_rate(seeds: int, rows: int, precision: str, device: str, repeats: int = 20) -> float:
     """Measure the operations per second of [seeds, rows, 64] x [seeds, 64, 64]."""
-    dtype = getattr(torch, precision)
-    a, b = torch.randn(seeds, rows, 64).to(dtype), torch.randn(seeds, 64, 64).to(dtype)
+    kind = {"dtype": getattr(torch, precision), "device": device}
+    a, b = torch.randn(seeds, rows, 64, **kind), torch.randn(seeds, 64, 64, **kind)
     times = []
     for _ in range(repeats):
         begin = time.perf_counter()
         torch.bmm(a, b)
+        if device == "cuda":
+            torch.cuda.synchronize()
         times.append(time.perf_counter() - begin)
     return 2.0 * seeds * rows * 64 * 64 / min(times)
 
 
-def measure(name: str, seeds: int, iterations: int) -> dict[str, object]:
+def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, object]:
     """Time `iterations` iterations of one case."""
-    learner = build_learner(resolve_config("navigation", seeds=range(seeds), overrides=CASES[name]))
+    learner = build_learner(resolve_config("navigation", seeds=range(seeds), overrides=CASES[name], device=device))
     assert isinstance(learner, Mappo)
-    learner.iterate(0.0)
+    learner.iterate(0.0).finite.tolist()
     times = []
     for _ in range(iterations):
         begin = time.perf_counter()
-        learner.iterate(0.0)
+        learner.iterate(0.0).finite.tolist()  # until a GPU has computed it
         times.append(time.perf_counter() - begin)
     steps = seeds * learner.steps_per_iteration
     rates = [steps / seconds for seconds in times]
     work = flops_per_step(learner)
     precision = CASES[name].get("network.precision", "float32")
     rows = learner.config.chunk_steps // seeds * learner.spec.num_agents
-    machine = matrix_rate(seeds, rows, str(precision))
+    machine = matrix_rate(seeds, rows, str(precision), device)
     return {
         "case": name,
         "seeds": seeds,
@@ -103,22 +105,25 @@ def main() -> None:
     parser.add_argument("--case", action="append", choices=list(CASES), help="what to measure; by default all")
     parser.add_argument("--seeds", action="append", type=int, help="number of seeds; may be given several times")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--iterations", type=int, default=7)
     parser.add_argument("--json", type=Path, help="also write the records to this file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    table = Table(title=f"MAPPO on navigation, {args.threads} thread(s)")
+    where = f"{args.threads} thread(s)" if args.device == "cpu" else args.device
+    table = Table(title=f"MAPPO on navigation, {where}")
     for heading in ("case", "seeds", "seed-steps/s (median)", "most", "MFLOP/step", "machine GFLOP/s", "share"):
         table.add_column(heading, justify="left" if heading == "case" else "right")
     records = []
     for name in args.case or CASES:
         for seeds in args.seeds or (10, 1):
-            records.append(record := measure(name, seeds, args.iterations))
+            records.append(record := measure(name, seeds, args.iterations, args.device))
             numbers = [f"{float(str(record[key])):,.{digits}f}" for key, digits in COLUMNS]
             table.add_row(name, str(seeds), *numbers, f"{float(str(record['share_of_matrix_rate'])):.0%}")
     Console(width=140).print(table)
     if args.json:
-        args.json.write_text(json.dumps({"threads": args.threads, "records": records}, indent=2) + "\n")
+        content = {"device": args.device, "threads": args.threads, "records": records}
+        args.json.write_text(json.dumps(content, indent=2) + "\n")
 
 
 COLUMNS = (("seed_steps_per_second", 0), ("most", 0), ("mflop_per_step", 2), ("machine_gflops", 0))

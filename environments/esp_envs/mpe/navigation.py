@@ -129,7 +129,7 @@ class Navigation(ParticleTask):
             contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
             watched=tuple((a, agents + k) for a in range(agents) for k in range(landmarks)),
         )
-        self._extents = (1.0,) * agents + (settings.extent,) * landmarks
+        self._extents = torch.tensor((1.0,) * agents + (settings.extent,) * landmarks, device=self.device)
         self._build(_spec(settings), bodies, (SENSITIVITY,) * agents)
         self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
         # [N, pairs]: which agents take part in which pair

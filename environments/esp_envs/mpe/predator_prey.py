@@ -112,7 +112,7 @@ class PredatorPrey(ParticleTask):
             max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
             contacts=(*touches, *shoves, *bumps),
         )
-        self._extents = (1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles
+        self._extents = torch.tensor((1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles, device=self.device)
         self._prey_learns = settings.control == "prey"
         first_learner = predators if self._prey_learns else 0
         self._build(predator_prey_spec(settings), bodies, full_gain, first_learner)

@@ -255,16 +255,15 @@ def unit_disc(wish: Tensor) -> Tensor:
     return wish / wish.norm(dim=1, keepdim=True).clamp_min(1.0)
 
 
-def place(worlds: ParticleWorlds, lanes: slice, extents: Sequence[float], generator: torch.Generator) -> None:
+def place(worlds: ParticleWorlds, lanes: slice, extents: Tensor, generator: torch.Generator) -> None:
     """Draw the position of every entity of the worlds `lanes` uniformly from its own square.
 
     Args:
         worlds: where to write.
         lanes: the worlds of one seed.
-        extents: half side of the square of each entity, agents first.
+        extents: [entities], half side of the square of each, agents first.
         generator: that seed's generator.
     """
-    device = worlds.physics.device
     shape = (len(extents), 2, lanes.stop - lanes.start)
-    unit = torch.rand(shape, generator=generator, device=device).mul_(2).sub_(1)
-    worlds.entity[:, :, lanes] = unit * torch.tensor(extents, device=device).view(-1, 1, 1)
+    unit = torch.rand(shape, generator=generator, device=extents.device).mul_(2).sub_(1)
+    worlds.entity[:, :, lanes] = unit * extents.view(-1, 1, 1)
