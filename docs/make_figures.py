@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from esp_cli.evaluation.curve_statistics import median_steps
-from esp_cli.reporting.page import draw_over_strength
+from esp_cli.reporting.page import draw_over_coefficient, draw_over_strength
 from esp_cli.reporting.plots import Group, appearance, dots
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.summary import floats
@@ -133,7 +133,7 @@ def draw(ax: Axes, panel: Panel) -> None:
 
 
 def draw_results() -> None:
-    """Draw the returns of the ablations, and those over the strength of breaking, from their results."""
+    """Draw the returns of the ablations, over the coefficient and over the strength of breaking, from their results."""
     for name, picture in RESULTS.items():
         results = read_results(MEASURED / f"{name}.json")
         for panel in dict.fromkeys(cell.panel for cell in results.cells):
@@ -153,6 +153,9 @@ def draw_results() -> None:
         title = f"{picture.removeprefix('tuned-').capitalize()}, tuned and default settings"
         _, svg = dots(groups, MEASURED / picture, title, f"{searches[0].mode} return")
         svg.unlink()
+    weights = MEASURED / "ablate-coefficient"
+    ((_, svg),) = draw_over_coefficient(read_results(weights.with_suffix(".json")), weights)
+    svg.unlink()
     for picture, parts in BREAKING.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
         for _, svg in draw_over_strength(whole, MEASURED / picture):

@@ -149,31 +149,38 @@ def _pictures(material: Material, panels: Sequence[Panel], out: Path) -> Picture
     pictures = [curve_panels(panels, out / CURVES, label)]
     if results.rows == "panels":
         return pictures
+    if over_strength := draw_over_strength(results, out / "breaking"):
+        return [*pictures, *over_strength]
+    if results.kind == "ablate-coefficient":
+        return [*pictures, *draw_over_coefficient(results, out / "coefficient")]
+    for k, (panel, own) in enumerate(_finished(results).items()):
+        groups = [Group(variant, floats(cell.returns[results.mode])) for variant, cell in own.items()]
+        anchors = {key: round(value, 1) for key, value in next(iter(own.values())).anchors.items()}
+        pictures.append(dots(groups, out / f"returns-{k + 1}", panel, label, anchors))
+    return pictures
+
+
+def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
+    """Return the cells whose seeds all have a return, by panel and variant."""
     finished: dict[str, dict[str, CellResult]] = {}
     for cell in results.cells:
         if cell.returns and None not in cell.returns[results.mode]:
             finished.setdefault(cell.panel, {})[cell.variant] = cell
-    values = {
-        panel: {variant: floats(cell.returns[results.mode]) for variant, cell in own.items()}
-        for panel, own in finished.items()
-    }
-    if over_strength := draw_over_strength(results, out / "breaking"):
-        return [*pictures, *over_strength]
-    if results.kind == "ablate-coefficient":
-        lines = [
-            Sensitivity(panel, values[panel], {v: c.paper[0] for v, c in own.items() if c.paper})
-            for panel, own in finished.items()
-        ]
-        title, weights = "Return over the weight of the consistency loss", [cell.variant for cell in results.cells]
-        return [
-            *pictures,
-            *([sensitivity(lines, out / "coefficient", title, "weight", label, weights)] if lines else []),
-        ]
-    for k, (panel, own) in enumerate(finished.items()):
-        groups = [Group(variant, numbers) for variant, numbers in values[panel].items()]
-        anchors = {key: round(value, 1) for key, value in next(iter(own.values())).anchors.items()}
-        pictures.append(dots(groups, out / f"returns-{k + 1}", panel, label, anchors))
-    return pictures
+    return finished
+
+
+def draw_over_coefficient(results: Results, out: Path) -> Pictures:
+    """Draw the return over the weight of the consistency loss, one line for each panel, into the picture `out`."""
+    lines = [
+        Sensitivity(
+            panel,
+            {variant: floats(cell.returns[results.mode]) for variant, cell in own.items()},
+            {variant: cell.paper[0] for variant, cell in own.items() if cell.paper},
+        )
+        for panel, own in _finished(results).items()
+    ]
+    title, weights = "Return over the weight of the consistency loss", [cell.variant for cell in results.cells]
+    return [sensitivity(lines, out, title, "weight", f"{results.mode} return", weights)] if lines else []
 
 
 def draw_over_strength(results: Results, out: Path) -> Pictures:
