@@ -28,6 +28,7 @@ RESULTS = {
     "ablate-modules": "ablate-modules",
     "ablate-transforms": "ablate-transforms",
     "ablate-transforms-mappo": "ablate-transforms",
+    "ablate-transforms-qmix": "ablate-transforms",
 }
 """Results in docs/measured -> their figures, of which each learner has one."""
 BREAKING = {
