@@ -74,6 +74,11 @@ class Items(Enum):
     AGENTS = "agents"
 
 
+def others_of(num_agents: int) -> list[list[int]]:
+    """Return for each agent the others, in the order of `Items.OTHERS`: N lists of N - 1."""
+    return [[other for other in range(num_agents) if other != agent] for agent in range(num_agents)]
+
+
 @dataclass(frozen=True)
 class Field:
     """A run of numbers of one kind: `count` items of `item_width` numbers each, item after item.

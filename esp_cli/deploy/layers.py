@@ -181,11 +181,6 @@ class MessageAggregation(Fixed):
         return math.sqrt(self.reach_squared)
 
     @property
-    def others(self) -> list[list[int]]:
-        """For each agent the others, in their order."""
-        return [[j for j in range(self.team) if j != i] for i in range(self.team)]
-
-    @property
     def flops(self) -> int:
         """Per other agent: distance (3), comparison, count, and two operations per number of position and features."""
         return (self.team - 1) * (9 + 2 * self.width) + 4

@@ -13,6 +13,7 @@ from esp_cli import __version__
 from esp_cli.deploy import layers
 from esp_cli.deploy.program import Program
 from esp_envs.extras import install
+from esp_envs.spec import others_of
 
 OPSET = 17
 """The first with layer normalisation; runtimes since 2022 read it."""
@@ -167,7 +168,7 @@ class _Graph:
         count = self.node("Add", [self.reduce("ReduceSum", near, 1, keepdims=1), one])
         share = self.node("Div", [near, count])  # [rows, N - 1, 1]
         mean_way = self.reduce("ReduceSum", self.node("Mul", [share, self.node("Div", [ways, reach])]), 1)
-        index = self.constant(np.array(layer.others, np.int64))
+        index = self.constant(np.array(others_of(layer.team), np.int64))
         said = self.node("Gather", [self.reshape(x, -1, layer.team, layer.width), index], axis=1)
         said = self.reshape(said, -1, others, layer.width)
         heard = self.reduce("ReduceSum", self.node("Mul", [share, said]), 1)

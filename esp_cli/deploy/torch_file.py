@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from esp_cli.deploy import layers
 from esp_cli.deploy.program import Program
 from esp_cli.networks.heads import masked
+from esp_envs.spec import others_of
 
 
 class TorchProgram(nn.Module):
@@ -103,7 +104,7 @@ def _aggregate(x: Tensor, observation: Tensor, layer: layers.MessageAggregation)
     ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
     near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()
     share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
-    said = x.unflatten(0, (-1, layer.team))[:, torch.tensor(layer.others)].flatten(0, 1)
+    said = x.unflatten(0, (-1, layer.team))[:, torch.tensor(others_of(layer.team))].flatten(0, 1)
     return torch.cat([x, (share * (ways / layer.reach)).sum(1), (share * said).sum(1)], 1)
 
 

@@ -24,7 +24,7 @@ from esp_cli.networks.layers import GAINS
 from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
-from esp_envs.spec import Field, Items, Kind, Layout
+from esp_envs.spec import Field, Items, Kind, Layout, others_of
 
 CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
 """Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
@@ -210,9 +210,8 @@ class MessagePassing(Memoryless):
             block = following
         self.layers = nn.ModuleList(layers)
         self.head = ConstrainedLinear(generators, [block], io.outputs(self.group), output_gain)
-        index = [[j for j in range(self.team) if j != i] for i in range(self.team)]
         self.index: Tensor
-        self.register_buffer("index", torch.tensor(index), False)
+        self.register_buffer("index", torch.tensor(others_of(self.team)), False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, W * N, D] to [S, W * N, out]; the N rows of a world are adjacent."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Discrete, Spaces, others_of
 
 _WIDEST_PAIRS = 48
 """Up to so many numbers of one agent, products of two of them are looked at too."""
@@ -40,8 +40,7 @@ def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
 
 def orders_of_others(num_agents: int) -> list[list[int]]:
     """Return who is each agent's first other, second other and so on, in index order: N - 1 lists of N agents."""
-    each = ([j for j in range(num_agents) if j != i] for i in range(num_agents))
-    return [list(order) for order in zip(*each, strict=True)]
+    return [list(order) for order in zip(*others_of(num_agents), strict=True)]
 
 
 def _columns(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:

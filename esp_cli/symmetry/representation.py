@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from esp_cli.symmetry.elements import Element, Floats, Indices, item_places, places_of
-from esp_envs.spec import Discrete, Field, Items, Layout, Spaces
+from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, others_of
 
 _MATCH_TOLERANCE = 1e-6
 
@@ -231,7 +231,7 @@ def _old_slots(field: Field, came_from: Indices) -> Indices:
         _require_count(field, num_agents)
         return np.broadcast_to(came_from[:, None, :], shape)
     _require_count(field, num_agents - 1)
-    others = np.array([[j for j in range(num_agents) if j != i] for i in range(num_agents)], dtype=np.int64)
+    others = np.array(others_of(num_agents), dtype=np.int64)
     described = came_from[:, others.reshape(num_agents, -1)]
     # The observer is left out of its own list, so agents after it sit one slot earlier.
     return described - (described > came_from[:, :, None])

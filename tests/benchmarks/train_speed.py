@@ -1,12 +1,14 @@
-"""Measure how fast MAPPO trains, and what share of the machine's own matrix rate that is.
+"""Measure how fast learners train on navigation, and what share of the machine's own matrix rate MAPPO has.
 
-    python tests/benchmarks/train_speed.py [--seeds 10 --seeds 1] [--threads 2] [--device cuda] [--json speed.json]
+    python tests/benchmarks/train_speed.py [--cases 'qmix*' ...] [--seeds 10 1] [--threads 2] [--device cuda]
+                                           [--json speed.json]
 
-A seed-step is one environment step of one seed. The floating-point work is counted, not guessed: the matrix products of
-actor and critic, forward and backward, in the rollout and in all epochs (a product with an [in, out] matrix is
-2 in out operations a row; backward costs it once more for the weight and, behind the first layer, once for the input).
-The machine's matrix rate is measured in the same process on the largest product of an update. Each figure is the median
-of several iterations (collect and update) after a warm-up; where other programs use the machine, look at the most.
+A seed-step is one environment step of one seed. MADDPG and QMIX take one gradient step on 32 episodes per collected
+episode. MAPPO's floating-point work is counted, not guessed: the matrix products of actor and critic, forward and
+backward, in the rollout and in all epochs (a product with an [in, out] matrix is 2 in out operations a row; backward
+costs it once more for the weight and, behind the first layer, once for the input). The machine's matrix rate is
+measured in the same process on the largest product of an update. Each figure is the median of several iterations
+(collect and update) after a warm-up; where other programs use the machine, look at the most.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import argparse
 import json
 import statistics
 import time
+from fnmatch import fnmatch
 from pathlib import Path
 
 from esp_cli import machine
@@ -29,20 +32,31 @@ from esp_cli.algorithms.mappo import Mappo
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
-PEER_LAYOUT = {
+PEER_LAYOUT: dict[str, object] = {
     "mappo.num_envs": 128,
     "mappo.num_minibatches": 1,
     "mappo.num_epochs": 10,
     "network.activation": "relu",
 }
 """128 worlds x 25 steps, 10 epochs x 1 minibatch, MLP 64-64: the layout in which MAPPO implementations are compared."""
-CASES: dict[str, dict[str, object]] = {
-    "128 x 25, 10 x 1, plain": PEER_LAYOUT | {"prior.kind": "none"},
-    "128 x 25, 10 x 1, plain, bfloat16": PEER_LAYOUT | {"prior.kind": "none", "network.precision": "bfloat16"},
-    "default, plain": {"prior.kind": "none"},
-    "default, esp": {},
-    "default, esp, bfloat16": {"network.precision": "bfloat16"},
+PLAIN: dict[str, object] = {"prior.kind": "none"}
+BFLOAT16: dict[str, object] = {"network.precision": "bfloat16"}
+GRU: dict[str, object] = {"network.name": "gru"}
+CASES: dict[str, tuple[str, dict[str, object]]] = {
+    "mappo 128 x 25, 10 x 1, plain": ("mappo", PEER_LAYOUT | PLAIN),
+    "mappo 128 x 25, 10 x 1, plain, bfloat16": ("mappo", PEER_LAYOUT | PLAIN | BFLOAT16),
+    "mappo default, plain": ("mappo", PLAIN),
+    "mappo default, esp": ("mappo", {}),
+    "mappo default, esp, bfloat16": ("mappo", BFLOAT16),
+    "maddpg, plain": ("maddpg", PLAIN),
+    "maddpg, esp": ("maddpg", {}),
+    "qmix, plain": ("qmix", PLAIN),
+    "qmix, esp": ("qmix", {}),
+    "qmix gru, plain": ("qmix", PLAIN | GRU),
+    "qmix gru, esp": ("qmix", GRU),
 }
+WARM_UP = 2
+"""Iterations that do not count; MADDPG and QMIX explore at random in a part of the first."""
 
 
 def flops_per_step(learner: Mappo) -> float:
@@ -74,59 +88,72 @@ def matrix_rate(seeds: int, rows: int, precision: str, device: str, repeats: int
 
 def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, object]:
     """Time `iterations` iterations of one case."""
-    learner = build_learner(resolve_config("navigation", seeds=range(seeds), overrides=CASES[name], device=device))
-    assert isinstance(learner, Mappo)
-    learner.iterate(0.0).finite.tolist()
+    algorithm, overrides = CASES[name]
+    config = resolve_config("navigation", algorithm, seeds=range(seeds), overrides=overrides, device=device)
+    learner = build_learner(config)
+    for _ in range(WARM_UP):
+        learner.iterate(0.0).finite.tolist()
     times = []
     for _ in range(iterations):
         begin = time.perf_counter()
         learner.iterate(0.0).finite.tolist()  # until a GPU has computed it
         times.append(time.perf_counter() - begin)
-    steps = seeds * learner.steps_per_iteration
-    rates = [steps / seconds for seconds in times]
-    work = flops_per_step(learner)
-    precision = CASES[name].get("network.precision", "float32")
-    rows = learner.config.chunk_steps // seeds * learner.spec.num_agents
-    machine = matrix_rate(seeds, rows, str(precision), device)
-    return {
+    rates = [seeds * learner.steps_per_iteration / seconds for seconds in times]
+    record: dict[str, object] = {
         "case": name,
         "seeds": seeds,
         "seed_steps_per_second": statistics.median(rates),
         "most": max(rates),
-        "mflop_per_step": work / 1e6,
-        "machine_gflops": machine / 1e9,
-        "share_of_matrix_rate": statistics.median(rates) * work / machine,
     }
+    if isinstance(learner, Mappo):
+        work = flops_per_step(learner)
+        rows = learner.config.chunk_steps // seeds * learner.spec.num_agents
+        rate = matrix_rate(seeds, rows, str(overrides.get("network.precision", "float32")), device)
+        record |= {
+            "mflop_per_step": work / 1e6,
+            "machine_gflops": rate / 1e9,
+            "share_of_matrix_rate": statistics.median(rates) * work / rate,
+        }
+    return record
+
+
+COLUMNS = {
+    "seeds": ("seeds", ",d"),
+    "seed_steps_per_second": ("seed-steps/s (median)", ",.0f"),
+    "most": ("most", ",.0f"),
+    "mflop_per_step": ("MFLOP/step", ".2f"),
+    "machine_gflops": ("machine GFLOP/s", ",.0f"),
+    "share_of_matrix_rate": ("share", ".0%"),
+}
 
 
 def main() -> None:
     """Parse the command line, measure, print, and write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", action="append", choices=list(CASES), help="what to measure; by default all")
-    parser.add_argument("--seeds", action="append", type=int, help="number of seeds; may be given several times")
+    parser.add_argument("--cases", nargs="+", default=["*"], metavar="PATTERN", help="names, or patterns as 'qmix*'")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[10, 1], help="numbers of seeds")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--iterations", type=int, default=7)
     parser.add_argument("--json", type=Path, help="also write the records to this file")
     args = parser.parse_args()
+    names = [name for name in CASES if any(fnmatch(name, pattern) for pattern in args.cases)]
+    if not names:
+        parser.error(f"no case has such a name; the cases are: {'; '.join(CASES)}")
     torch.set_num_threads(args.threads)
     where = f"{args.threads} thread(s)" if args.device == "cpu" else args.device
-    table = Table(title=f"MAPPO on navigation, {where}")
-    for heading in ("case", "seeds", "seed-steps/s (median)", "most", "MFLOP/step", "machine GFLOP/s", "share"):
-        table.add_column(heading, justify="left" if heading == "case" else "right")
-    records = []
-    for name in args.case or CASES:
-        for seeds in args.seeds or (10, 1):
-            records.append(record := measure(name, seeds, args.iterations, args.device))
-            numbers = [f"{float(str(record[key])):,.{digits}f}" for key, digits in COLUMNS]
-            table.add_row(name, str(seeds), *numbers, f"{float(str(record['share_of_matrix_rate'])):.0%}")
+    table = Table("case", title=f"Training on navigation, {where}")
+    for heading, _ in COLUMNS.values():
+        table.add_column(heading, justify="right")
+    records = [measure(name, seeds, args.iterations, args.device) for name in names for seeds in args.seeds]
+    for record in records:
+        shown = [format(record[key], form) if key in record else "" for key, (_, form) in COLUMNS.items()]
+        table.add_row(str(record["case"]), *shown)
     Console(width=140).print(table)
     if args.json:
         content = {"device": args.device, "threads": args.threads, "records": records}
         args.json.write_text(json.dumps(content, indent=2) + "\n")
 
-
-COLUMNS = (("seed_steps_per_second", 0), ("most", 0), ("mflop_per_step", 2), ("machine_gflops", 0))
 
 if __name__ == "__main__":
     main()

@@ -17,7 +17,7 @@ from esp_cli.symmetry.representation import (
     rows_permutation,
     state_matrix,
 )
-from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
 KINDS = [Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.VECTOR, Kind.WHEELS, Kind.PICTURE]
@@ -34,6 +34,11 @@ def joint(row_layout: Layout, *elements: Element, num_agents: int = 3) -> np.nda
 def field_of(name: str, kind: Kind, count: int = 1, items: Items = Items.FIXED) -> Field:
     """Return a field of any kind; a picture has 3 x 3 pixels."""
     return Field(name, kind, count, items=items, pixels=(3, 3) if kind == Kind.PICTURE else None)
+
+
+def test_others_by_hand() -> None:
+    assert others_of(3) == [[1, 2], [0, 2], [0, 1]]
+    assert others_of(1) == [[]]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)

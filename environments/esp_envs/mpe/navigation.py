@@ -10,6 +10,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.breaking import described, remaining
+from esp_envs.lockstep import to_others
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
@@ -142,12 +143,8 @@ class Navigation(ParticleTask):
         agents = self.settings.num_agents
         rows = state.unflatten(-1, (-1, 2))
         velocity, position, landmark = rows.split((agents, agents, self.settings.landmarks), dim=-2)
-        parts = []
-        for i in range(agents):
-            here = position[..., i, :]
-            others = [position[..., j, :] - here for j in range(agents) if j != i]
-            parts += [velocity[..., i, :], here, (landmark - here.unsqueeze(-2)).flatten(-2), *others]
-        return torch.cat(parts, dim=-1)
+        landmarks = (landmark.unsqueeze(-3) - position.unsqueeze(-2)).flatten(-2)
+        return torch.cat([velocity, position, landmarks, to_others(position).flatten(-2)], -1).flatten(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy` (default) or `cover`."""

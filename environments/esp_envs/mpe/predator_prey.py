@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from esp_envs.lockstep import to_others
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
@@ -137,14 +138,12 @@ class PredatorPrey(ParticleTask):
             return self.prey_observation_of(state)
         predators = self.settings.num_predators
         velocity, position, obstacle = self._split(state)
-        prey, prey_velocity = position[..., predators, :], velocity[..., predators, :]
-        parts = []
-        for i in range(predators):
-            here = position[..., i, :]
-            others = [position[..., j, :] - here for j in range(predators) if j != i]
-            obstacles = (obstacle - here.unsqueeze(-2)).flatten(-2)
-            parts += [velocity[..., i, :], here, obstacles, *others, prey - here, prey_velocity]
-        return torch.cat(parts, dim=-1)
+        here, prey = position.split((predators, 1), -2)
+        own_velocity, prey_velocity = velocity.split((predators, 1), -2)
+        obstacles = (obstacle.unsqueeze(-3) - here.unsqueeze(-2)).flatten(-2)
+        others = to_others(here).flatten(-2)
+        parts = [own_velocity, here, obstacles, others, prey - here, prey_velocity.expand_as(here)]
+        return torch.cat(parts, -1).flatten(-2)
 
     def prey_observation_of(self, state: Tensor) -> Tensor:
         """Return the prey's observation [..., D] in a global state [..., width]."""

@@ -18,7 +18,7 @@ from esp_envs.base import (
     restore_generators,
 )
 from esp_envs.scene import COLORS, Body, Scene
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, others_of
 from esp_envs.wildlife.pictures import all_pictures, cell_index
 from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec
 
@@ -86,7 +86,7 @@ class Wildlife(Environment):
         pictures = all_pictures(settings.width, settings.height)
         # as wide as an observation, so that one copy of rows makes the observations
         self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
-        self._others = torch.tensor([[j for j in range(agents) if j != i] for i in range(agents)], device=device)
+        self._others = torch.tensor(others_of(agents), device=device)
         lead = (self.num_seeds, num_envs)
         self._cells = torch.zeros(*lead, agents + 1, 2, dtype=torch.int64, device=device)
         self._time = torch.zeros(lead, dtype=torch.int64, device=device)
