@@ -5,21 +5,27 @@
     <!-- end of results -->
 
 The file is found from the page's own folder; the word behind it is a name of `tables.TABLES`. Several files of one kind
-of study, with spaces between, give one table. A comment that does not begin its line is none of these, as this example.
+of study, with spaces between, give one table. A last word, `greedy` or `stochastic`, says which final returns it takes.
+A comment that does not begin its line is none of these, as this example.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
+from esp_cli.evaluation.final import Mode
 from esp_cli.files.opening import read_regular
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.tables import TABLES
 
 _MOST_BYTES = 1 << 24
+_OF_EITHER_MODE = ("returns", "paper", "comparison")
+"""Tables of final returns, which files keep of greedy and of drawn actions; of curves they keep one."""
 _BLOCK = re.compile(
-    r"^(<!-- results: (?P<files>\S+(?: \S+)*) (?P<table>\S+) -->\n).*?^(<!-- end of results -->)",
+    rf"^(<!-- results: (?P<files>\S+(?: \S+)*?) (?P<table>\S+)(?: (?P<mode>{'|'.join(get_args(Mode))}))? -->\n)"
+    r".*?^(?P<end><!-- end of results -->)",
     re.DOTALL | re.MULTILINE,
 )
 
@@ -42,9 +48,14 @@ def filled(page: Path) -> str:
         name = match["table"]
         if name not in TABLES:
             raise ValueError(f"{page} asks for the table '{name}'; the tables are {', '.join(TABLES)}")
-        table = TABLES[name](join([read_results(page.parent / file) for file in match["files"].split()]))
+        results = join([read_results(page.parent / file) for file in match["files"].split()])
+        if match["mode"]:
+            if name not in _OF_EITHER_MODE:
+                raise ValueError(f"{page} asks for '{name} {match['mode']}'; {', '.join(_OF_EITHER_MODE)} take a mode")
+            results = results.model_copy(update={"mode": match["mode"]})
+        table = TABLES[name](results)
         content = "Nothing yet." if table is None else table.markdown()
-        return f"{match[1]}\n{content}\n\n{match[4]}"
+        return f"{match[1]}\n{content}\n\n{match['end']}"
 
     page_text, count = _BLOCK.subn(compute, text)
     if not count:

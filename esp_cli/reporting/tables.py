@@ -107,10 +107,11 @@ def comparison_table(results: Results) -> Table:
             by_seed &= found.gap is None or found.gap.paired
         rows.append((cell.panel, cell.variant, *(texts.get(heading, NOTHING) for heading in columns)))
     welch = "Ours and the paper's means are compared by Welch's test at 5 %. " if has_paper else ""
+    drawn = "Returns are those of drawn actions. " if results.mode == "stochastic" else ""
     caption = (
         f"The reference is {_reference(results)}, compared seed by seed"
         f"{'' if by_seed else ' where both have the same seeds'}; over all pairs: "
-        f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}"
+        f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}{drawn}"
         "No interval is widened for the number of comparisons."
     )
     title = f"Beside the reference{' and the paper' if has_paper else ''}"

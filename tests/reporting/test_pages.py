@@ -64,6 +64,23 @@ def test_a_table_or_file_that_is_not_there_is_told(page, old, new, sentence):
         filled(page.with_name("no.md"))
 
 
+def test_a_table_of_final_returns_takes_those_of_drawn_actions(page):
+    file = page.parent / "measured" / "a.json"
+    found = json.loads(file.read_text())
+    for cell in found["cells"]:
+        cell["returns"]["stochastic"] = [value - 7 for value in cell["returns"]["greedy"]]
+    file.write_text(json.dumps(found))
+    page.write_text(page.read_text().replace("comparison -->", "comparison stochastic -->"))
+    greedy, _, drawn = filled(page).partition("between")
+    assert "-150.00 ± 5.77" in greedy
+    assert "of the greedy return" in greedy
+    assert "| MAPPO | -157.00 ± 5.77 |" in drawn
+    assert "Returns are those of drawn actions." in drawn
+    page.write_text(page.read_text().replace("comparison stochastic", "steps stochastic"))
+    with pytest.raises(ValueError, match="asks for 'steps stochastic'; returns, paper, comparison take a mode"):
+        filled(page)
+
+
 def longer(page, seeds=(0, 1), **change):
     """Write the results of a second study, of more steps and fewer seeds, beside those of the page."""
     study = small_study(steps=((None, 400),), seeds=seeds)
