@@ -17,6 +17,7 @@ _TRIED = "d8,rot57,flip23"
 _NAMED = ("c2", "flip-x", "flip-y", "flip-diagonal", "flip-antidiagonal", "d2", "c4", "d4", "c8", "d8")
 """Groups that are named as found, smaller ones first, if all their elements hold."""
 _MOST = 64
+"""Of more listed elements some are tried that generate them all: where these hold, so do their products."""
 
 
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
@@ -42,7 +43,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     if not found:
         said = next(iter(refusals.values()), None)
         raise ValueError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
-    return found[:_MOST]
+    return found
 
 
 def _orders(name: str, count: int) -> list[str]:
@@ -90,7 +91,7 @@ def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     holding = {verdict.element for verdict in verdicts if verdict.outcome == "holds"}
     broken = {verdict.element for verdict in verdicts if verdict.outcome == "broken"}
     plane = "c1"
-    for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_elements(name, 1))):
+    for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_listed(name, 1))):
         elements = _elements(name, 1)
         known = [element for element in elements if element.name in holding | broken]
         whole = generate(known, elements) if name in _NAMED else len(known) == len(elements)
@@ -115,10 +116,31 @@ def _is_order(name: str) -> bool:
     return name.startswith("agents-")
 
 
-def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
+def _listed(text: str, num_agents: int) -> tuple[Element, ...]:
+    """Return the elements that a text names, of a group that is sampled its generators, without the identity."""
     if text in ("", "c1"):
         return ()
     found = parse_elements(text, num_agents)
     if isinstance(found, Group):
         return tuple(element for element in found.generators() if not element.is_identity)
-    return found[:_MOST]
+    return found
+
+
+def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
+    """Return those to try: all, or of many each one that is no product of those before it."""
+    elements = _listed(text, num_agents)
+    if len(elements) <= _MOST:
+        return elements
+    chosen: list[Element] = []
+    generating: list[Element] = []
+    reached: set[Element] = set()
+    for element in elements:
+        if element in reached:
+            continue
+        chosen.append(element)
+        try:
+            reached.update(FiniteGroup.generated_by(element.name, [*generating, element]).elements)
+        except ValueError:  # its products are too many to list, so it stands for itself
+            continue
+        generating.append(element)
+    return tuple(chosen)

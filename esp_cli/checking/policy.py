@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
@@ -9,10 +10,12 @@ from torch import Tensor
 
 from esp_cli.checking.candidates import candidates
 from esp_cli.symmetry import build_transform
+from esp_cli.training.build import with_compass
 from esp_cli.training.loading import TrainedPolicy
+from esp_envs.base import Observation
 from esp_envs.conformance.subject import MakeWorlds
 
-_WORLDS = 64
+_WORLDS, _STEPS = 64, 10
 _CLOSE = 0.1
 """Continuous actions nearer than this, in every number, count as the same."""
 
@@ -36,29 +39,30 @@ def check_policy(trained: TrainedPolicy, make: MakeWorlds, transforms: str | Non
     Raises:
         ValueError: the policy is of another task.
     """
-    env = make(_WORLDS, trained.config.seeds)
+    env = with_compass(make(_WORLDS, trained.config.seeds), trained.config.prior)
     if (env.spec.observation, env.spec.action) != (trained.spec.observation, trained.spec.action):
         raise ValueError(f"{trained.source} is a policy of {trained.config.task}, which sees or does other things")
-    policy = trained.policy.cpu()
-    seen: list[Tensor] = []
-    masks: list[Tensor] = []
+    policy = deepcopy(trained.policy).cpu()
+    steps: list[tuple[Observation, Tensor]] = []
     observation = env.reset()
-    memory = policy.initial_memory(_WORLDS, observation.obs)
+    blank = memory = policy.initial_memory(_WORLDS, observation.obs)
     with torch.no_grad():
-        for _ in range(min(env.spec.horizon, 10)):
-            seen.append(observation.obs)
-            masks += [] if observation.action_mask is None else [observation.action_mask]
+        for _ in range(min(env.spec.horizon, _STEPS)):
             action, memory = policy.act(observation.obs, memory, action_mask=observation.action_mask)
+            steps.append((observation, action))
             observation = env.step(action).next
         verdicts = []
-        rows, mask = torch.cat(seen, 1), torch.cat(masks, 1) if masks else None
-        blank = policy.initial_memory(rows.shape[1], rows)
-        here = policy.act(rows, blank, action_mask=mask)[0]
         for element in candidates(env.spec, transforms):
-            transform = build_transform([element], env.spec)
-            turned = None if mask is None else transform.push_outputs(mask)
-            there = policy.act(transform.obs(rows), blank, action_mask=turned)[0]
-            expected = transform.action(here)
-            same = there == expected if not there.is_floating_point() else ((there - expected).abs() < _CLOSE).all(-1)
-            verdicts.append(PolicyVerdict(element.name, float(same.float().mean())))
+            transform, memory, same = build_transform([element], env.spec), blank, []
+            for there, action in steps:
+                mask = None if there.action_mask is None else transform.push_outputs(there.action_mask)
+                moved, memory = policy.act(transform.obs(there.obs), memory, action_mask=mask)
+                same.append(_same(moved, transform.action(action)))
+            verdicts.append(PolicyVerdict(element.name, float(torch.stack(same).float().mean())))
     return verdicts
+
+
+def _same(action: Tensor, expected: Tensor) -> Tensor:
+    if action.is_floating_point():
+        return ((action - expected).abs() < _CLOSE).all(-1)
+    return action == expected

@@ -19,6 +19,8 @@ SAMPLES = 8
 """Actions drawn where a divergence has no closed form."""
 _FAR, _MARGIN = 30.0, 1e-6
 """A latent action that a squash sends to the end of its box, and how near to the end, as a share, actions may come."""
+_GOLDEN = 0.6180339887498949
+"""Multiples of it, without their whole parts, lie evenly in [0, 1)."""
 _KNOWN = "Categorical, OneHotCategorical, Normal, Independent, or a squashed Normal such as TanhNormal"
 
 
@@ -143,12 +145,17 @@ def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> T
 
 
 @torch.no_grad()
-def _commutes(transform: Transform, mean: Tensor, squash: list[td.Transform]) -> bool:
-    """Whether turning before a squash is turning after it, tried on a policy's own means."""
-    turned = _pulled(transform, mean)
+def _commutes(transform: Transform, like: Tensor, squash: list[td.Transform]) -> bool:
+    """Whether turning before a squash is turning after it, tried on latent actions spread over [-2, 2].
+
+    A policy's own means do not tell: near 0 a tanh is a line, and turns commute with that.
+    """
+    spread = torch.arange(like.numel(), device=like.device, dtype=torch.float64).mul_(_GOLDEN).frac_().mul_(4).sub_(2)
+    latent = spread.to(like.dtype).view_as(like)
+    turned = _pulled(transform, latent)
     for step in squash:
-        mean, turned = step(mean), step(turned)
-    return torch.allclose(transform.pull_back(mean), turned, rtol=1e-4, atol=1e-6)
+        latent, turned = step(latent), step(turned)
+    return torch.allclose(transform.pull_back(latent), turned, rtol=1e-4, atol=1e-6)
 
 
 def _samples_apart(transform: Transform, there: Policy, here: Policy, samples: int) -> Tensor:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.gate import fit_gate
 from esp_cli.training.config import RunConfig
 from esp_cli.training.memory import refuse_what_does_not_fit
@@ -22,7 +23,12 @@ _GATE_WORLDS = 256
 def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
     """Make `num_envs` worlds per seed whose draws come from the named random stream, with the prior's compass."""
     env = make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
-    prior = config.prior.effective()
+    return with_compass(env, config.prior)
+
+
+def with_compass(env: Environment, prior: PriorConfig) -> Environment:
+    """Return worlds as the policies of a prior see them."""
+    prior = prior.effective()
     return Compass(env, prior.compass, labels="agents" in prior.transforms) if prior.compass else env
 
 

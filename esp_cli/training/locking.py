@@ -51,8 +51,10 @@ def is_held(file: Path) -> bool:
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return True
+    except OSError:  # without locks nothing holds one, and `acquire` says so
+        return False
     finally:
         os.close(descriptor)
     return False

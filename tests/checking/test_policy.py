@@ -1,0 +1,74 @@
+"""How symmetric a policy is, along its own episodes, and that a check of many elements leaves none of them out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from esp_cli.checking import candidates, check_policy, check_symmetry
+from esp_cli.symmetry import FiniteGroup, parse_elements
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_cli.training.loading import TrainedPolicy
+from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.registry import make
+
+
+def worlds(**settings: object):
+    return lambda count, seeds: make("navigation", count, seeds, settings)
+
+
+def untrained(**overrides: object) -> TrainedPolicy:
+    names = {name.replace("__", "."): value for name, value in overrides.items()}
+    config = resolve_config("navigation", seeds=[0, 1], overrides={"mappo.num_envs": 2, **names})
+    learner = build_learner(config)
+    return TrainedPolicy(config, learner.policy, learner.spec, 0, Path("run"))
+
+
+class SymmetricAtFirst(torch.nn.Module):
+    """Stays in the first step of an episode, and goes right from then on."""
+
+    def initial_memory(self, count: int, obs: Tensor) -> int:
+        return 0
+
+    def act(self, obs: Tensor, memory: int, action_mask: Tensor | None = None) -> tuple[Tensor, int]:
+        return torch.full(obs.shape[:-1], 2 if memory else 0), memory + 1
+
+
+def agreements(trained: TrainedPolicy, transforms: str = "rot90,flip-x") -> dict[str, float]:
+    return {one.element: one.agreement for one in check_policy(trained, worlds(), transforms)}
+
+
+def test_an_equivariant_network_agrees_everywhere_and_a_plain_one_does_not() -> None:
+    turned_by_c4 = agreements(untrained(network__name="equivariant", network__hidden=[8]))
+    assert turned_by_c4["rot90"] == 1
+    assert turned_by_c4["flip-x"] < 0.9
+    assert max(agreements(untrained(network__hidden=[8])).values()) < 0.9
+
+
+def test_a_policy_that_remembers_is_judged_with_what_it_remembers() -> None:
+    trained = untrained(network__hidden=[8])
+    trained = TrainedPolicy(trained.config, SymmetricAtFirst(), trained.spec, 0, trained.source)
+    assert agreements(trained)["rot90"] == pytest.approx(0.1)  # one of ten steps
+
+
+def test_a_policy_with_a_compass_is_judged_in_worlds_with_one() -> None:
+    assert set(agreements(untrained(prior__compass=1.0, network__hidden=[8]))) == {"rot90", "flip-x"}
+
+
+def test_many_elements_are_tried_by_those_that_generate_them() -> None:
+    spec = worlds(num_agents=5)(2, [0]).spec
+    tried = candidates(spec, "d4*agents")
+    assert len(tried) < 10
+    assert set(parse_elements("d4*agents", 5)) < set(FiniteGroup.generated_by("tried", tried).elements)
+    assert [len(candidates(spec, text)) for text in ("d4", "d4*agents-1-0-2-3-4")] == [7, 8]
+
+
+def test_a_weak_agent_breaks_the_orders_of_five_agents() -> None:
+    report = check_symmetry(worlds(num_agents=5, weak_agent=0.5), "d4*agents")
+    assert report.found == "d4"
+    broken = [one.element for one in report.elements if one.outcome == "broken"]
+    assert broken == ["agents-1-0-2-3-4"], "the only generator that moves the weak agent, 0"
