@@ -104,7 +104,9 @@ class Field:
             raise ValueError(f"field '{self.name}': count is {self.count}; give how many items it has")
         if (self.kind == Kind.PICTURE) != (self.pixels is not None):
             raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
-        if (self.kind == Kind.RING) != (self.rays > 0):
+        if self.pixels is not None and min(self.pixels) < 1:
+            raise ValueError(f"field '{self.name}': pixels are {self.pixels}; give at least one row and one column")
+        if (self.kind == Kind.RING) != (self.rays > 0) or self.rays < 0:
             raise ValueError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
         if (self.kind == Kind.RECORD) != bool(self.parts):
             raise ValueError(f"field '{self.name}': a record, and nothing else, says what parts it has")
@@ -339,8 +341,10 @@ class TaskSpec(Spaces):
         return self.name
 
     def __post_init__(self) -> None:
-        if self.num_agents < 1 or self.horizon < 1 or not math.isfinite(self.control_period_s):
+        if self.num_agents < 1 or self.horizon < 1:
             raise ValueError(f"task {self.name}: agents and horizon must be positive")
+        if not 0 < self.control_period_s < math.inf:
+            raise ValueError(f"task {self.name}: control_period_s is {self.control_period_s}; give seconds above 0")
         if self.masks and not isinstance(self.action, Discrete):
             raise ValueError(f"task {self.name}: masks are for discrete actions; leave 'masks' out")
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -77,30 +80,43 @@ def bundle(
     played = play_greedily(alone, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
-    others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
-    file = folder / f"{name}.safetensors"
-    description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
-    write_policy(file, alone.policy.state_dict(), description)
-    entry = Entry(
-        name=name,
-        file=file.name,
-        sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
-        task=config.task,
-        task_version=alone.spec.version,
-        convention=alone.spec.convention,
-        algorithm=config.algorithm,
-        prior=config.prior.kind,
-        seed=alone.config.seeds[0],
-        chosen_from=len(config.seeds),
-        step=alone.step,
-        score=score,
-        metrics={key: float(value.mean()) for key, value in played.metrics.items()},
-        command=config.command(),
-        esp_version=__version__,
-        config=config.model_dump(mode="json"),
-    )
-    write_bundled(folder, (*others, entry))
+    with _alone_in(folder):
+        others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
+        file = folder / f"{name}.safetensors"
+        description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
+        write_policy(file, alone.policy.state_dict(), description)
+        entry = Entry(
+            name=name,
+            file=file.name,
+            sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+            task=config.task,
+            task_version=alone.spec.version,
+            convention=alone.spec.convention,
+            algorithm=config.algorithm,
+            prior=config.prior.kind,
+            seed=alone.config.seeds[0],
+            chosen_from=len(config.seeds),
+            step=alone.step,
+            score=score,
+            metrics={key: float(value.mean()) for key, value in played.metrics.items()},
+            command=config.command(),
+            esp_version=__version__,
+            config=config.model_dump(mode="json"),
+        )
+        write_bundled(folder, (*others, entry))
     return entry
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Wait until no other process adds to the folder, and let none begin; where the file system can lock."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:

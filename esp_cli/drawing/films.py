@@ -9,9 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from imageio.v2 import get_writer
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -106,13 +109,15 @@ def _colors(codes: NDArray[np.uint32]) -> Frame:
 
 def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
     """Write frames as an MP4."""
-    film = np.stack(list(frames))
-    height, width = film.shape[1:3]
-    even = np.pad(film, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")  # the format asks for it
-    made = iio.imwrite(
-        "<bytes>", even, extension=".mp4", fps=frames_per_second, macro_block_size=2, ffmpeg_log_level="error"
-    )
-    write_file(path, made)
+    with TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        options: dict[str, Any] = {"fps": frames_per_second, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        writer: Any = get_writer(film, format="FFMPEG", mode="I", **options)
+        with writer:
+            for frame in frames:
+                odd = [(0, size % 2) for size in frame.shape[:2]]  # the format asks for even sizes
+                writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
+        write_file(path, film.read_bytes())
 
 
 def write_png(path: Path, picture: Frame) -> None:

@@ -67,7 +67,11 @@ def begin(name: str) -> Future[tempfile.TemporaryDirectory[str]]:
 
 
 def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
-    compiler = shlex.split(os.environ.get("CXX", "")) or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
+    try:
+        named = shlex.split(os.environ.get("CXX", ""))
+    except ValueError as error:
+        raise ValueError(f"the environment variable CXX is no command ({error}); name a C++ compiler in it") from None
+    compiler = named or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
     if shutil.which(compiler[0]) is None:
         raise ValueError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
     folder = tempfile.TemporaryDirectory()

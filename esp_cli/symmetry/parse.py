@@ -112,13 +112,13 @@ class Factors:
         for word in words:
             match = re.fullmatch(_ORDER, word)
             if match is None:
-                plane += [word] if word != "agents" else []
+                plane += [word.lower()] if word.lower() != "agents" else []
             elif match[2].count("-") == 1:
                 items[match[1]] = int(match[2][1:])
             else:
                 count = match[2].count("-")
                 raise ValueError(f"'{word}' is one order of items; declare all of them, as in {match[1]}-{count}")
-        return cls("*".join(plane), "agents" in words, items)
+        return cls("*".join(plane), "agents" in map(str.lower, words), items)
 
     @property
     def name(self) -> str:

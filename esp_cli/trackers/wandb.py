@@ -20,8 +20,9 @@ class WeightsAndBiases:
     def __init__(self, run: TrackedRun) -> None:
         self._seeds = run.seeds
         folder = run.folder.absolute()
-        for place in _PLACES:
-            os.environ.setdefault(f"WANDB_{place}_DIR", str(folder / "wandb" / place.lower()))
+        places = {f"WANDB_{place}_DIR": str(folder / "wandb" / place.lower()) for place in _PLACES}
+        self._set = [name for name in places if name not in os.environ]  # until the run closes: the next has its own
+        os.environ.update({name: places[name] for name in self._set})
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         mode: Any = os.environ.get("WANDB_MODE", "offline")
         quiet = wandb.Settings(
@@ -55,7 +56,11 @@ class WeightsAndBiases:
 
     def close(self) -> None:
         """Finish the run."""
-        self._run.finish()
+        try:
+            self._run.finish()
+        finally:
+            for name in self._set:
+                os.environ.pop(name, None)
 
 
 def _run_id(run: TrackedRun) -> str:

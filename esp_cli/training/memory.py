@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import torch
 
@@ -14,6 +15,8 @@ from esp_envs.spec import TaskSpec
 _FLOAT_BYTES = 4
 _COPIES_OF_WEIGHTS = 4
 """Weights, gradients, and the two moments of Adam."""
+_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+"""Where Linux says what the processes of a container may take, in its second and first version of control groups."""
 _PROCESS_BYTES = 500 * 2**20
 """Of a process with torch and its libraries, before it trains."""
 
@@ -68,10 +71,19 @@ def process_bytes(config: RunConfig, spec: TaskSpec) -> int:
 
 
 def machine_bytes(device: str) -> int:
-    """Return the memory of the device that trains."""
+    """Return the memory of the device that trains; in a container what the container may take."""
     if device == "cuda":
         return torch.cuda.get_device_properties(0).total_memory
-    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    installed = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min([installed, *(limit for file in _LIMITS if (limit := _number_in(file)) is not None)])
+
+
+def _number_in(file: Path) -> int | None:
+    """Return the number that a file of the kernel holds, None where there is no such file or it says "max"."""
+    try:
+        return int(file.read_text())
+    except (OSError, ValueError):
+        return None
 
 
 def _gigabytes(size: int) -> str:

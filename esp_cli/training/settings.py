@@ -7,13 +7,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from esp_cli.algorithms.presets import FAST, PRESETS, TUNED, Sections
+from esp_cli.algorithms.presets import FAST, PAPER, PRESETS, TUNED, Sections
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.settings_index import Section, Setting
 from esp_cli.training.config import EvaluationConfig
-from esp_envs.registry import TASKS, task_class, task_names
+from esp_envs.registry import TASKS, task_class
 
 _UNITS = {
     "_m": "m",
@@ -34,13 +34,11 @@ _UNITS = {
 
 def sections() -> Iterator[Section]:
     """Yield the sections of everything that is built in: learners, tasks, networks, prior, evaluation."""
-    for name, learner in ALGORITHMS.items():
-        yield Section(name, "algorithm", _settings(name, learner.config_class))
-    for name in task_names():
-        if ":" not in name:  # a task of the caller is not built in
-            yield task_section(name)
-    for name, network in NETWORKS.items():
-        yield Section(name, "network", _settings("network", network))
+    for name in filter(ALGORITHMS.ships, ALGORITHMS):
+        yield Section(name, "algorithm", _settings(name, ALGORITHMS[name].config_class))
+    yield from map(task_section, filter(TASKS.ships, TASKS))
+    for name in filter(NETWORKS.ships, NETWORKS):
+        yield Section(name, "network", _settings("network", NETWORKS[name]))
     yield Section("prior", "prior", _settings("prior", PriorConfig))
     yield Section("evaluation", "evaluation", _settings("evaluation", EvaluationConfig))
 
@@ -87,7 +85,9 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             bounds=_bounds(schema[name]),
             unit=str(schema[name].get("unit", "")) or _unit(name),
             description=field.description or "",
-            presets=_changes(section, name, PRESETS) | _changes(section, name, FAST, "fast on "),
+            presets=_changes(section, name, PRESETS)
+            | _changes(section, name, FAST, "fast on ")
+            | _changes(section, name, PAPER, "paper on "),
             tasks=_changes(section, name, TUNED),
         )
         for name, field in model.model_fields.items()

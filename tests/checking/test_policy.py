@@ -17,7 +17,7 @@ from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.registry import make
 
 
-def worlds(**settings: object):
+def worlds(**settings: object) -> MakeWorlds:
     return lambda count, seeds: make("navigation", count, seeds, settings)
 
 

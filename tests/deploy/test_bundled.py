@@ -7,6 +7,7 @@ import json
 import math
 import shlex
 import shutil
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -264,3 +265,22 @@ def test_a_policy_of_a_task_that_is_not_installed_gets_a_name_that_can_be_writte
     assert standard_name("mine.tasks:My_Task", "mappo", "none") == "mine-tasks-my-task-mappo-plain"
     assert standard_name("pkg._tasks:T", "mappo", "esp") == "pkg-tasks-t-mappo-esp"
     assert standard_name("navigation", "qmix", "esp") == "navigation-qmix-esp"
+
+
+def test_two_exports_into_one_folder_take_turns(tmp_path: Path) -> None:
+    began, order = threading.Event(), []
+
+    def second() -> None:
+        began.set()
+        with bundling._alone_in(tmp_path):
+            order.append("second")
+
+    with bundling._alone_in(tmp_path):
+        other = threading.Thread(target=second)
+        other.start()
+        began.wait()
+        other.join(0.1)
+        order.append("first")
+    other.join()
+    assert order == ["first", "second"]
+    assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import math
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -108,3 +110,10 @@ def test_an_installed_task_is_known_by_its_entry_point(monkeypatch: pytest.Monke
     assert issubclass(task_class("theirs"), Environment)
     with pytest.raises(ValueError, match="the installed task 'broken' cannot be imported: ModuleNotFoundError"):
         task_class("broken")
+
+
+@pytest.mark.parametrize("period", [0.0, -0.1, math.nan, math.inf])
+def test_a_control_period_that_no_clock_has_is_refused(period: float) -> None:
+    spec = make("navigation", 1, [0]).spec
+    with pytest.raises(ValueError, match=r"task navigation: control_period_s is .*; give seconds above 0"):
+        replace(spec, control_period_s=period)

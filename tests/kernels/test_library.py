@@ -55,13 +55,20 @@ def without_compiler(_name):
     raise AssertionError("the kernel is asked for")
 
 
-def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("no-such-compiler", "network.compiled needs a C++ compiler"),
+        ('g++ "', "the environment variable CXX is no command (No closing quotation)"),
+    ],
+)
+def test_a_missing_compiler_is_named_in_one_sentence(tmp_path, monkeypatch, command, sentence):
     library.library.cache_clear()
     library.begin.cache_clear()
-    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setenv("CXX", command)
     result = CliRunner().invoke(app, ["train", "--set", "network.compiled=true", "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
-    assert "network.compiled needs a C++ compiler" in " ".join(result.output.split())
+    assert sentence in " ".join(result.output.split())
     assert "Traceback" not in result.output
 
 

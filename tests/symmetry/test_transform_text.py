@@ -104,6 +104,7 @@ def test_what_a_symmetry_moves() -> None:
     assert (factors.plane, factors.agents, factors.items) == ("d4", True, {"Marks": 3, "cars": 2})
     assert (factors.allow("agents", 5), factors.allow("Marks", 3), factors.allow("cars", 3)) == (True, True, False)
     assert Factors.of("flip-y") == Factors("flip-y", False, {})
+    assert Factors.of("D4*Agents*Marks-3") == Factors("d4", True, {"Marks": 3})
     with pytest.raises(ValueError, match="'marks-1-0' is one order of items; declare all of them, as in marks-2"):
         Factors.of("d4*marks-1-0")
 

@@ -192,3 +192,6 @@ def test_a_resumed_run_is_one_run_for_its_tracker(tmp_path: Path, name: str, mon
     assert file.read_text() == known
     curves = READERS[name](run)
     assert [step for step, _ in curves[NAME]] in ([0, 100, 0, 100], [0, 0, 100, 100])
+    assert not {name for name in os.environ if name.endswith("_DIR") and name.startswith("WANDB_")}, (
+        "the next run's own"
+    )

@@ -42,6 +42,14 @@ def test_a_machine_with_less_memory_refuses_what_a_larger_one_takes(monkeypatch)
         build_learner(config)
 
 
+def test_a_container_has_the_memory_that_it_may_take(monkeypatch, tmp_path):
+    installed = memory.machine_bytes("cpu")
+    for content, expected in (("1000000\n", 1_000_000), ("max\n", installed), (f"{2 * installed}\n", installed)):
+        (tmp_path / "memory.max").write_text(content)
+        monkeypatch.setattr(memory, "_LIMITS", (tmp_path / "memory.max", tmp_path / "nothing"))
+        assert memory.machine_bytes("cpu") == expected
+
+
 def test_every_seed_counts():
     one, ten = (resolve_config("formation", seeds=range(count)) for count in (1, 10))
     settings = ALGORITHMS["mappo"].config_class(**one.algorithm_settings)

@@ -45,7 +45,7 @@ _FEW_COPIES = 8
 class ParallelSettings(TaskSettings):
     """What a user may change of every task of this kind; a subclass adds its own."""
 
-    horizon: int = Setting(25, ge=1, description="steps of an episode")
+    horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode")
     workers: int | None = Setting(
         None, ge=0, le=256, description="processes that step the copies; 0 is none, by default one for each core"
     )

@@ -42,7 +42,7 @@ class VmasSettings(TaskSettings):
     """What a user may change of every VMAS task; a subclass adds the scenario's own arguments."""
 
     num_agents: int = Setting(4, ge=1, le=64, description="N, agents of the team")
-    horizon: int = Setting(100, ge=1, description="steps of an episode (0.1 s each)")
+    horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode (0.1 s each)")
 
 
 class VmasTask(Environment):
