@@ -1,7 +1,13 @@
-"""What is asked for where nobody says, and the most that can be asked for; imports nothing."""
+"""What can be asked for, and what is asked for where nobody says; imports nothing of this package."""
 
 from __future__ import annotations
 
+from typing import Literal
+
+PriorKind = Literal["esp", "none", "augment", "consistency"]
+"""What a prior consists of, in the order in which a task's bundled policies are preferred."""
+Mode = Literal["greedy", "stochastic"]
+"""How a policy acts: by its most probable action, or by actions that it draws."""
 STEPS = 1_000_000
 """Environment steps per seed of a run."""
 EPISODES = 320

@@ -164,8 +164,9 @@ class OffPolicyLearner(Learner):
         """Return targets [S, B, T, C] from standardised rewards and the target network's values of what followed.
 
         Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
-        values, and with them S_Q and c, mean about the same in every task. Where an episode or an agent may end early,
-        their mean is not taken off: it would pay for each step that is still to come, or charge for it.
+        values, and with them S_Q and c, mean about the same in every task. Mean and variance are those of one agent's
+        reward; a team's, the mean of rewards of the agents' own, varies less. Where an episode or an agent may end
+        early, the mean is not taken off: it would pay for each step that is still to come, or charge for it.
         """
         config = self.config
         ended = batch.terminated.clone()

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from esp_cli.commands.options import Mode, check_finite
+from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
+from esp_cli.defaults import Mode
 
 EPILOG = """Examples:\n
     esp compare-homomorphic --dry-run\n

@@ -17,6 +17,7 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
+from esp_cli.defaults import PriorKind
 
 T = TypeVar("T")
 
@@ -234,7 +235,6 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
         ),
     ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
-Mode = Literal["greedy", "stochastic"]
 Device = Literal["auto", "cpu", "cuda"]
 DeviceOption = Annotated[
     Device,
@@ -292,6 +292,6 @@ BundledAlgoOption = Annotated[
     ),
 ]
 BundledPriorOption = Annotated[
-    Literal["esp", "augment", "consistency", "none"] | None,
+    PriorKind | None,
     typer.Option("--prior", help="Choose the bundled policy with this prior (none: the plain learner)."),
 ]

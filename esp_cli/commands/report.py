@@ -14,7 +14,6 @@ from esp_cli import console
 from esp_cli.commands.counts import parse_count
 from esp_cli.commands.options import (
     JsonOption,
-    Mode,
     OwnAlgoOption,
     OwnNetworkOption,
     OwnTaskOption,
@@ -22,6 +21,7 @@ from esp_cli.commands.options import (
     not_over_a_run,
     register_named,
 )
+from esp_cli.defaults import Mode
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material

@@ -22,7 +22,7 @@ from esp_cli.training.folder_names import LOG
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
-    from esp_cli.evaluation.final import Mode
+    from esp_cli.defaults import Mode
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
     from esp_cli.studies.forecast import Forecast

@@ -30,7 +30,7 @@ from esp_cli.commands.options import (
 )
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.train_choices import with_file
-from esp_cli.defaults import STEPS
+from esp_cli.defaults import STEPS, PriorKind
 from esp_cli.kernels.library import begin
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def train(
     algo: AlgoOption = "mappo",
     preset: PresetOption = "default",
     prior: Annotated[
-        Literal["esp", "auto", "augment", "consistency", "none"] | None,
+        Literal[PriorKind, "auto"] | None,
         typer.Option(
             "--prior",
             help="esp: both parts; auto: as far as the task is symmetric; augment, consistency: one part; none: plain.",

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.defaults import PriorKind
 from esp_cli.deploy import manifest
 from esp_cli.deploy.manifest import Entry, read_bundled
 from esp_cli.files.documents import shortened
 from esp_cli.files.suggesting import did_you_mean
 from esp_cli.training.loading import TrainedPolicy, load_policy
 from esp_envs.registry import task_names
-
-_PRIORS = ("esp", "none", "augment", "consistency")
-"""In the order in which a task's policies are preferred; algorithms are in that of their registry."""
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
@@ -47,7 +46,7 @@ def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
 def _rank(entry: Entry) -> tuple[bool, int, int]:
     algorithms = list(ALGORITHMS)
     algorithm = algorithms.index(entry.algorithm) if entry.algorithm in algorithms else len(algorithms)
-    return not entry.is_standard, algorithm, _PRIORS.index(entry.prior)
+    return not entry.is_standard, algorithm, get_args(PriorKind).index(entry.prior)
 
 
 def open_policy(where: Path, algo: str | None = None, prior: str | None = None) -> TrainedPolicy:

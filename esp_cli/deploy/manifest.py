@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
 
+from esp_cli.defaults import PriorKind
 from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.formatting import file_name
 
@@ -35,7 +36,7 @@ class Entry(Strict):
     task_version: int
     convention: str
     algorithm: str
-    prior: Literal["esp", "augment", "consistency", "none"]
+    prior: PriorKind
     seed: int
     chosen_from: int = Field(ge=1, description="seeds of the run, of which this one did best")
     step: int = Field(ge=0, description="environment steps behind it")

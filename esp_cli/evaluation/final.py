@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from esp_cli import __version__
+from esp_cli.defaults import Mode
 from esp_cli.evaluation.spread import EpisodeSpread, spread_over_episodes
 from esp_cli.evaluation.statistics import SeedSummary, summarise
 from esp_cli.training.build import build_environment
@@ -16,8 +17,6 @@ from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
 
-Mode = Literal["greedy", "stochastic"]
-"""How a policy acts: by its most probable action, or by actions that it draws."""
 MAX_WORLDS = 4096
 """Worlds played at once, over all seeds; more episodes are played one batch after the other."""
 _STREAM = "judgement"

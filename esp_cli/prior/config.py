@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from esp_cli.defaults import PriorKind
 from esp_cli.files.documents import Strict
 
 _AUTO = {"kind": "esp", "trust": "measured", "fade": 0.5}
@@ -23,7 +24,7 @@ class PriorConfig(Strict):
     count by how nearly they hold, and only for the first half of the run. It weighs all of d4, whatever a preset has.
     """
 
-    kind: Literal["esp", "augment", "consistency", "none", "auto"] = Field(
+    kind: Literal[PriorKind, "auto"] = Field(
         "esp", description="copies and losses, one of them alone, neither (plain), or auto: what holds in the task"
     )
     transforms: str = Field(

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
+from esp_cli.defaults import Mode
 from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
-from esp_cli.evaluation.final import FinalEvaluation, Mode
+from esp_cli.evaluation.final import FinalEvaluation
 from esp_cli.evaluation.network_cost import flops_per_action, network_parameters
 from esp_cli.evaluation.statistics import summarise
 from esp_cli.files.tables import flat

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.loading import parse_config

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.evaluation.statistics import Interval, SeedSummary, summarise
 from esp_cli.formatting import format_count
 from esp_cli.reporting.collect import Material, RunState, results_of

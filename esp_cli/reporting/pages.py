@@ -15,7 +15,7 @@ import re
 from pathlib import Path
 from typing import get_args
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.files.opening import read_regular
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.tables import TABLES

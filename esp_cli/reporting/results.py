@@ -11,7 +11,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.evaluation.statistics import (
     Estimate,
     Floats,

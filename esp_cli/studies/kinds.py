@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from esp_cli.evaluation.final import Mode
+from esp_cli.defaults import Mode
 from esp_cli.studies import paper
 
 Settings = Mapping[str, object]

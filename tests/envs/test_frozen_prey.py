@@ -68,6 +68,10 @@ def refused(path: str, **settings: object) -> str:
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     assert "there is no prey policy file" in refused(str(tmp_path / "none.safetensors"))
+    large = tmp_path / "large.safetensors"
+    with large.open("wb") as file:
+        file.truncate(2**26 + 1)
+    assert "has more than 64 MiB" in refused(str(large))
 
 
 @pytest.mark.parametrize("content", [b"", b"not a policy", b"\xff" * 64, b"\x80\x04K\x01."])

@@ -1,4 +1,4 @@
-"""Inside a VMAS simulator: its tensors by name, its dice, and its entities as a layout of the global state."""
+"""Inside a VMAS simulator: its tensors by name, its random numbers, its entities as a layout of the global state."""
 
 from __future__ import annotations
 
@@ -53,19 +53,19 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
     return make
 
 
-class Dice:
+class RandomNumbers:
     """The random numbers of one simulator. VMAS has one state for all simulators; this exchanges it around a call."""
 
     def __init__(self, seed: int) -> None:
-        self.throw_anew(seed)
+        self.begin(seed)
 
-    def throw_anew(self, seed: int) -> None:
+    def begin(self, seed: int) -> None:
         """Begin with the numbers of a seed."""
         self.state = torch.Generator().manual_seed(seed).get_state()
 
     @contextlib.contextmanager
-    def thrown(self) -> Iterator[None]:
-        """Let VMAS draw from these dice."""
+    def drawn(self) -> Iterator[None]:
+        """Let VMAS draw these numbers."""
         from vmas.simulator.environment import Environment  # noqa: PLC0415 - an extra
 
         shared = Environment.vmas_random_state

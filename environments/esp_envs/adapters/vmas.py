@@ -88,8 +88,8 @@ class VmasTask(Environment):
         require_attributes(self, "scenario", "symmetry", "convention")
         make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
         self._sims = [make() for _ in self.generators]
-        self._dice = [simulation.Dice(generator.initial_seed()) for generator in self.generators]
-        self._nursery = make()
+        self._numbers = [simulation.RandomNumbers(generator.initial_seed()) for generator in self.generators]
+        self._starter = make()
         self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags)
         self.spec = TaskSpec(
             name=f"vmas-{self.scenario}" if isinstance(self.scenario, str) else type(self).__name__.lower(),
@@ -121,7 +121,7 @@ class VmasTask(Environment):
         """Start a new episode in every world."""
         for s, generator in enumerate(self.generators):
             self._base[s] = torch.randint(2**31, (), generator=generator, device=self.device)
-            self._dice[s].throw_anew(int(self._base[s]))
+            self._numbers[s].begin(int(self._base[s]))
         self._starts = [{} for _ in self.generators]
         self._begun.zero_()
         every = torch.ones(self.num_envs, dtype=torch.bool)
@@ -139,7 +139,7 @@ class VmasTask(Environment):
         self._time += 1
         due = self._time == self.spec.horizon
         for s, sim in enumerate(self._sims):
-            with self._dice[s].thrown():
+            with self._numbers[s].drawn():
                 obs, reward, done, infos = sim.step(list(force[s].unbind(1)))
             here = self._look(sim, obs)
             over = done.cpu() if self.terminates else torch.zeros(self.num_envs, dtype=torch.bool)
@@ -170,7 +170,7 @@ class VmasTask(Environment):
         self._time.zero_()
         parts = []
         for s, sim in enumerate(self._sims):
-            with self._dice[s].thrown():
+            with self._numbers[s].drawn():
                 self._entities.write(sim, state[s])
                 for agent in sim.agents:  # brings what rewards remember of the step before up to date
                     sim.scenario.reward(agent)
@@ -179,9 +179,9 @@ class VmasTask(Environment):
         return _joined(parts)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return every simulator's tensors, its dice, clocks and generators."""
+        """Return every simulator's tensors, its random numbers, clocks and generators."""
         saved = {"base": self._base.clone(), "begun": self._begun.clone(), "time": self._time.clone()}
-        saved["dice"] = torch.stack([dice.state for dice in self._dice])
+        saved["dice"] = torch.stack([numbers.state for numbers in self._numbers])
         saved["generators"] = generator_states(self.generators)
         for s, sim in enumerate(self._sims):
             saved |= {f"{s}.{name}": tensor for name, tensor in simulation.snapshot(sim).items()}
@@ -198,8 +198,8 @@ class VmasTask(Environment):
         self._base = tensors["base"].cpu().clone()
         self._begun, self._time = (tensors[name].cpu().clone() for name in ("begun", "time"))
         self._starts = [{} for _ in self.generators]
-        for s, (sim, dice) in enumerate(zip(self._sims, self._dice, strict=True)):
-            dice.state = tensors["dice"][s].cpu().clone()
+        for s, (sim, numbers) in enumerate(zip(self._sims, self._numbers, strict=True)):
+            numbers.state = tensors["dice"][s].cpu().clone()
             own = {n.removeprefix(f"{s}."): t.to(self.device) for n, t in tensors.items() if n.startswith(f"{s}.")}
             simulation.restore(sim, own)
         restore_generators(self.generators, tensors["generators"])
@@ -231,8 +231,8 @@ class VmasTask(Environment):
         if episode not in kept:
             while len(kept) >= _KEPT_STARTS:
                 kept.pop(next(iter(kept)))
-            obs = self._nursery.reset(seed=seed_of(int(self._base[s]), episode))
-            kept[episode] = simulation.Start(simulation.snapshot(self._nursery), self._look(self._nursery, obs))
+            obs = self._starter.reset(seed=seed_of(int(self._base[s]), episode))
+            kept[episode] = simulation.Start(simulation.snapshot(self._starter), self._look(self._starter, obs))
         return kept[episode]
 
     def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:

@@ -18,6 +18,7 @@ from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION, 
 
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 _TASK, _NETWORK = "predator-prey", "mlp"
+_MOST_BYTES = 1 << 26
 
 
 class FrozenPrey:
@@ -59,6 +60,8 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
     """Return the JSON header and the actor's tensors of a policy file."""
     if not Path(path).is_file():
         raise ValueError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
+    if Path(path).stat().st_size > _MOST_BYTES:
+        raise ValueError(f"{path} has more than {_MOST_BYTES >> 20} MiB, so it is no prey policy; export a prey")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
