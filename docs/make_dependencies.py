@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "dependencies.md"
 _BEGIN = """# Dependencies
 
-This is what `pip install esp-marl` brings on Linux with Python 3.11, at the versions of
+This is what `pip install .` in a checkout brings on Linux with Python 3.11, at the versions of
 [constraints.txt](../constraints.txt), and when each release was uploaded. The parts of CUDA that `torch` may bring are
 left out, since the tests do not install them. `docs/make_dependencies.py` writes this page; its first lines say how.
 

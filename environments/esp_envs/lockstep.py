@@ -112,6 +112,11 @@ class BatchedTask(LockstepTask):
         self.spec = self._describe()
         if not isinstance(self.spec, TaskSpec):
             raise ValueError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
+        if self.spec.terminates:
+            raise ValueError(
+                f"{self.spec.name}: all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out, or derive "
+                "from Environment"
+            )
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
 
     @abstractmethod
@@ -124,7 +129,10 @@ class BatchedTask(LockstepTask):
 
     @abstractmethod
     def _advance(self, world: World, action: Tensor) -> Outcome:
-        """Write the next step's tensors into `world`; return the reward [S, E, N] (or [S, E]) and metrics [S, E]."""
+        """Write the next step's tensors into `world`; return reward and metrics [S, E].
+
+        A reward may be [S, E, N]; where agents have rewards of their own, switch `shared_reward` off in the spec.
+        """
 
     @abstractmethod
     def _observe(self, world: World) -> Tensor:

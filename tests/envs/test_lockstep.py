@@ -189,6 +189,15 @@ def test_an_observation_of_another_width_is_refused() -> None:
         worlds(Wide).reset()
 
 
+def test_ends_of_an_episode_s_own_are_refused() -> None:
+    class Ending(Plain):
+        def _describe(self):
+            return TaskSpec(**{**vars(super()._describe()), "terminates": True})
+
+    with pytest.raises(ValueError, match="all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out"):
+        worlds(Ending)
+
+
 def test_others_are_seen_in_index_order() -> None:
     position = torch.tensor([[0.0], [1.0], [10.0]])
     assert to_others(position).squeeze(-1).tolist() == [[1.0, 10.0], [-1.0, 9.0], [-10.0, -9.0]]

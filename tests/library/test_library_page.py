@@ -15,9 +15,9 @@ SCRIPT = DOCS / "plain_mappo.py"
 MARK = "  # ESP"
 
 
-def test_examples_of_the_page(tmp_path: Path) -> None:
-    page = str(DOCS / "library.md")
-    failed, tried = doctest.testfile(page, module_relative=False, encoding="utf-8", extraglobs={"folder": tmp_path})
+def test_examples_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    failed, tried = doctest.testfile(str(DOCS / "library.md"), module_relative=False, encoding="utf-8")
     assert tried >= 20
     assert failed == 0
 
