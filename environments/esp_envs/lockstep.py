@@ -114,8 +114,8 @@ class BatchedTask(LockstepTask):
             raise ValueError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
         if self.spec.terminates:
             raise ValueError(
-                f"{self.spec.name}: all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out, or derive "
-                "from Environment"
+                f"{self.spec.name}: all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out, or "
+                "derive from Environment"
             )
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
 
