@@ -144,7 +144,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper, fast"),
         (
             ["--prior", "some"],
-            "Invalid value for '--prior': 'some' is not one of 'esp', 'auto', 'augment', 'consistency', 'none'",
+            "Invalid value for '--prior': 'some' is not one of 'esp', 'none', 'augment', 'consistency', 'auto'",
         ),
         (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
