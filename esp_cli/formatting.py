@@ -46,6 +46,11 @@ def format_count(count: float) -> str:
     return f"{count:.3g}"
 
 
+def format_exactly(count: int) -> str:
+    """Return a count in the short form where that is exact, as names carry it: 500000 -> "500k", 1234 -> "1234"."""
+    return format_count(count) if float(f"{count:.3g}") == count else str(count)
+
+
 def format_duration(seconds: float) -> str:
     """Return a time to wait in its two largest units: "8 s", "2 min 05 s", "1 h 03 min"."""
     if not math.isfinite(seconds):

@@ -104,6 +104,8 @@ def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tup
             end = next(fits, 1)
             names.append(", ".join(parts[:end]))
             del parts[:end]
+    if items and not names:
+        raise ValueError(f"'{' '.join(items)}' names nothing; name something, or leave the option out")
     return tuple(names) or None
 
 

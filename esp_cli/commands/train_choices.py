@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -55,8 +56,30 @@ def with_file(
     kept = file.settings
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
+    if file.is_complete:
+        kept = _fitting(kept, settings)
     chosen = set(settings) if file.is_complete else {*kept, *settings}
     return given | filled, kept | settings, chosen
+
+
+def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict[str, object]:
+    """Return the settings of a whole run without those that another network or another task of the user's makes void.
+
+    What was measured or found in a task does not hold in a changed one, so it is measured and looked for again.
+    """
+    left = dict(kept)
+    if "network.name" in settings:
+        from esp_cli.networks.build import network_class
+
+        known = {f"network.{name}" for name in network_class(settings["network.name"]).model_fields}
+        left = {name: value for name, value in left.items() if not name.startswith("network.") or name in known}
+    if any(name.startswith("task.") and kept.get(name) != value for name, value in settings.items()):
+        from esp_cli.symmetry.admission import DISCOVERED
+
+        left.pop("prior.weights", None)
+        if str(left.get("prior.transforms")).startswith(DISCOVERED):
+            left["prior.transforms"] = DISCOVERED.rstrip(":")
+    return left
 
 
 def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:

@@ -12,8 +12,18 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.text import Text
 
+
+class _Notes(Console):
+    """Standard error, which nobody has to read: long work goes on where a pipe behind it has closed."""
+
+    def on_broken_pipe(self) -> None:
+        """Say no more."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+
+
 out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+err = _Notes(stderr=True, highlight=False)
 
 
 def say(text: str) -> None:

@@ -90,6 +90,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
         # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
+            with contextlib.suppress(OSError):  # a new file, or one of somebody else
+                if stat.S_ISREG((before := path.lstat()).st_mode):
+                    os.fchmod(descriptor, before.st_mode & 0o777)
             yield functools.partial(_write_all, descriptor)
             reach("fsync")
             os.fsync(descriptor)

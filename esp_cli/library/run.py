@@ -37,7 +37,7 @@ from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.initial import describe, matching_weights
 from esp_cli.training.loading import TrainedPolicy, load_policy, parse_config, transfer
 from esp_cli.training.metrics import read_metrics
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_cli.training.trainer import Listener, Progress, Trainer
 from esp_envs.base import Environment
 from esp_envs.registry import register
@@ -201,7 +201,12 @@ def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os
     numbered = (Path("runs") / f"{name}-{k}" for k in itertools.count(2))
     free = (path for path in itertools.chain([Path("runs") / name], numbered) if not path.exists())
     path = next(free) if out is None else Path(out)
-    return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
+    try:
+        return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
+    except RunFolderError:
+        if out is not None or not path.exists():
+            raise
+        return begin(config, weights, None)  # another program took the name meanwhile
 
 
 def train(

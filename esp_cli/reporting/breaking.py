@@ -93,7 +93,7 @@ def side(results: Results, cell: CellResult, other: CellResult | None, early: bo
     found = difference(values, others, cell.seeds == other.seeds)
     interval = found.ci95
     if interval is None:  # of one seed, or of runs that differ by the same number for every seed, as equal ones do
-        if values.size < 2:
+        if min(values.size, others.size) < 2:
             return None
         interval = (found.value, found.value)
     return side_of(interval)

@@ -9,7 +9,7 @@ from pydantic import JsonValue
 
 from esp_cli.defaults import Mode
 from esp_cli.evaluation.statistics import Interval, SeedSummary, summarise
-from esp_cli.formatting import format_count
+from esp_cli.formatting import format_exactly
 from esp_cli.reporting.collect import Material, RunState, results_of
 from esp_cli.reporting.curves import RunCurve
 from esp_cli.reporting.plots import Curve, learning_curves
@@ -57,7 +57,7 @@ def put_together(
     for step in steps:
         for k, (curve, path) in enumerate(zip(curves, paths, strict=True)):
             name, first = f"{k}-{curve.label}-{step}", f"0-{labels[0]}-{step}"
-            panel = f"{curve.config.task}, {format_count(step)}"
+            panel = f"{curve.config.task}, {format_exactly(step)}"
             reference = None if k == 0 else first
             cells.append(Cell(name=name, panel=panel, variant=curve.label, config=curve.config, reference=reference))
             states[name] = RunState(curve.last_step, curve, at=step)

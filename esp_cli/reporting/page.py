@@ -238,7 +238,7 @@ def _data_uri(path: Path, kind: str) -> str:
 
 def _markdown(material: Material, pictures: Pictures) -> str:
     parts = [f"# {markdown_text(material.study.title)}", _fenced(material.study.command)]
-    parts += [f"## {table.title}\n\n{table.markdown()}" for table in all_tables(material.results)]
+    parts += [f"## {markdown_text(table.title)}\n\n{table.markdown()}" for table in all_tables(material.results)]
     parts += [f"![{png.stem}]({png.name})" for png, _ in pictures]
     commands = "\n".join(run.command for run in _runs(material))
     return "\n\n".join([*parts, "## Each run by itself", _fenced(commands)]) + "\n"

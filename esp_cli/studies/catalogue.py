@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import planned
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
-from esp_cli.formatting import file_name, format_count
+from esp_cli.formatting import file_name, format_exactly
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
 from esp_cli.studies.study import Cell, Study
@@ -113,13 +113,13 @@ def _pairs(
     for team, steps, algorithm in (
         (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
     ):
-        stem = f"{file_name(team.label)}-{_count(steps)}-{file_name(algorithm)}"
+        stem = f"{file_name(team.label)}-{format_exactly(steps)}-{file_name(algorithm)}"
         for prior in variants:
             settings = {**team.settings, **kind.variants[prior]}
             config = _config(task, algorithm, steps, request, settings, kind.common)
             yield Cell(
                 name=f"{stem}-{'plain' if prior == 'none' else prior}",
-                panel=f"{team.label}, {_count(steps)}",
+                panel=f"{team.label}, {format_exactly(steps)}",
                 variant=_paired_name(algorithm, prior),
                 config=config,
                 reference=None if prior == "none" else f"{stem}-plain",
@@ -139,7 +139,7 @@ def _variants(
         (team, a, s) for team in strengths for a in algorithms for s in _steps(kind, task, request)
     ):
         heads = [part for part in (task, strength.label) if part]
-        stem = "-".join(file_name(part) for part in (*heads, algorithm)) + f"-{_count(steps)}"
+        stem = "-".join(file_name(part) for part in (*heads, algorithm)) + f"-{format_exactly(steps)}"
         for variant in variants:
             if request.variants is None and variant in kind.without.get(task, ()):
                 continue
@@ -150,7 +150,7 @@ def _variants(
             place = tuple(part.format(**fields) for part in kind.place)
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
-                panel=", ".join([*heads, _paired_name(algorithm, "none"), _count(steps)]),
+                panel=", ".join([*heads, _paired_name(algorithm, "none"), format_exactly(steps)]),
                 variant=variant,
                 config=config,
                 reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
@@ -237,11 +237,6 @@ def _paired_name(algorithm: str, prior: str) -> str:
     return algorithm.rpartition(":")[2].upper() + ("" if prior == "none" else "-ESP")
 
 
-def _count(steps: int) -> str:
-    """Return steps in the short form where that is exact, as names carry it: 500000 -> "500k", 1234 -> "1234"."""
-    return format_count(steps) if float(f"{steps:.3g}") == steps else str(steps)
-
-
 def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Yield panel, variant and place of every number that the paper's table of this kind has; none for ablations."""
     kind = kind_of(name)
@@ -254,4 +249,4 @@ def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
                 for algorithm in kind.algorithms:
                     for prior in kind.variants:
                         key = (*team.place, str(steps), algorithm, prior)
-                        yield f"{team.label}, {_count(steps)}", _paired_name(algorithm, prior), key
+                        yield f"{team.label}, {format_exactly(steps)}", _paired_name(algorithm, prior), key

@@ -32,7 +32,7 @@ from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
 from esp_cli.training.loading import parse_config
-from esp_cli.training.locking import acquire
+from esp_cli.training.locking import acquire, release
 from esp_cli.training.run_folder import RunFolder
 
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -243,7 +243,7 @@ class StudyFolder:
                     file.unlink(missing_ok=True)
             yield
         finally:
-            os.close(descriptor)
+            release(descriptor)
 
     def run_path(self, cell: Cell) -> Path:
         """Return the run folder of a cell."""

@@ -31,7 +31,7 @@ class TensorBoard:
         if seed not in self._boards:
             folder = self._run.folder / "tensorboard"
             place = folder if seed is None else folder / f"seed-{seed}"
-            # what a resumed run writes again is hidden
-            purge = self._run.first_step + 1 if self._run.first_step else None
+            # what a resumed run writes again is hidden, also where it begins anew without a checkpoint
+            purge = self._run.first_step + 1 if self._run.first_step else 0
             self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)
         return self._boards[seed]

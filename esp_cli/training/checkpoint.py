@@ -35,7 +35,7 @@ CHECKPOINT_VERSION = 1
 _RESERVED = ("format", "version", "sha256")
 # parsed JSON takes some 20 times the space of its text, so this bounds the memory that a hostile header can ask for
 _MAX_HEADER_BYTES = 4 * 2**20
-_MAX_FILE_BYTES = 8 * 2**30
+_MAX_FILE_BYTES = 64 * 2**30
 _MAX_DIMENSIONS = 16
 _MAX_ELEMENTS = 2**40
 _LENGTH_BYTES = 8

@@ -17,7 +17,7 @@ class LockError(ValueError):
 
 
 def acquire(file: Path) -> int:
-    """Take a lock and write into its file who holds it; closing the returned descriptor lets go of it.
+    """Take a lock and write into its file who holds it; `release` of the returned descriptor lets go of it.
 
     The file stays when the lock is let go: removing it would let two processes hold two files of one name.
 
@@ -41,6 +41,12 @@ def acquire(file: Path) -> int:
             os.close(descriptor)
             raise
     return descriptor
+
+
+def release(descriptor: int) -> None:
+    """Let go of a lock, also for processes that were forked meanwhile."""
+    fcntl.flock(descriptor, fcntl.LOCK_UN)
+    os.close(descriptor)
 
 
 def is_held(file: Path) -> bool:

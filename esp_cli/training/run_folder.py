@@ -39,7 +39,7 @@ from esp_cli.training.checkpoint import (
 )
 from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
-from esp_cli.training.locking import LockError, acquire
+from esp_cli.training.locking import LockError, acquire, release
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 from esp_envs.policy_format import POLICY_FORMAT
@@ -170,7 +170,7 @@ class RunFolder:
                     self._remove_superseded()
             yield
         finally:
-            os.close(descriptor)
+            release(descriptor)
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""

@@ -40,6 +40,25 @@ def test_auto_means_the_same_over_a_whole_configuration(tmp_path: Path) -> None:
     assert printed("--config", whole, "--prior", "auto", "--set", "prior.fade=0.2")["prior"]["fade"] == 0.2
 
 
+def test_what_was_measured_in_a_task_is_measured_anew_in_a_changed_one(tmp_path: Path) -> None:
+    whole = printed("--prior", "auto", "--steps", "20k")
+    whole["prior"] |= {"weights": {"rot90": 0.5}, "transforms": "discovered:rot90"}
+    file = written(tmp_path / "c.json", whole)
+    for kept in ([], ["--set", "task.wind=0"]):
+        assert printed("--config", file, *kept)["prior"] == whole["prior"]
+    changed = printed("--config", file, "--set", "task.wind=0.9")["prior"]
+    assert changed["transforms"].startswith("discovered:flip-x")
+    assert changed["weights"]["flip-x"] == 1
+    assert "rot90" not in changed["weights"]
+
+
+def test_another_network_takes_the_settings_that_it_has(tmp_path: Path) -> None:
+    whole = printed("--set", "network.hidden=[32,32]", "--set", "network.precision=bfloat16", "--steps", "20k")
+    network = printed("--config", written(tmp_path / "c.json", whole), "--network", "equivariant")["network"]
+    assert (network["name"], network["hidden"]) == ("equivariant", [32, 32])
+    assert "precision" not in network
+
+
 def test_weights_of_elements_are_a_value_in_a_small_file(tmp_path: Path) -> None:
     prior = {"transforms": "rot90,rot180", "trust": "measured", "weights": {"rot90": 0.5, "rot180": 1.0}}
     small = written(tmp_path / "c.json", {"task": "navigation", "prior": prior})

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +16,7 @@ from pydantic import BaseModel
 
 from esp_cli import console
 from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.formatting import file_name
+from esp_cli.formatting import file_name, format_exactly
 
 
 class Model(BaseModel):
@@ -155,3 +158,20 @@ def test_the_rate_forgets_what_is_half_a_minute_old() -> None:
 def test_progress_before_its_first_update_promises_nothing() -> None:
     with TrainingProgress(total=1000, clock=Clock()) as progress:
         assert progress.parts() == ["0/1k  0 steps/s  ? left"]
+
+
+def test_work_goes_on_where_nobody_reads_its_notes_any_more() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    program = "from esp_cli import console\nfor k in range(3): console.note(f'note {k}')\nprint('done')"
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=writing, text=True, check=False
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stdout) == (0, "done\n")
+
+
+def test_a_count_in_a_name_is_exact() -> None:
+    assert [format_exactly(count) for count in (500_000, 1000, 1004, 1234)] == ["500k", "1k", "1004", "1234"]

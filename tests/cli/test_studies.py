@@ -34,7 +34,9 @@ KILLED_STEPS = 1500
 
 def test_names_and_steps_are_read_from_lists() -> None:
     assert parse_names(["mappo, qmix", "maddpg"]) == ("mappo", "qmix", "maddpg")
-    assert parse_names(None) is parse_names([","]) is None
+    assert parse_names(None) is None
+    with pytest.raises(ValueError, match="',,' names nothing; name something, or leave the option out"):
+        parse_names([",,"])
     assert parse_names(["none,rot90,rot90, rot180", "C4,drawn"], KINDS["ablate-transforms"].variants) == (
         "none",
         "rot90",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -183,6 +184,45 @@ def test_opponents_draw_from_their_own_copys_episode() -> None:
     assert same_step(one, two)
 
 
+def test_what_an_opponent_draws_is_not_what_the_environment_draws() -> None:
+    drawn = []
+
+    class Watching(Walking):
+        def opponent(self, agent, observation, generator):
+            drawn.append(generator.normal(size=3).tolist())
+            return 0
+
+    env = worlds(Watching, 1, (3,), workers=0)
+    start = env.reset().state
+    env.step(torch.zeros(1, 1, 2, dtype=torch.int64))
+    assert len(drawn) == 1
+    assert abs(start[0, 0, 0].item() - drawn[0][0]) > 1e-3
+
+
+class Haunted(Walk):
+    """The ghost leaves in its second step, in which it is still seen; then it may act no more."""
+
+    def step(self, actions):
+        assert ("ghost" in actions) == (self.time < 2)
+        seen, reward, never, over, infos = super().step({"ghost": 0} | actions)
+        if self.time > 2:
+            del seen["ghost"], reward["ghost"]
+        return seen, reward, never | {"ghost": self.time >= 2}, over, infos
+
+
+def test_an_opponent_that_has_left_acts_no_more() -> None:
+    class Haunting(Walking):
+        metrics = ()
+
+        def make_one(self):
+            return Haunted(self.settings.horizon)
+
+    env = worlds(Haunting, workers=0)
+    env.reset()
+    for _ in range(8):
+        env.step(env.random_action())
+
+
 SENTENCES = {
     "walker_0 sees 2 numbers, but the layout has 1": {"observation": layout(Field("place", Kind.SCALAR))},
     "walker_0 acts in Discrete(3), but the task says 2 discrete actions": {
@@ -290,6 +330,32 @@ def test_workers_leave_with_the_environment() -> None:
     assert all(worker.is_alive() for worker in processes)
     del env
     assert not any(worker.is_alive() for worker in processes)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_copies_are_closed_with_the_environment(workers: int, tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+
+    class Closing(Walking):
+        def make_one(self):
+            walk = Walk(self.settings.horizon)
+            walk.close = lambda: closed.open("a").write("x")
+            return walk
+
+    env = worlds(Closing, workers=workers)
+    env.reset()
+    assert closed.read_text() == "x", "the copy that was looked at"
+    del env
+    gc.collect()
+    assert closed.read_text() == 11 * "x"
+
+
+def test_a_signal_to_the_whole_group_leaves_the_workers_to_their_parent() -> None:
+    env = worlds(Walking, workers=2)
+    env.reset()
+    for _, worker in env._copies._workers:
+        os.kill(worker.pid, signal.SIGTERM)
+    env.step(env.random_action())
 
 
 @pytest.fixture

@@ -42,6 +42,15 @@ def test_written_files_follow_the_umask(tmp_path, write):
 
 
 @WRITERS
+def test_a_file_that_is_written_again_keeps_its_permissions(tmp_path, write):
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    write(path, b"new")
+    assert (path.read_bytes(), path.stat().st_mode & 0o777) == (b"new", 0o600)
+
+
+@WRITERS
 def test_the_longest_names_are_taken(tmp_path, write):
     path = tmp_path / ("ü" * 127)
     write(path, b"x")

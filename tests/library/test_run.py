@@ -11,6 +11,7 @@ import pytest
 from esp_cli import Progress, Run, load_policy, train
 from esp_cli.library.metrics import Metrics
 from esp_cli.training.metrics import column, read_metrics
+from esp_cli.training.run_folder import RunFolder, RunFolderError
 from tests.cli.running import esp
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_steps": 25, "evaluation.every_steps": 200, "evaluation.episodes": 2}
@@ -153,6 +154,25 @@ def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
         train(out=run.path)
     with pytest.raises(ValueError, match="cannot write"):
         run.render(tmp_path / "film.txt")
+
+
+def test_a_name_that_another_program_takes_meanwhile_is_left_to_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("time.strftime", lambda _: "20261125-090121")
+    create, asked = RunFolder.create, []
+
+    def late(path: Path, *given: object, **named: object) -> RunFolder:
+        asked.append(path.name)
+        if len(asked) == 1:
+            path.mkdir(parents=True)
+            raise RunFolderError(f"{path} is in use")
+        return create(path, *given, **named)
+
+    monkeypatch.setattr(RunFolder, "create", late)
+    train(steps=8, settings={"mappo.num_envs": 2, "task.horizon": 4, "evaluation.episodes": 1})
+    assert asked == ["navigation-mappo-esp-20261125-090121", "navigation-mappo-esp-20261125-090121-2"]
 
 
 def test_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

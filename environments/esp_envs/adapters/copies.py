@@ -117,6 +117,9 @@ class Stepper(Protocol):
     def step(self) -> None:
         """Advance the active copies by one step, and reset those whose episode ends."""
 
+    def close(self) -> None:
+        """Let go of the copies."""
+
 
 class WorkerCopies:
     """The copies shared out among worker processes, which are forks of this one.
@@ -154,6 +157,10 @@ class WorkerCopies:
     def step(self) -> None:
         """Advance the active copies by one step."""
         self._command(_STEP)
+
+    def close(self) -> None:
+        """Let the workers leave."""
+        self._finalizer()
 
     def _command(self, word: bytes) -> None:
         for pipe, _ in self._workers:
@@ -196,7 +203,8 @@ def _work(
     share: range,
 ) -> None:
     """Obey commands until the pipe closes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops in its own time, and then closes the pipe
+    for stop in (signal.SIGINT, signal.SIGTERM):  # the parent stops in its own time, and then closes the pipe
+        signal.signal(stop, signal.SIG_IGN)
     for end in ends_of_the_parent:
         end.close()
     os.dup2(2, 1)  # an environment may print, and the command's output stays clean
@@ -215,6 +223,7 @@ def _work(
     with contextlib.suppress(EOFError, ConnectionError):
         while (word := pipe.recv_bytes()) != _LEAVE:
             pipe.send_bytes(_failure_of(commands[word]).encode())
+    stepper.close()
 
 
 def _failure_of(command: Callable[[], None]) -> str:

@@ -164,7 +164,7 @@ class ParallelTask(CopyHooks, Environment):
         if self._copies is None:
             count, workers = self._base.numel(), self.settings.workers
             if workers is None:
-                cores = available_cores()
+                cores = min(available_cores(), torch.get_num_threads())  # a run of a study has one of them
                 workers = cores if cores > 1 and count > _FEW_COPIES else 0
             spec, discrete = self.spec, isinstance(self.action, Discrete)
             sizes = Sizes(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -146,7 +146,7 @@ class CopyStepper:
         self._seen: dict[int, Mapping[str, Any]] = {}
         self._infos: dict[int, Mapping[str, Any]] = {}
         self._gone: dict[int, set[str]] = {}
-        self._dice: dict[int, np.random.Generator] = {}
+        self._opponents_draws: dict[int, np.random.Generator] = {}
 
     def reset(self) -> None:
         """Start an episode in the active copies."""
@@ -160,9 +160,20 @@ class CopyStepper:
             if self.board.active[k]:
                 self._step(k, copy)
 
+    def close(self) -> None:
+        """Let go of the copies; what they raise then concerns nobody any more."""
+        for copy in self._copies.values():
+            with suppress(Exception):
+                copy.close()
+        self._copies = {}
+
+    def __del__(self) -> None:
+        """Close the copies of a task that is forgotten."""
+        self.close()
+
     def _start(self, k: int) -> None:
         seed = int(self.board.seed[k])
-        self._dice[k] = np.random.default_rng(seed)
+        self._opponents_draws[k] = np.random.default_rng([seed, 1])  # of `seed` alone the environment's own are made
         with self._naming(k, "reset"):
             self._seen[k], self._infos[k] = self._copies[k].env.reset(seed=seed)
         self._gone[k] = set()
@@ -173,7 +184,8 @@ class CopyStepper:
         task, board, seen = self._task, self.board, self._seen[k]
         gone = self._gone[k]
         chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name not in gone}
-        chosen |= {name: task.opponent(name, seen[name], self._dice[k]) for name in copy.rest if name in seen}
+        others = [name for name in copy.rest if name in seen and name not in gone]
+        chosen |= {name: task.opponent(name, seen[name], self._opponents_draws[k]) for name in others}
         with self._naming(k, "step"):
             self._seen[k], reward, terminated, truncated, self._infos[k] = copy.env.step(chosen)
         with self._naming(k, "measure"):
@@ -192,6 +204,7 @@ class CopyStepper:
         terminates = all if task.agents_end and board.cut[k] else any
         board.ended[k] = self._how(k, len(over) == len(acting), terminates(ended.values()))
         gone.update(name for name in over if ended[name] or not board.cut[k])
+        gone.update(name for name in others if terminated.get(name, False) or truncated.get(name, False))
         self._write(k, board.final_obs, board.final_state, board.final_mask, board.final_alive)
         if board.ended[k]:
             self._start(k)
