@@ -27,6 +27,7 @@ from esp_cli.symmetry import parse_elements, transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
+from esp_envs.base import Environment
 from tests.cli.running import esp, refused
 
 FORCES = {"actions": "continuous"}
@@ -269,6 +270,21 @@ def test_what_could_not_be_looked_at_weighs_nothing(monkeypatch: pytest.MonkeyPa
     measured._breaking.cache_clear()
     config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.transforms": "rot90"})
     assert prepared(config).prior.weights == {"rot90": 0.0}
+    measured._breaking.cache_clear()
+
+
+def test_a_gap_of_variance_weighs_as_the_shift_that_costs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shift of d leaves rows and their copies d / 2 off their mean: d^2 / 4 = 0.04, so d = 0.4 and exp(-8 x 0.4)."""
+    gaps = (FieldVerdict("reward", "broken", 0.04, 0.001), FieldVerdict("obs.velocity", "broken", 0.01, 0.001))
+    off = ElementVerdict("rot90", False, gaps)
+    held = ElementVerdict("rot180", False, (FieldVerdict("reward", "holds", 0.001, 0.001),))
+    monkeypatch.setattr(Environment, "has", lambda *_: False)
+    monkeypatch.setattr(measured, "collect", lambda *_: None)
+    monkeypatch.setattr(measured, "check_by_regression", lambda *_: [off, held])
+    measured._breaking.cache_clear()
+    config = resolve_config("navigation", overrides={"prior.trust": "measured", "prior.transforms": "rot90,rot180"})
+    assert config.prior.doubt == 8
+    assert prepared(config).prior.weights == {"rot90": pytest.approx(0.0408, abs=5e-5), "rot180": 1.0}
     measured._breaking.cache_clear()
 
 

@@ -238,6 +238,26 @@ def test_the_webots_controller_drives_as_the_policy_does(
     assert gap < 1e-3, "in 4 s and up to half a metre the same way, but for float32"
 
 
+def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    team = SimpleNamespace(poses=np.array([[0.3, 0.2, 1.0], [0.9, -0.5, 2.0]]), pillars=np.zeros((1, 0, 2)))
+    robot = Robot(team, 1, np.zeros((2, 2)), lambda: -1)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    asked = []
+
+    def wheels(poses, goals, pillars) -> np.ndarray:
+        asked.append(goals[1])
+        return np.zeros((2, 2))
+
+    monkeypatch.setattr(module, "Pilot", lambda *_: SimpleNamespace(control_period_s=0.1, wheels=wheels))
+    for arguments in ([], ["0.5", "-0.3"]):
+        monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *arguments])
+        module.main()
+    assert asked == [(-0.9, 0.5), (0.5, -0.3)]
+
+
 def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = drawn_policy("wheels")
     export(alone, ["webots"], tmp_path)

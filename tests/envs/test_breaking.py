@@ -202,6 +202,20 @@ def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() 
     assert speed.unique().numel() == speed.numel()
 
 
+def test_each_step_has_a_gust_of_its_own_times_the_deviation() -> None:
+    """From rest, along x and y: 0.1 x 0.5 x (2, -1), then 0.75 of that and 0.1 x 0.5 x (4, 1)."""
+    env = make("navigation", 1, [0], {"gust_std": 0.5, "num_landmarks": 1, "num_agents": 1})
+    env.reset()
+    env.set_state(torch.zeros(env.state_shape))
+    saved = env.state_dict()
+    saved["gusts"][:2, 0, :, 0] = torch.tensor([[2.0, -1.0], [4.0, 1.0]])
+    env.load_state_dict(saved)
+    nothing = torch.zeros(env.action_shape, dtype=torch.int64)
+    velocities = [env.step(nothing).next.state[0, 0, :2] for _ in range(2)]
+    assert velocities[0] == pytest.approx(torch.tensor([0.1, -0.05]), abs=1e-6)
+    assert velocities[1] == pytest.approx(torch.tensor([0.275, 0.0125]), abs=1e-6)
+
+
 def test_the_first_agent_is_weak() -> None:
     env = make("navigation", 1, [0], {"weak_agent": 0.5, "num_landmarks": 1})
     state = torch.zeros(env.state_shape)

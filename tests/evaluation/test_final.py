@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from esp_cli.evaluation import final
-from esp_cli.evaluation.final import FinalEvaluation, evaluate, summarise_returns
+from esp_cli.evaluation.final import FinalEvaluation, evaluate, play_batches, summarise_returns
 from esp_cli.evaluation.statistics import SeedSummary
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.build import build_environment
 from esp_cli.training.loading import TrainedPolicy, _stopped
-from esp_cli.training.play import HeuristicController, play
+from esp_cli.training.play import HeuristicController, PolicyController, play
 from esp_cli.training.streams import generators
 from tests.training.runs import tiny_config
 
@@ -51,6 +51,18 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     assert result.task_settings["num_agents"] == 3
     assert evaluate(trained, 3) == result, "the same every time"
     assert FinalEvaluation.model_validate_json(result.model_dump_json()) == result
+
+
+def test_the_measures_of_the_task_are_those_of_the_greedy_policy(tmp_path):
+    trained = untrained(tmp_path, task__horizon=8)
+    result = evaluate(trained, 3)
+    greedy = play_batches(trained, PolicyController(trained.policy), "greedy", 3).metrics
+    noise = generators(trained.config.seeds, "judgement", "noise")
+    drawn = play_batches(trained, PolicyController(trained.policy, noise), "stochastic", 3).metrics
+    assert result.metrics == pytest.approx({name: value.mean().item() for name, value in greedy.items()})
+    for name, value in greedy.items():
+        assert result.metrics_per_seed[name] == pytest.approx(value.mean(1).tolist())
+    assert any(drawn[name].mean().item() != pytest.approx(value) for name, value in result.metrics.items())
 
 
 def test_a_heuristic_that_would_try_too_many_sharings_is_left_out(tmp_path):

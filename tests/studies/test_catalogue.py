@@ -16,6 +16,30 @@ from esp_cli.symmetry import parse
 from esp_envs import registry, task_class
 from tests.studies.small_studies import request, small_study
 
+LEARNERS = tuple((algorithm, prior) for algorithm in ("maddpg", "qmix", "mappo") for prior in ("none", "esp"))
+PRINTED = """
+    table1 predator-prey 500000    56.81±11.26   80.71±9.12    38.93±8.96    59.95±4.86    28.35±6.76    45.22±5.45
+    table1 predator-prey 3000000   85.43±8.14    87.06±4.87    48.78±7.75    57.75±6.81    32.54±8.21    59.54±4.32
+    table1 navigation 500000     -145.23±3.71  -132.22±1.27  -154.24±3.16  -140.12±2.25  -132.65±2.89  -122.25±1.62
+    table1 navigation 3000000    -122.63±6.04  -112.21±2.75  -124.67±3.05  -113.84±1.43  -126.97±2.12  -110.22±2.12
+    table1 formation 200000       -45.63±13.96  -41.13±11.17   48.53±20.12   51.23±14.71  122.56±15.12  163.18±14.14
+    table1 formation 1000000      -42.13±10.71  -44.13±12.31   49.44±18.71   59.47±14.35  140.64±18.45  170.85±10.2
+    agents 2 500000              -101.42±3.24   -94.12±2.15  -106.65±3.68   -98.75±1.89   -99.12±3.25   -92.68±2.65
+    agents 2 3000000              -95.72±1.25   -90.92±2.54   -95.95±2.42   -89.32±2.31   -94.67±1.87   -87.54±2.56
+    agents 4 500000              -187.57±4.12  -179.93±5.24  -192.57±4.23  -186.32±3.14  -189.42±4.52  -183.87±3.24
+    agents 4 3000000             -183.43±4.68  -178.62±5.12  -191.57±4.24  -185.92±3.65  -187.73±2.45  -182.81±2.98
+""".strip()
+"""Table 1 of the paper, then that of its supplement: MADDPG, with ESP, QMIX, with ESP, MAPPO, with ESP."""
+READ_OFF = {
+    ("coefficient, read off figure 5c", "navigation", "500000", "maddpg"): {
+        "0": -145, "0.01": -138, "0.05": -135, "0.1": -134, "0.5": -132, "1": -137,
+    },
+    ("coefficient, read off figure 5c", "navigation", "3000000", "maddpg"): {
+        "0": -122, "0.01": -116, "0.05": -115, "0.1": -115, "0.5": -115, "1": -116,
+    },
+    ("networks, read off figure 6b", "wildlife"): {"mpn": 2.1, "empn": 2.25, "mpn-esp": 2.4},
+}  # fmt: skip
+
 
 def test_table_1_has_the_papers_rows_and_columns():
     study = plan("table1", Request())
@@ -47,6 +71,19 @@ def test_the_papers_numbers_stand_where_the_paper_has_them():
     assert tasks() == ("predator-prey", "navigation", "formation")
     assert (horizons("navigation"), horizons("formation")) == ((500_000, 3_000_000), (200_000, 1_000_000))
     assert horizons("chess") == ()
+
+
+@pytest.mark.parametrize("row", PRINTED.splitlines(), ids=lambda row: " ".join(row.split()[:3]))
+def test_a_row_of_the_papers_tables_is_as_printed(row: str):
+    table, task, steps, *numbers = row.split()
+    found = [reported((table, task, steps, *learner)) for learner in LEARNERS]
+    assert found == [Reported(*map(float, number.split("±"))) for number in numbers]
+
+
+@pytest.mark.parametrize("place", READ_OFF, ids=" ".join)
+def test_what_is_read_off_a_figure_of_the_paper_has_no_error(place: tuple[str, ...]):
+    means = READ_OFF[place]
+    assert {key: reported((*place, key)) for key in means} == {key: Reported(mean, None) for key, mean in means.items()}
 
 
 def test_every_number_of_the_tables_is_a_cell_of_the_papers_table():

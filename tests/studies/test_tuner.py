@@ -15,7 +15,7 @@ from optuna.trial import TrialState
 from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
 from esp_cli.studies.study import StudyError
 from esp_cli.studies.tuner import Trials, Tuner, write_presets
-from esp_cli.studies.tuning import Tuning, TuningFolder
+from esp_cli.studies.tuning import Point, Tuning, TuningFolder
 from esp_cli.studies.tuning_space import Dimension
 from esp_cli.training.config import resolve_config
 from esp_cli.training.config_file import read_config_file
@@ -113,6 +113,7 @@ def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early
         paths = [tmp_path / "t" / "trials" / f"{prior}-{k:03d}" for k in range(12)]
         pruned = [state == TrialState.PRUNED for state in states(tuner.trials, prior)]
         assert [last_step(path) < 900 for path in paths] == pruned
+        assert set(map(last_step, paths)) <= {100, 200, 300, 400, 900}, "at a rung, or a look later"
         assert found.env_steps == 2 * sum(map(last_step, paths))
         assert not any(list((path / "checkpoints").iterdir()) for path in paths)
         # the first trial has the default settings; the best is the best of all that were trained to the end
@@ -126,6 +127,18 @@ def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early
         assert found.best_score == max(trial.value for trial in trials if trial.state == TrialState.COMPLETE)
     assert "prior.consistency_coef" in tuner.trials.outcome("esp").settings
     assert "prior.consistency_coef" not in tuner.trials.outcome("none").settings
+
+
+def test_a_third_goes_on_after_a_ninth_and_after_a_third_of_the_steps(tmp_path):
+    """Of 1, 2, 3, ... values at a rung the best 1, 1, 1, 1, 1, 2, 2, 2, 3 may go on; 9, 8.5 and 8.4 are among them."""
+    trials = Trials(TuningFolder.begin(tmp_path / "t", tuning(priors=("none",), budget=10)))
+    ends = []
+    for number, value in enumerate((0.0, 9.0, 6.0, 7.0, 8.0, 5.0, 8.5, 8.2, 8.3, 8.4)):
+        trial = trials.trial("none", number)
+        looks = [Point(step, step / 10, value, value) for step in range(50, 901, 50)]
+        assert trials.keeps_up(trial, looks) == (number in (0, 1))
+        ends.append(trials.studies["none"].get_trials(deepcopy=False)[number].last_step)
+    assert ends == [900, 900, 100, 100, 100, 100, 300, 100, 100, 300]
 
 
 def test_a_search_that_is_killed_at_any_moment_loses_no_trial_and_changes_no_settings(tmp_path):

@@ -240,6 +240,19 @@ def test_robots_that_differ_drive_differently_and_a_state_makes_them_alike_again
     assert env.step(forward).next.state[..., where["spin"]].abs().max() < 1e-6
 
 
+def test_masses_and_grip_spread_evenly_around_a_robots_own_and_a_state_brings_these_back() -> None:
+    env = make("formation", 40, [0], {"mass_spread": 0.3, "friction_spread": 0.6})
+    state, drawn = env.reset().state, env.state_dict()
+    for name, spread in (("mass", 0.3), ("friction", 0.6)):
+        values = drawn[f"physics.{name}"]
+        assert values.shape == (40, 8)
+        assert bool(((values - 1).abs() <= spread).all())
+        # 320 uniform numbers: their deviation of spread / sqrt(3) is known to 2.5 %
+        assert values.std().item() == pytest.approx(spread / math.sqrt(3), rel=0.1)
+    env.set_state(state)
+    assert all(bool((env.state_dict()[f"physics.{name}"] == 1).all()) for name in ("mass", "friction"))
+
+
 def test_steering_by_hand() -> None:
     turn = MAX_SPIN_RAD_S * PERIOD_S
     heading = np.zeros((1, 4))
