@@ -142,7 +142,8 @@ class CopyStepper:
 
     def __init__(self, task: CopyHooks, board: Board, copies: range) -> None:
         self._task, self.board = task, board
-        self._copies = {k: Copy(task) for k in copies}
+        self._copies: dict[int, Copy] = {}
+        self._copies.update((k, Copy(task)) for k in copies)
         self._seen: dict[int, Mapping[str, Any]] = {}
         self._infos: dict[int, Mapping[str, Any]] = {}
         self._gone: dict[int, set[str]] = {}
