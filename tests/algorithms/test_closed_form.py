@@ -50,6 +50,11 @@ def gradients(trained, reference):
     last.data.mul_(50)
     batch, _ = trained.prepare(trained.collector.collect(25))
     copies = trained.prior.copies(trained._minibatches(batch)[0], trained.generators["prior"])
+    return parts_of_gradient(trained, copies, reference)
+
+
+def parts_of_gradient(trained, copies, reference):
+    """Return the gradients of head (if it learns), actor and critic, by closed form or reference."""
     assert carries(copies.transforms)
     if reference:
         gradient = trained.optimiser.gradient(trained.reference_loss(copies, 0.01, 1.0, None))
@@ -104,6 +109,19 @@ def test_each_term_of_the_closed_form_moves_the_gradient(change, actions, monkey
     monkeypatch.setattr("esp_cli.algorithms.closed_form.Weights", lambda **k: Weights(**k | {change: k[change] * 0}))
     ours = gradients(learner(task__actions=actions), reference=False)
     assert max(map(gap, ours, theirs)) > 3e-3
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_the_weight_of_the_value_loss_multiplies_the_critics_gradient_alone(reference):
+    found = []
+    for coefficient in (1.0, 2.0):
+        trained = learner(mappo__value_coef=coefficient, prior__kind="none")
+        batch, _ = trained.prepare(trained.collector.collect(25))
+        found.append(parts_of_gradient(trained, trained.prior.copies(batch, []), reference))
+    (actor, critic), (same_actor, twice) = found
+    torch.testing.assert_close(same_actor, actor)
+    torch.testing.assert_close(twice, 2 * critic)
+    assert critic.abs().max() > 1e-3
 
 
 @pytest.mark.parametrize(

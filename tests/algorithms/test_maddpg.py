@@ -144,11 +144,36 @@ def test_the_actor_climbs_the_critic_and_leaves_it_alone(rule):
 
 def test_target_networks_go_a_small_part_of_the_way():
     trained, episodes = prepared(algo__tau=0.25)
-    start = trained.target_critic.layers[0].weight.clone()
-    trained.update(episodes)
-    torch.testing.assert_close(
-        trained.target_critic.layers[0].weight, 0.75 * start + 0.25 * trained.critic.layers[0].weight.detach()
+    pairs = (
+        (trained.policy.actor.layers[0].weight, trained.target_policy.actor.layers[0].weight),
+        (trained.critic.layers[0].weight, trained.target_critic.layers[0].weight),
     )
+    starts = [target.clone() for _, target in pairs]
+    trained.update(episodes)
+    for (online, target), start in zip(pairs, starts, strict=True):
+        torch.testing.assert_close(target, 0.75 * start + 0.25 * online.detach(), rtol=0, atol=1e-7)
+        assert (target - start).abs().max() > 1e-4, "the control"
+
+
+def test_actor_and_critic_have_rates_of_their_own():
+    """Adam's first step moves no weight further than its rate, and one with a large gradient nearly that far."""
+    trained, episodes = prepared(algo__actor_learning_rate=1e-4, algo__learning_rate=4e-3)
+    buffers = [optimiser.parameters.buffer for optimiser in (trained.actor_optimiser, trained.critic_optimiser)]
+    before = [buffer.clone() for buffer in buffers]
+    trained.update(episodes)
+    moved = [float((now - then).abs().max()) for now, then in zip(buffers, before, strict=True)]
+    assert moved == [pytest.approx(1e-4, rel=0.05), pytest.approx(4e-3, rel=0.05)]
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_the_actors_loss_is_in_units_of_one_steps_reward(closed):
+    """A critic that says 2 of everything: values are over the root of 25 steps, so the loss is -5 x 2."""
+    trained, episodes = prepared(prior__kind="none")
+    trained._closed_form = closed
+    linear_critic(trained, torch.zeros(5))
+    trained.critic.layers[0].bias.data.fill_(2.0)
+    metrics = trained._learn_actor(trained.prior.copies(episodes, []), trained._critic_rows(episodes)[:, :, :-1])
+    torch.testing.assert_close(metrics["policy_loss"].detach(), torch.full((2,), -10.0))
 
 
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])

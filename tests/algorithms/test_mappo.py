@@ -1,6 +1,8 @@
 """MAPPO with and without the prior: what must be equal bit for bit, and what must not."""
 
 import copy
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -224,3 +226,182 @@ def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_valu
         final.obs[rollout.terminated[:, :, t]] = 7.0
     again, _ = learner("wildlife", **settings).prepare(marred)
     torch.testing.assert_close(again.advantage, batch.advantage)
+
+
+@pytest.mark.parametrize("group", ["actor", "critic"])
+def test_a_gradient_that_is_not_finite_stops_its_seed(group):
+    trained = learner()
+    step = trained.optimiser.step
+
+    def broken(gradient):
+        norms = dict(zip(("actor", "critic"), step(gradient), strict=True))
+        norms[group][1] = torch.nan
+        return [*norms.values()]
+
+    trained.optimiser.step = broken
+    result = trained.iterate(0.0)
+    assert result.finite.tolist() == [True, False]
+    assert all(result.metrics[f"train/{name}"].isfinite().all() for name in ("policy_loss", "value_loss"))
+
+
+def test_a_tiny_largest_norm_of_the_gradient_keeps_the_weights_where_they_are():
+    """Adam moves a weight by the rate times g / (g + 1e-5), which is 1e-3 x 1e-7 at most."""
+    for norm, moves in ((1e-12, False), (10.0, True)):
+        trained = learner(mappo__max_grad_norm=norm)
+        before = trained.optimiser.parameters.buffer.clone()
+        trained.iterate(0.0)
+        moved = (trained.optimiser.parameters.buffer - before).abs().max()
+        assert bool(moved > 1e-7) is moves
+
+
+def test_the_numbers_of_an_update_are_means_over_its_minibatches():
+    """A fresh policy is nearly uniform over five actions: its entropy is ln 5."""
+    metrics = learner(mappo__num_minibatches=4, mappo__learning_rate=1e-12).iterate(0.0).metrics
+    torch.testing.assert_close(metrics["train/entropy"], torch.full((2,), math.log(5)), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("clip", "fraction", "loss"), [(0.2, 1.0, -1.2), (1.5, 0.0, -2.0)])
+def test_what_is_logged_of_the_policy_by_hand(clip, fraction, loss):
+    """The probability of what was done is 1/2 and was 1/4: a ratio of 2, for an advantage of 1."""
+    trained = learner(mappo__clip_epsilon=clip, prior__kind="none")
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    ones = torch.ones_like(batch.log_prob)
+    batch = replace(batch, action=torch.zeros_like(batch.action), log_prob=ones * math.log(1 / 4), advantage=ones)
+    outputs = torch.tensor([1 / 2, 1 / 8, 1 / 8, 1 / 8, 1 / 8]).log().expand(*ones.shape, 5)
+    sums = {}
+    trained._watch(batch, outputs, batch.value, 1.0, sums)
+    expected = {
+        "clip_fraction": fraction,
+        "kl": 2 - 1 - math.log(2),
+        "entropy": math.log(2) / 2 + 4 * math.log(8) / 8,
+        "policy_loss": loss,
+    }
+    for name, number in expected.items():
+        torch.testing.assert_close(sums[name], torch.full((2,), number))
+
+
+def test_the_return_is_that_of_each_episode_alone():
+    """A reward of 1 a step for 25 steps, of episodes that end in the third, the fifth and the eighth rollout."""
+    trained = learner()
+    step = trained.collector.env.step
+    trained.collector.env.step = lambda action: replace(step(action), reward=torch.ones(2, 4, 3))
+    returns = []
+    for _ in range(8):
+        trained.collector.collect(10)
+        returns.append(trained.collector.pop_mean_return().nan_to_num(-1.0).tolist())
+    assert returns == [[number] * 2 for number in (-1.0, -1.0, 25.0, -1.0, 25.0, -1.0, -1.0, 25.0)]
+
+
+@pytest.mark.parametrize(("anneal", "share"), [(True, 0.25), (False, 1.0)])
+def test_rate_and_entropy_fall_linearly_where_asked(anneal, share):
+    trained = learner(
+        mappo__anneal_learning_rate=anneal,
+        mappo__anneal_entropy=anneal,
+        mappo__learning_rate=0.008,
+        mappo__entropy_coef=0.04,
+    )
+    rollout, step, seen = trained.collector.collect(25), trained._gradient_step, []
+    trained._gradient_step = lambda rows, entropy, sums: seen.append(entropy) or step(rows, entropy, sums)
+    for progress in (0.5, 0.75):  # the share is of the first rate, not of the last
+        seen.clear()
+        trained.update(rollout, progress)
+    assert trained.optimiser.learning_rate == pytest.approx(0.008 * share)
+    assert seen == [pytest.approx(0.04 * share)] * 4, "two minibatches in two epochs"
+
+
+@pytest.mark.parametrize(("bootstrap", "last"), [(True, 6.0), (False, 1.0)])
+def test_the_target_of_a_cut_episode_by_hand(bootstrap, last):
+    """Rewards of 1, values of 0 but for 10 of the final states: 1 + 0.5 x 10 where the final state is valued."""
+    trained = learner(mappo__bootstrap_truncated=bootstrap, mappo__gamma=0.5, mappo__gae_lambda=0.0)
+    rollout = trained.collector.collect(25)
+    rollout.reward.fill_(1.0)
+    trained.critic.unroll = lambda obs, state: obs.new_full((*obs.shape[:3], 1), 10.0 if obs.shape[2] == 1 else 0.0)
+    batch, _ = trained.prepare(rollout)
+    targets = trained.normaliser.denormalise(batch.target).view(2, 4, 25)
+    torch.testing.assert_close(targets, torch.tensor([1.0] * 24 + [last]).expand(2, 4, 25))
+
+
+def test_minibatches_take_every_row_once_in_an_order_of_each_seed_and_epoch():
+    trained = learner(mappo__num_minibatches=4)
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    numbers = torch.arange(100.0)
+    batch = replace(batch, value=numbers.view(1, 100, 1, 1).expand(2, 100, 1, 1))
+    orders = []
+    for _ in range(2):
+        parts = trained._minibatches(batch)
+        assert [part.value.shape[1] for part in parts] == [25] * 4
+        orders += torch.cat([part.value for part in parts], 1).flatten(1).unbind(0)
+    assert all(torch.equal(order.sort().values, numbers) for order in orders)
+    assert len({tuple(order.tolist()) for order in [numbers, *orders]}) == 5
+
+
+RECOMPUTED = {
+    "mappo__clip_value": True,
+    "prior__kind": "augment",
+    "prior__transforms": "rot90",
+    "prior__old_log_prob": "recompute",
+}
+
+
+def test_old_probabilities_and_values_are_those_of_the_networks_that_collected():
+    trained = learner(**RECOMPUTED)
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    trained._remember_old_networks()
+    before = trained.reevaluated(batch)
+    trained.optimiser.parameters.buffer.add_(torch.linspace(-1, 1, trained.optimiser.parameters.buffer.shape[1]))
+    after = trained.reevaluated(batch)
+    assert torch.equal(after.log_prob, before.log_prob)
+    assert torch.equal(after.value, before.value)
+    trained._remember_old_networks()
+    now = trained.reevaluated(batch)
+    assert (now.log_prob - before.log_prob).abs().max() > 0.01, "the control"
+    assert (now.value - before.value).abs().max() > 0.1, "the control"
+
+
+@pytest.mark.parametrize("rule", ["recompute", "copy"])
+def test_the_old_value_of_a_copy_is_what_the_critic_said_of_the_copy(rule):
+    trained = learner(**RECOMPUTED | {"prior__old_log_prob": rule})
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    trained._remember_old_networks()
+    copies = trained.prior.copies(batch, trained.generators["prior"], trained.reevaluated)
+    rows = copies.rows.map(lambda x: x[:, batch.count :])
+    torch.testing.assert_close(rows.value, trained.critic.unroll(rows.obs, rows.state).detach())
+    assert (rows.value - batch.value).abs().max() > 0.1, "the control"
+
+
+@pytest.mark.parametrize(("clip", "expected"), [(True, 3.92), (False, 0.5)])
+def test_value_clipping_by_hand(clip, expected):
+    """The old value is 0, the value 2, the target 3: an error of 1, and of 2.8 where the value is clipped to 0.2."""
+    trained = learner(mappo__clip_value=clip, prior__kind="none")
+    batch, _ = trained.prepare(trained.collector.collect(25))
+    value = torch.full_like(batch.value, 2.0)
+    batch = replace(batch, value=value * 0, target=value + 1, advantage=torch.zeros_like(batch.advantage))
+    trained.critic.unroll = lambda *args: value
+    sums = {}
+    loss = trained.reference_loss(trained.prior.copies(batch, []), 0.0, 1.0, sums)
+    torch.testing.assert_close(loss.detach(), torch.full((2,), expected))
+    torch.testing.assert_close(sums["value_loss"], torch.full((2,), expected))
+
+
+def test_the_memory_of_a_world_is_empty_where_its_episode_ended_and_there_alone():
+    collector = learner(network__name="gru").collector
+    collector.collect(10)
+    assert (collector.memory.abs().amax(2) > 0).all(), "they remember within an episode"
+    kept, ended = collector.memory.clone(), torch.tensor([[False, True, False, False], [True, False, False, True]])
+    collector._finish(torch.zeros(2, 4, 3), ended, True)
+    memory, kept = (x.view(2, 4, 3, -1) for x in (collector.memory, kept))
+    assert (memory[ended] == 0).all()
+    assert torch.equal(memory[~ended], kept[~ended])
+    collector.collect(15)
+    assert (collector.memory == 0).all(), "the horizon ended all"
+
+
+def test_the_next_value_along_whole_episodes_is_that_of_the_step_after():
+    """Of a critic that says how many steps it has seen: 0 to 24, and 1 to 25 behind them, in each of two episodes."""
+    trained = learner(network__name="gru", mappo__num_steps=50)
+    rollout = trained.collector.collect(50)
+    steps = torch.arange(26.0).view(26, 1)
+    trained.critic.unroll = lambda obs, state: steps[: obs.shape[2]].expand(*obs.shape[:2], -1, 1)
+    value, following = values_along(trained.critic, rollout, 25)
+    assert torch.equal(value, steps[:25].repeat(2, 1).expand(2, 4, 50, 1))
+    assert torch.equal(following - value, torch.ones(2, 4, 50, 1))

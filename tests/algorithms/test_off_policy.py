@@ -229,3 +229,73 @@ def test_a_reward_for_every_step_counts_where_episodes_end_early_alone(algorithm
     steps, gamma = trained.spec.horizon, trained.config.gamma * trained.config.td_lambda
     expected = share * steps**-0.5 * (1 - gamma**steps) / (1 - gamma)
     torch.testing.assert_close(targets[:, :, 0], torch.full_like(targets[:, :, 0], expected))
+
+
+@pytest.mark.parametrize(("algorithm", "optimiser"), [("maddpg", "actor"), ("maddpg", "critic"), ("qmix", "adam")])
+def test_a_gradient_that_is_not_finite_stops_its_seed(algorithm, optimiser):
+    trained = learner(algorithm)
+    step = trained.optimisers[optimiser].step
+
+    def broken(gradient):
+        (norm,) = step(gradient)
+        norm[1] = torch.nan
+        return [norm]
+
+    trained.optimisers[optimiser].step = broken
+    result = trained.iterate(0.0)
+    assert result.finite.tolist() == [True, False]
+    assert all(value.isfinite().all() for name, value in result.metrics.items() if name.endswith("loss"))
+
+
+@both
+def test_a_tiny_largest_norm_of_the_gradient_keeps_the_weights_where_they_are(algorithm):
+    """Adam moves a weight by the rate times g / (g + 1e-5), which is 4e-3 x 1e-7 at most."""
+    for norm, moves in ((1e-12, False), (10.0, True)):
+        trained = learner(algorithm, algo__max_grad_norm=norm)
+        buffers = [optimiser.parameters.buffer for optimiser in trained.optimisers.values()]
+        before = [buffer.clone() for buffer in buffers]
+        trained.iterate(0.0)
+        moved = [float((now - then).abs().max()) for now, then in zip(buffers, before, strict=True)]
+        assert [size > 1e-7 for size in moved] == [moves] * len(moved)
+
+
+@both
+@pytest.mark.parametrize(("delta", "loss"), [(1.0, 2.5), (2.0, 4.0), (10.0, 4.5)])
+def test_the_td_loss_is_linear_beyond_the_chosen_error(algorithm, delta, loss):
+    """Of an error of 3: 1 x (3 - 1/2), 2 x (3 - 1), and 3^2 / 2 within."""
+    trained = learner(algorithm, algo__huber_delta=delta, prior__kind="none")
+    episodes, _ = trained.collector.collect()
+    values = torch.full((2, 2, 25, 1), 4.0)
+    found, metrics = trained._td_loss(values, values - 3, trained.prior.copies(episodes, []))
+    assert found.tolist() == metrics["td_loss"].tolist() == [loss, loss]
+
+
+@both
+def test_every_episode_brings_its_gradient_steps(algorithm):
+    trained = learner(algorithm, algo__updates_per_episode=3)
+    trained.iterate(0.0)
+    assert trained.updates == 12, "3 for each of two worlds in each of two rounds"
+
+
+@both
+def test_the_numbers_of_an_iteration_are_means_over_its_rounds_and_its_gradient_steps(algorithm):
+    """Returns of 1 and 5, and losses of 1, 2, 3, 4 in the four gradient steps of two rounds."""
+    trained = learner(algorithm)
+    collect, returns, losses = trained.collector.collect, iter((1.0, 5.0)), iter((1.0, 2.0, 3.0, 4.0))
+    trained.collector.collect = lambda: (collect()[0], torch.full((2,), next(returns)))
+    trained.update = lambda batch: {"td_loss": torch.full((2,), next(losses))}
+    metrics = trained.iterate(0.0).metrics
+    assert metrics["train/return"].tolist() == [3.0, 3.0]
+    assert metrics["train/td_loss"].tolist() == [2.5, 2.5]
+
+
+@both
+def test_the_reward_statistics_forget_by_the_episode(algorithm):
+    """A round of eight episodes of rewards 0 leaves 0.999^8 of what was there, one of four 0.999^4."""
+    for worlds, kept in ((4, 0.99600), (8, 0.99203)):
+        trained = learner(algorithm, algo__num_envs=worlds, algo__replay_episodes=20)
+        trained.reward_scale.mean.fill_(1.0)
+        episodes, _ = trained.collector.collect()
+        episodes.reward.zero_()
+        trained._store(episodes)
+        torch.testing.assert_close(trained.reward_scale.mean, torch.full((2,), kept), atol=1e-5, rtol=0)

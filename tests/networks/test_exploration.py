@@ -137,3 +137,13 @@ def test_a_recurrent_policy_reads_its_previous_action_and_a_perceptron_does_not(
         one, two = acts.unroll(obs, action), acts.unroll(obs, other)
         assert torch.equal(one[:, :, :3], two[:, :, :3])
         assert torch.equal(one[:, :, 3:], two[:, :, 3:]) is not reads
+
+
+def test_the_noise_of_a_continuous_action_has_the_deviation_epsilon_by_hand():
+    """In the bounds as it is, and where it leads beyond them back onto them: (3, 4) / 5."""
+    head = BoundedPoint(Continuous(layout(Field("force", Kind.VECTOR))), 1)
+    still, noise = torch.zeros(1, 1, 1, 2), torch.tensor([1.0, 0.0])
+    head.explore(0.1)
+    torch.testing.assert_close(head.sample(still, noise).flatten(), torch.tensor([0.1, 0.0]))
+    head.explore(1.0)
+    torch.testing.assert_close(head.sample(still, torch.tensor([3.0, 4.0])).flatten(), torch.tensor([0.6, 0.8]))

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import resolve_config
 from esp_cli.training.loading import load_policy, parse_config
 from esp_cli.training.metrics import read_metrics
+from esp_cli.training.play import play
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer, checkpoint_seconds
 from tests.forks import fork, said, wait
@@ -87,34 +89,64 @@ def test_metrics_past_the_checkpoint_are_dropped_on_resume(tmp_path):
     assert resumed.step == kept[-1]["step"]
 
 
-def test_evaluations_do_not_depend_on_when_a_run_was_stopped_and_differ_between_steps(tmp_path):
+def test_a_run_is_evaluated_at_its_start_and_at_every_step_that_was_asked_for(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(lambda news: True)
     rows = [row for row in read_metrics(folder.metrics_path) if "eval/return_greedy" in row]
     assert [row["step"] for row in rows] == [0, 100, 200, 300]
     assert all(len(row["eval/return_stochastic"]) == 2 for row in rows)
-    assert rows[0]["eval/return_greedy"] != rows[1]["eval/return_greedy"]
 
 
-def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path):
-    folder = tiny_folder(tmp_path / "run")
-    broken = trainer(folder)
-    iterate, notes = broken.learner.iterate, []
-    good = []
+def test_every_step_is_evaluated_in_worlds_of_its_own(tmp_path):
+    """The policy stays as it began, so that the worlds alone make the returns differ."""
+    folder = tiny_folder(tmp_path / "run", mappo__learning_rate=1e-30)
+    run = trainer(folder)
+    began = {name: tensor.clone() for name, tensor in run.learner.policy.state_dict().items()}
+    run.run(lambda news: True)
+    assert all((tensor - began[name]).abs().max() < 1e-20 for name, tensor in run.learner.policy.state_dict().items())
+    returns = [row["eval/return_greedy"] for row in read_metrics(folder.metrics_path) if "eval/return_greedy" in row]
+    assert len(returns) == 4
+    for seed in (0, 1):
+        assert len({row[seed] for row in returns}) == 4
 
-    def break_seed_one_in_the_third_iteration(progress):
+
+def test_greedy_evaluations_draw_no_action_and_stochastic_ones_draw_from_new_generators(tmp_path, monkeypatch):
+    controllers = []
+    monkeypatch.setattr(training, "play", lambda env, by: controllers.append(by) or play(env, by))
+    trainer(tiny_folder(tmp_path / "run", steps=100)).run(lambda news: True)
+    greedy, first, again, second = (controller.generators for controller in controllers)
+    assert greedy is None
+    assert again is None
+    assert len(first) == len(second) == 2
+    assert len({generator.initial_seed() for generator in (*first, *second)}) == 4, "of each seed at each step"
+
+
+def break_seed_one_in_the_third_iteration(broken):
+    """Give its critic a weight that is no number; return what is filled with what seed 1 had before, by name."""
+    iterate, good = broken.learner.iterate, {}
+
+    def breaking(progress):
         if broken.iteration == 2:
-            good.append(broken.learner.policy.actor.layers[0].weight[1].detach().clone())
+            state = {name: tensor for name, tensor in broken.learner.state_dict().items() if tensor.dim()}
+            parts = ("policy", "critic", "normaliser", "optimiser")
+            good.update({name: tensor[1].clone() for name, tensor in state.items() if name.startswith(parts)})
             with torch.no_grad():
                 broken.learner.critic.network.layers[0].weight[1, 0, 0] = torch.nan
         return iterate(progress)
 
-    broken.learner.iterate = break_seed_one_in_the_third_iteration
+    broken.learner.iterate = breaking
+    return good
+
+
+def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    broken, notes = trainer(folder), []
+    good = break_seed_one_in_the_third_iteration(broken)
     assert broken.run(lambda news: notes.extend(news.notes) or True)
     assert broken.stopped_seeds == {1: 150}
     assert any("seed 1 stopped at step 150" in note for note in notes)
     tensors, _ = final_state(folder)
-    assert torch.equal(tensors["policy.actor.layers.0.weight"][1], good[0])
+    assert torch.equal(tensors["policy.actor.layers.0.weight"][1], good["policy.actor.layers.0.weight"])
     assert all(t.isfinite().all() for name, t in tensors.items() if name.startswith(("policy", "critic")))
     last = read_metrics(folder.metrics_path)[-1]
     assert last["train/policy_loss"][0] is not None
@@ -124,6 +156,27 @@ def test_a_seed_that_breaks_stops_alone_and_keeps_its_last_good_policy(tmp_path)
     theirs = final_state(whole)[0]["policy.actor.layers.0.weight"]
     assert torch.equal(tensors["policy.actor.layers.0.weight"][0], theirs[0]), "seed 0 never noticed"
     assert not torch.equal(tensors["policy.actor.layers.0.weight"][1], theirs[1])
+
+
+def test_a_seed_that_broke_stays_as_it_was_when_its_run_is_resumed(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    broken = trainer(folder)
+    good = break_seed_one_in_the_third_iteration(broken)
+    assert not broken.run(lambda news: news.step < 200)
+    assert broken.step == 200
+    resumed = trainer(folder)
+    assert resumed.stopped_seeds == {1: 150}
+    halted, _ = final_state(folder)
+    assert resumed.run(lambda news: True)
+    assert resumed.stopped_seeds == {1: 150}
+    tensors, _ = final_state(folder)
+    assert all(same_bits(tensors[name][1], kept) for name, kept in good.items())
+    assert not any(torch.equal(tensors[name][0], halted[name][0]) for name in good if "weight" in name), "the control"
+    rows = [row for row in read_metrics(folder.metrics_path) if row["step"] > 0]
+    assert [row["step"] for row in rows] == [50, 100, 150, 200, 250, 300]
+    assert [row["train/policy_loss"][1] is None for row in rows] == [False, False, True, True, True, True]
+    assert rows[-1]["eval/return_greedy"][0] is not None
+    assert rows[-1]["eval/return_greedy"][1] is None
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
@@ -242,6 +295,39 @@ def test_a_checkpoint_that_says_something_else_of_its_run_is_one_sentence(tmp_pa
     folder.write_checkpoint(meta.pop("step"), tensors, meta | change)
     with pytest.raises(ValueError, match=sentence):
         trainer(folder)
+
+
+def test_the_seconds_of_a_resumed_run_go_on_from_those_of_its_checkpoint(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    trainer(folder).run(stop_after(2))
+    tensors, meta = folder.latest_checkpoint(pytest.fail)
+    folder.write_checkpoint(meta.pop("step"), tensors, meta | {"elapsed_s": 1000.0})
+    trainer(folder).run(lambda news: True)
+    seconds = [row["time/elapsed_s"] for row in read_metrics(folder.metrics_path) if "time/elapsed_s" in row]
+    assert [second >= 1000 for second in seconds] == [False, False, True, True, True, True]
+    assert seconds[2] < 2000
+
+
+def test_the_speed_is_that_of_all_seeds_together(tmp_path, monkeypatch):
+    """Of 50 steps of two seeds each, in a second of learning and an hour of evaluation."""
+    folder, now = tiny_folder(tmp_path / "run"), [0.0]
+    run = trainer(folder)
+    iterate, evaluate = run.learner.iterate, run._evaluate
+
+    def pass_a_second(progress):
+        now[0] += 1.0
+        return iterate(progress)
+
+    def pass_an_hour():
+        now[0] += 3600.0
+        return evaluate()
+
+    run.learner.iterate, run._evaluate = pass_a_second, pass_an_hour
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    run.run(lambda news: True)
+    rows = read_metrics(folder.metrics_path)[1:]
+    assert [row["time/steps_per_second"] for row in rows] == [100.0] * 6
+    assert [row["time/elapsed_s"] % 3600 for row in rows] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-1", "often", ""])
