@@ -179,8 +179,8 @@ def draw_steps() -> None:
             named = None if place else label
             ax.plot([min(median / cell.step, 1.2)], [place + shift], "o", color=colour, markersize=6, label=named)
     ax.set_xscale("log")
-    ax.set_xlim(0.02, 1.4)
-    ax.set_xticks([1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1], ["1/32", "1/16", "1/8", "1/4", "1/2", "1"])
+    ax.set_xlim(0.014, 1.4)
+    ax.set_xticks([1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1], ["1/64", "1/32", "1/16", "1/8", "1/4", "1/2", "1"])
     ax.minorticks_off()
     ax.set_yticks(range(len(pairs)), [f"{cell.panel}: {other.variant}" for cell, other in pairs])
     ax.set_ylim(-0.6, len(pairs) - 0.4)
