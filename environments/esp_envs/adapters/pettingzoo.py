@@ -47,7 +47,7 @@ class ParallelSettings(TaskSettings):
 
     horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode")
     workers: int | None = Setting(
-        None, ge=0, le=256, description="processes that step the copies; 0 is none, by default one for each core of the run"
+        None, ge=0, le=256, description="processes that step copies; 0 is none, by default one a core of the run"
     )
 
 
