@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -18,6 +15,7 @@ from esp_cli.evaluation.final import play_batches
 from esp_cli.evaluation.spread import spread_over_episodes
 from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.loading import TrainedPolicy, single_seed
+from esp_cli.training.locking import taking_turns
 from esp_cli.training.play import Episodes, PolicyController
 from esp_cli.training.policy_file import describe_policy, write_policy
 
@@ -80,7 +78,7 @@ def bundle(
     played = play_greedily(alone, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
-    with _alone_in(folder):
+    with taking_turns(folder):
         others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
         file = folder / f"{name}.safetensors"
         description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
@@ -105,18 +103,6 @@ def bundle(
         )
         write_bundled(folder, (*others, entry))
     return entry
-
-
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Wait until no other process adds to the folder, and let none begin; where the file system can lock."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:

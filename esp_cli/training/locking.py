@@ -1,4 +1,4 @@
-"""A lock file that one process holds: the kernel lets go of it when the process ends, however it ends."""
+"""Locks that one process holds: the kernel lets go of them when the process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import fcntl
 import json
 import os
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from esp_cli.files.failures import attempting
@@ -41,6 +43,18 @@ def acquire(file: Path) -> int:
             os.close(descriptor)
             raise
     return descriptor
+
+
+@contextmanager
+def taking_turns(folder: Path) -> Iterator[None]:
+    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def release(descriptor: int) -> None:

@@ -22,6 +22,7 @@ from esp_cli.deploy.manifest import MANIFEST, Entry, bundled_folder, read_bundle
 from esp_cli.evaluation.final import evaluate
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_cli.training.loading import TrainedPolicy
+from esp_cli.training.locking import taking_turns
 from esp_cli.training.play import Episodes
 from tests.deploy.policies import drawn_policy
 
@@ -272,10 +273,10 @@ def test_two_exports_into_one_folder_take_turns(tmp_path: Path) -> None:
 
     def second() -> None:
         began.set()
-        with bundling._alone_in(tmp_path):
+        with taking_turns(tmp_path):
             order.append("second")
 
-    with bundling._alone_in(tmp_path):
+    with taking_turns(tmp_path):
         other = threading.Thread(target=second)
         other.start()
         began.wait()

@@ -211,16 +211,23 @@ class Haunted(Walk):
 
 
 def test_an_opponent_that_has_left_acts_no_more() -> None:
+    acted = []
+
     class Haunting(Walking):
         metrics = ()
 
         def make_one(self):
             return Haunted(self.settings.horizon)
 
+        def opponent(self, agent, observation, generator):
+            acted.append(agent)
+            return 0
+
     env = worlds(Haunting, workers=0)
     env.reset()
     for _ in range(8):
         env.step(env.random_action())
+    assert acted == ["ghost"] * 40, "twice in each of two episodes of ten copies"
 
 
 SENTENCES = {
@@ -356,6 +363,7 @@ def test_a_signal_to_the_whole_group_leaves_the_workers_to_their_parent() -> Non
     for _, worker in env._copies._workers:
         os.kill(worker.pid, signal.SIGTERM)
     env.step(env.random_action())
+    assert all(worker.is_alive() for _, worker in env._copies._workers)
 
 
 @pytest.fixture

@@ -117,9 +117,6 @@ class Stepper(Protocol):
     def step(self) -> None:
         """Advance the active copies by one step, and reset those whose episode ends."""
 
-    def close(self) -> None:
-        """Let go of the copies."""
-
 
 class WorkerCopies:
     """The copies shared out among worker processes, which are forks of this one.
@@ -157,10 +154,6 @@ class WorkerCopies:
     def step(self) -> None:
         """Advance the active copies by one step."""
         self._command(_STEP)
-
-    def close(self) -> None:
-        """Let the workers leave."""
-        self._finalizer()
 
     def _command(self, word: bytes) -> None:
         for pipe, _ in self._workers:
@@ -223,7 +216,6 @@ def _work(
     with contextlib.suppress(EOFError, ConnectionError):
         while (word := pipe.recv_bytes()) != _LEAVE:
             pipe.send_bytes(_failure_of(commands[word]).encode())
-    stepper.close()
 
 
 def _failure_of(command: Callable[[], None]) -> str:

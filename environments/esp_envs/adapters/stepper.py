@@ -161,16 +161,11 @@ class CopyStepper:
             if self.board.active[k]:
                 self._step(k, copy)
 
-    def close(self) -> None:
-        """Let go of the copies; what they raise then concerns nobody any more."""
+    def __del__(self) -> None:
+        """Close the copies of a task that is forgotten, or of a worker that leaves; what they raise concerns nobody."""
         for copy in self._copies.values():
             with suppress(Exception):
                 copy.close()
-        self._copies = {}
-
-    def __del__(self) -> None:
-        """Close the copies of a task that is forgotten."""
-        self.close()
 
     def _start(self, k: int) -> None:
         seed = int(self.board.seed[k])
