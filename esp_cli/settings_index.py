@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 INDEX = Path(__file__).with_suffix(".json")
-Value = bool | int | float | str | Sequence[int] | None
+Value = bool | int | float | str | Sequence[int] | Mapping[str, float] | None
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,10 @@ def fork(job: Callable[[], None], path: Path, log: Path | None = None, errors: P
     """Run a job in a fork that leads a group of its own; what it says goes to a file beside the path."""
     log = log or path.with_name("said.txt")
     sys.stdout.flush()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # until the child can answer it
     pid = os.fork()
     if pid:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return pid
     code = 1
     try:
@@ -42,6 +44,7 @@ def fork(job: Callable[[], None], path: Path, log: Path | None = None, errors: P
         sys.stdout, sys.stderr = (os.fdopen(fd, "w", 1, closefd=False) for fd in (1, 2))  # pytest has its own
         signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
             job()
             code = 0
         except SystemExit as end:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from importlib import import_module, invalidate_caches
 from importlib.metadata import EntryPoint, entry_points
 from inspect import isabstract
@@ -83,9 +84,9 @@ class Registry(Mapping[str, type[T]]):
             raise ValueError(
                 f"the {self.noun} '{name}' is not installed; add {self.option} {name} to let esp import and run it"
             )
-        raise ValueError(
-            f"unknown {self.noun} '{name[:80]}'; the {self.noun}s are {', '.join(self)}; name your own as module:Class"
-        )
+        near = get_close_matches(name.lower(), self, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"the {self.noun}s are {', '.join(self)}"
+        raise ValueError(f"unknown {self.noun} '{name[:80]}'; {hint}; name your own as module:Class")
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is a class of this name."""
@@ -118,8 +119,10 @@ class Registry(Mapping[str, type[T]]):
         try:
             module = import_module(module_name)
         except (Exception, SystemExit) as error:
+            missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(error.name or "?")
+            place = f"; it is looked for in {here} and among installed packages, without .py" if missing else ""
             raise ValueError(
-                f"cannot import the module '{module_name}' of the {self.noun}: {last_line(error)}"
+                f"cannot import the module '{module_name}' of the {self.noun}: {last_line(error)}{place}"
             ) from error
         finally:
             sys.path.remove(here)

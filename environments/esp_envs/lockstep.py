@@ -13,7 +13,7 @@ whose world is a few named tensors:
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -118,6 +118,7 @@ class BatchedTask(LockstepTask):
                 "derive from Environment"
             )
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
+        self._unproven = self.spec.horizon
 
     @abstractmethod
     def _describe(self) -> TaskSpec:
@@ -184,10 +185,7 @@ class BatchedTask(LockstepTask):
         restore_generators(self.generators, tensors["generators"])
 
     def _begin(self) -> None:
-        drawn = [self._start(generator) for generator in self.generators]
-        for name, value in drawn[0].items():
-            if not isinstance(value, Tensor):
-                raise ValueError(f"'{name}' of what '_start' of {self.spec.name} drew is no tensor; give tensors")
+        drawn = [self._named("_start", self._start(generator)) for generator in self.generators]
         self.world = {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
         for field in self.spec.state.fields:
             found = self.world.get(field.name)
@@ -197,24 +195,54 @@ class BatchedTask(LockstepTask):
                 raise ValueError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
 
     def _play(self, action: Tensor) -> Outcome:
-        reward, metrics = self._advance(self.world, self.spec.action.admissible(action))
+        outcome: object = self._advance(self.world, self.spec.action.admissible(action))
+        if not isinstance(outcome, tuple) or len(outcome) != 2 or not isinstance(outcome[0], Tensor):
+            raise ValueError(
+                f"'_advance' of {self.spec.name} gives {type(outcome).__name__}; return a tensor of rewards and a dict "
+                "of metrics, as 'return reward, {}'"
+            )
+        reward, metrics = outcome[0], self._named("_advance", outcome[1])
         if reward.dim() == 2:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
-        require_shape("reward", reward, self.action_shape[:3])
+        require_shape(f"reward that '_advance' of {self.spec.name} gives", reward, self.action_shape[:3])
+        if self._unproven and self.spec.shared_reward:  # in the first episode alone: a GPU is waited for
+            self._unproven -= 1
+            if bool((reward != reward[..., :1]).any()):
+                raise ValueError(
+                    f"agents of {self.spec.name} get different rewards, but its spec says that they share them; return "
+                    "one reward [S, E], or set shared_reward=False in the spec"
+                )
         for name, value in metrics.items():
-            require_shape(f"metric {name}", value, self.action_shape[:2])
+            require_shape(f"metric {name} that '_advance' of {self.spec.name} gives", value, self.action_shape[:2])
         metrics = {name: value.float().contiguous().clone() for name, value in metrics.items()}
         return reward.float().contiguous().clone(), metrics
 
     def _seen(self) -> Observation:
-        obs = self._observe(self.world).flatten(3).float().clone(memory_format=torch.contiguous_format)
-        require_shape("observation", obs, (*self.action_shape[:3], self.spec.observation.width))
+        seen: object = self._observe(self.world)
+        if not isinstance(seen, Tensor):
+            raise ValueError(
+                f"'_observe' of {self.spec.name} gives {type(seen).__name__}; return a tensor [S, E, N, D]"
+            )
+        obs = seen.flatten(3).float().clone(memory_format=torch.contiguous_format)
+        width = self.spec.observation.width
+        require_shape(f"observation that '_observe' of {self.spec.name} gives", obs, (*self.action_shape[:3], width))
         alive = self._living(self.world)
         if (alive is not None) != self.spec.agents_end:
             raise ValueError(f"{self.spec.name}: implement '_living' and set 'agents_end' in the spec, or do neither")
         if alive is not None:
             require_flags("tensor of '_living'", alive, self.action_shape[:3])
         return Observation(obs, self._state(), self.action_mask(), None if alive is None else alive.clone())
+
+    def _named(self, method: str, named: object) -> Mapping[str, Tensor]:
+        """Refuse what a method of a subclass gives instead of tensors by name."""
+        if not isinstance(named, Mapping):
+            raise ValueError(
+                f"'{method}' of {self.spec.name} gives {type(named).__name__}; give a dict of tensors by name"
+            )
+        for name, value in named.items():
+            if not isinstance(value, Tensor):
+                raise ValueError(f"'{name}' of what '{method}' of {self.spec.name} gives is no tensor; give tensors")
+        return named
 
     def _put(self, state: Tensor) -> None:
         self.world = self._split(state.clone())

@@ -18,7 +18,7 @@ def discrete_moves(moves: int | Sequence[str]) -> Discrete:
             order of the action's index, of "stay", "right", "up", "left" and "down".
 
     Raises:
-        ValueError: a name is unknown or repeated; or there is no direction.
+        ValueError: a name is unknown or repeated; there is no direction; or it is neither a number nor names.
     """
     if isinstance(moves, int):
         if moves < 1:
@@ -28,6 +28,8 @@ def discrete_moves(moves: int | Sequence[str]) -> Discrete:
         angles = [2 * math.pi * k / moves for k in range(moves)]
         names = tuple(f"{360 * k / moves:g} degrees" for k in range(moves))
         return Discrete(Kind.VECTOR, tuple((math.cos(a), math.sin(a)) for a in angles), names)
+    if not isinstance(moves, Sequence):
+        raise ValueError(f"discrete_moves({moves!r}) is neither a number of directions nor their names; give one")
     for index, name in enumerate(moves):
         if name not in _MOVES or name in moves[:index]:
             wrong = "does not know" if name not in _MOVES else "was given twice"

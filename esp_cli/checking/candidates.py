@@ -23,7 +23,8 @@ _MOST = 64
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try: those asked for, else of d8, any angle, orders of agents and of declared items.
 
-    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task.
+    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task. Of the
+    default ones that move all numbers alike, as two mirrors that no vector sees, the first stands for all.
 
     Args:
         spaces: of the task.
@@ -37,13 +38,27 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
         agents = {"agents": spaces.num_agents} if spaces.num_agents > 1 else {}
         for name, count in (agents | Factors.of(spaces.symmetry).items).items():
             texts += _orders(name, count)
-    asked = dict.fromkeys(element for text in texts for element in _elements(text, spaces.num_agents))
-    refusals = {element: _refusal(element, spaces) for element in asked}
-    found = [element for element, refusal in refusals.items() if refusal is None]
+    refusals = _refusals(texts, spaces)
+    found: list[Element] = []
+    for element in (element for element, refusal in refusals.items() if refusal is None):
+        alike = (build_transform([element @ one.inverse()], spaces).is_identity for one in found)
+        if transforms is not None or not any(alike):
+            found.append(element)
     if not found:
         said = next(iter(refusals.values()), None)
         raise ValueError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
     return found
+
+
+def refused(spaces: Spaces, transforms: str) -> dict[str, str]:
+    """Return why elements that are asked for cannot be tried, by their names."""
+    return {element.name: told for element, told in _refusals([transforms], spaces).items() if told is not None}
+
+
+def _refusals(texts: Sequence[str], spaces: Spaces) -> dict[Element, str | None]:
+    """Return for each element that some texts name why it cannot be tried, or None."""
+    asked = dict.fromkeys(element for text in texts for element in _elements(text, spaces.num_agents))
+    return {element: _refusal(element, spaces) for element in asked}
 
 
 def _orders(name: str, count: int) -> list[str]:

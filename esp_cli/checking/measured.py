@@ -42,7 +42,7 @@ def prepared(config: RunConfig) -> RunConfig:
             f"with prior.compass nothing is false that prior.trust={prior.trust} could find; leave one of the two out"
         )
     if prior.transforms == DISCOVERED.rstrip(":"):
-        found = discover_in_task(_Maker(config)).transforms.removeprefix(DISCOVERED)
+        found = _discovered(_Maker(config))
         if prior.copies == "all" or prior.trust != "full":
             found = _listed(found, config)
         prior = prior.model_copy(update={"transforms": DISCOVERED + found} | ({} if found else {"kind": "none"}))
@@ -87,6 +87,11 @@ class _Maker:
 
     def __hash__(self) -> int:
         return hash(self._key)
+
+
+@lru_cache(maxsize=64)
+def _discovered(make_worlds: _Maker) -> str:
+    return discover_in_task(make_worlds).transforms.removeprefix(DISCOVERED)
 
 
 @lru_cache(maxsize=64)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from esp_cli.checking.candidates import candidates, found_group
+from esp_cli.checking.candidates import candidates, found_group, refused
 from esp_cli.checking.paired import check_paired
 from esp_cli.checking.recorded import collect
 from esp_cli.checking.transitions import check_transitions
@@ -25,6 +26,7 @@ class SymmetryReport:
         declared: the symmetry that the task declares.
         found: the largest group whose tried elements all hold.
         elements: one verdict for each element that was tried.
+        refused: why elements that were asked for could not be tried, by their names.
     """
 
     task: str
@@ -32,6 +34,7 @@ class SymmetryReport:
     declared: str
     found: str
     elements: tuple[ElementVerdict, ...]
+    refused: Mapping[str, str]
 
     @property
     def holds(self) -> bool:
@@ -57,4 +60,5 @@ def check_symmetry(make: MakeWorlds, transforms: str | None = None) -> SymmetryR
     else:
         worlds = min(_COPIES, max(32, 8192 // spec.horizon))
         method, verdicts = "transitions", check_transitions(spec, collect(make(worlds, [0])), elements)
-    return SymmetryReport(spec.name, method, spec.symmetry, found_group(verdicts, spec), tuple(verdicts))
+    found, left_out = found_group(verdicts, spec), {} if transforms is None else refused(spec, transforms)
+    return SymmetryReport(spec.name, method, spec.symmetry, found, tuple(verdicts), left_out)

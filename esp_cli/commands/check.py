@@ -113,7 +113,7 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
 
 
 def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
-    rows = []
+    rows: list[tuple[str, str, str, str]] = []
     for element in report.elements:
         worst = [f for f in element.fields if f.outcome == "broken"]
         gaps = ", ".join(f"{f.field} {f.gap:.3f} ± {f.error:.3f}" for f in worst)
@@ -122,6 +122,7 @@ def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
         rows.append((element.element, "yes" if element.declared else "no", element.outcome, told))
     title = f"{report.task} by {report.method}: declared {report.declared}, found {report.found}"
     caption = "gap and standard error in standard deviations of the field; found: as far as the visited states show"
+    rows += [(name, "no", "not tried", told) for name, told in report.refused.items()]
     console.table(("element", "declared", "result", "where"), rows, title=title, caption=caption)
     if measured:
         agreeing = [(m.element, f"{m.agreement:.3f}") for m in measured]

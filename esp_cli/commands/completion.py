@@ -44,15 +44,17 @@ def presets(_: typer.Context, incomplete: str) -> list[str]:
 def settings(context: typer.Context, incomplete: str) -> list[str]:
     """Offer the settings of the task, the learner and the network that the command line names so far.
 
-    Where it names a policy, which says what task it is of, all tasks' settings are offered and no others.
+    A command that trains nothing takes settings of the task alone. Where it does not name one that is built in, all
+    tasks' are offered.
     """
-    given = context.params
-    if "policy" in given:
-        found = [one.name for section in read_index() if section.kind == "task" for one in section.settings]
+    given, sections = context.params, read_index()
+    if "policy" in given or "what" in given:
+        tasks = [section.name for section in sections if section.kind == "task"]
+        names = [name for name in tasks if name in context.args] or tasks
     else:
         task, algo = given.get("task") or "navigation", given.get("algo") or "mappo"
-        names = (*_SHARED, given.get("network") or "mlp", task, algo)
-        found = [one.name for section in read_index() if section.name in names for one in section.settings]
+        names = [*_SHARED, given.get("network") or "mlp", task, algo]
+    found = [one.name for section in sections if section.name in names for one in section.settings]
     return [f"{name}=" for name in _starting(incomplete, found)]
 
 

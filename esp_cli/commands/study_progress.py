@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 
 from esp_cli import console
+from esp_cli.formatting import format_rate
 
 if TYPE_CHECKING:
     from esp_cli.studies.scheduler import Run, Snapshot
@@ -100,7 +101,8 @@ def run_status(run: Run) -> str:
     if rate is None:
         return steps
     left_s = (run.cell.config.steps - run.step) * len(run.cell.config.seeds) / rate
-    return f"{steps}  {console.format_count(rate)} steps/s  {console.format_duration(left_s)} left"
+    speed = format_rate(rate, len(run.cell.config.seeds))
+    return f"{steps}  {speed}  {console.format_duration(left_s)} left"
 
 
 def whole_status(snapshot: Snapshot) -> str:

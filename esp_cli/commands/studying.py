@@ -88,7 +88,8 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
     logged = [name for name in names if name in with_log]
     whose = "their folders" if len(logged) == len(names) else f"the folders of {', '.join(logged)}"
     see = f" see {LOG} in {whose} below {out};" if logged else ""
-    raise ValueError(f"{len(names)} runs failed ({', '.join(names)});{see} the same command tries them again")
+    runs = "run" if len(names) == 1 else "runs"
+    raise ValueError(f"{len(names)} {runs} failed ({', '.join(names)});{see} the same command tries them again")
 
 
 @contextmanager

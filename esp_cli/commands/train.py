@@ -216,6 +216,8 @@ def _announce(config: RunConfig, path: Path, step: int) -> None:
         if broken := [weight for weight in prior.weights.values() if weight < 1]:
             worth = f"{min(broken):.2g} to {max(broken):.2g}" if min(broken) < max(broken) else f"{broken[0]:.2g}"
             symmetry += f", {len(broken)} of {len(prior.weights)} elements broken and weighed {worth}"
+        if prior.fade:
+            symmetry += f", fading out over {prior.fade:.0%} of the run"
     elif config.prior.transforms == DISCOVERED:
         symmetry = "no prior (no symmetry was discovered)"
     verb = f"resuming at {console.format_count(step)}" if step else "training"

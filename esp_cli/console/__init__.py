@@ -64,6 +64,8 @@ def result(json: str | None, value: object, show: Callable[[], object]) -> None:
         show()
     if json is not None:
         write_json(json, value)
+        if json != "-":
+            note(f"json -> {json}")
 
 
 def write_json(path: str | Path, value: object) -> None:

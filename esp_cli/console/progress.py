@@ -11,7 +11,7 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from esp_cli.console.streams import err, note
-from esp_cli.formatting import format_count, format_duration
+from esp_cli.formatting import format_count, format_duration, format_rate
 
 LINE_INTERVAL_S = 10.0
 """Seconds between two plain progress lines where standard error is no terminal."""
@@ -132,7 +132,7 @@ class TrainingProgress:
         rate = self.rate()
         left_s = (self.total - self._done) * self.num_seeds / rate if rate > 0 else math.inf
         return [
-            f"{format_count(self._done)}/{format_count(self.total)}  {format_count(rate)} steps/s  "
+            f"{format_count(self._done)}/{format_count(self.total)}  {format_rate(rate, self.num_seeds)}  "
             f"{format_duration(left_s)} left",
             *(f"{name} {value:.4g}" for name, value in self._metrics.items()),
         ]

@@ -144,7 +144,7 @@ def _recorded(
             f"{trained.source} is a policy of {trained.config.task}, {other.source} of {other.config.task}; "
             "compare two policies of one task"
         )
-    theirs = other.config.seeds[0] if seed not in other.config.seeds else own
+    theirs = other.config.seeds[0] if seed is None or len(other.config.seeds) == 1 else seed
     return list(record_both(trained, other, (own, theirs), count, greedy))
 
 

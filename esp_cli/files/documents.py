@@ -198,7 +198,8 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
     if not first["loc"] and isinstance(first["input"], Mapping):  # settings that do not go together
         return f"bad settings{f' for {section}' if section else ''}: {own_words(first['msg'])}"
     message = "it has to be a list, as [64,64]" if first["type"] == "tuple_type" else own_words(first["msg"])
-    return f"bad value {shortened(repr(first['input']))} for '{name}': {message[0].lower()}{message[1:]}"
+    given = "" if isinstance(first["input"], Mapping) else f" {shortened(repr(first['input']))}"
+    return f"bad value{given} for '{name}': {message[0].lower()}{message[1:]}"
 
 
 def shortened(text: str) -> str:

@@ -116,6 +116,13 @@ def remove_file(path: Path) -> None:
     path.unlink(missing_ok=True)
 
 
+def sync_file(path: Path) -> None:
+    """Flush what was appended to a file, if it is there, to the disk."""
+    if path.exists():
+        with path.open("rb+") as file:
+            os.fsync(file.fileno())
+
+
 def _write_all(descriptor: int, content: bytes) -> None:
     """Write everything; a kill on purpose comes in the middle of it."""
     rest = memoryview(content)

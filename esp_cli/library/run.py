@@ -197,7 +197,9 @@ def plan(
 
 def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:
     """Make the folder of a new run, by default a new one in runs/."""
-    name = f"{file_name(config.task)}-{config.algorithm}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    name = (
+        f"{file_name(config.task)}-{file_name(config.algorithm)}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    )
     numbered = (Path("runs") / f"{name}-{k}" for k in itertools.count(2))
     free = (path for path in itertools.chain([Path("runs") / name], numbered) if not path.exists())
     path = next(free) if out is None else Path(out)

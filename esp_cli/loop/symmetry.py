@@ -27,6 +27,8 @@ _ARGUMENTS = {
     "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),
     "group": (str, 'a text, as "d4"'),
     "num_agents": (int, "a number of agents"),
+    "state": (Layout | None, "layout(Field(...), ...)"),
+    "seed": (int, "a number"),
 }
 """What arguments of a symmetry are, and what a message says to give."""
 
@@ -76,10 +78,10 @@ class Symmetry:
         copies: Literal["draw", "all"] = "draw",
         seed: int = 0,
     ) -> None:
-        given = {"observation": observation, "action": action, "group": group, "num_agents": num_agents}
-        for name, (kind, example) in _ARGUMENTS.items():
-            if not isinstance(given[name], kind):
-                raise ValueError(f"{name} is {given[name]!r}; give {example}")
+        given = (observation, action, group, num_agents, state, seed)
+        for value, (name, (kind, example)) in zip(given, _ARGUMENTS.items(), strict=True):
+            if not isinstance(value, kind):
+                raise ValueError(f"{name} is {value!r}; give {example}")
         if copies not in ("draw", "all"):
             raise ValueError(f"copies is {copies!r}; choose 'draw' or 'all'")
         if num_agents < 1:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding
 
-from esp_cli.networks.heads import MASKED, Categorical, Head, best, same_disc, squash
+from esp_cli.networks.heads import MASKED, Categorical, Head, best, drawn, same_disc, squash
 from esp_envs.base import random_choice
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
@@ -63,7 +63,7 @@ class EpsilonGreedy(ExploringChoice):
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw, per seed, whether to explore and where to: uniform [S, *shape, 2]."""
-        return torch.stack([torch.rand((*shape, 2), generator=g, device=g.device) for g in generators])
+        return drawn(torch.rand, (*shape, 2), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Explore where the first number is below epsilon; the second then names the action."""
@@ -145,8 +145,7 @@ class BoundedPoint(ExploringHead):
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
-        full = (*shape, self.num_outputs)
-        return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
+        return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action plus noise, back within the bounds."""

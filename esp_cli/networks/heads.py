@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -31,6 +31,11 @@ def masked(outputs: Tensor, action_mask: Tensor | None) -> Tensor:
     if action_mask is None:
         return outputs
     return outputs.masked_fill(~action_mask & action_mask.any(-1, keepdim=True), MASKED)
+
+
+def drawn(draw: Callable[..., Tensor], shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+    """Return [S, *shape] numbers, by `torch.rand` or `torch.randn`, per seed from its own generator, on its device."""
+    return torch.stack([draw(tuple(shape), generator=g, device=g.device) for g in generators])
 
 
 class Head(nn.Module, ABC):
@@ -77,7 +82,7 @@ class Categorical(Head):
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw what `sample` needs for actions of `shape`, per seed from its own generator: uniform [S, *shape]."""
-        return torch.stack([torch.rand(tuple(shape), generator=g, device=g.device) for g in generators])
+        return drawn(torch.rand, shape, generators)
 
     def normalise(self, outputs: Tensor) -> Tensor:
         """Return log-probabilities, which are what all other methods take.
@@ -144,8 +149,7 @@ class BoundedGaussian(Head):
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
-        full = (*shape, self.num_outputs)
-        return torch.stack([torch.randn(full, generator=g, device=g.device) for g in generators])
+        return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the latent action mean + std * noise."""

@@ -232,9 +232,9 @@ def verdicts_table(results: Results) -> Table | None:
     said = {True: "yes", False: "no", None: NOTHING}
     rows = tuple((v.method, said[v.unbroken], said[v.largest], said[v.between]) for v in verdicts(results))
     caption = (
-        "Where nothing is broken, a default is at most one standard error behind ESP. At the largest strength it is "
-        "not behind the plain learner. In between it is ahead of both or level with them. All holds in every task. "
-        f"{NOTHING}: runs are missing."
+        "Where nothing is broken, a default is at most one standard error (the larger of the two) behind ESP. At the "
+        "largest strength it is not behind the plain learner. In between it is ahead of both or level with them. All "
+        f"holds in every task. {NOTHING}: runs are missing."
     )
     headings = ("method", "not behind ESP unbroken", "not behind plain at the largest", "ahead or level in between")
     return Table("Could it be the default?", headings, rows, caption) if rows else None
@@ -242,13 +242,16 @@ def verdicts_table(results: Results) -> Table | None:
 
 def times_table(results: Results) -> Table:
     """Return what was run, by which version, and how long it took."""
-    done = [cell for cell in results.cells if cell.seconds is not None]
-    total = sum({(c.variant, str(c.config)): c.seconds or 0.0 for c in done}.values())  # each run once
-    versions = sorted({cell.esp_version for cell in done if cell.esp_version}) or [results.esp_version]
+    # each run once: a report may look at several of its steps, and it may not have reached the last of them
+    ordered = sorted(results.cells, key=lambda cell: cell.status == "finished")
+    runs = {(cell.variant, str(cell.config)): cell for cell in ordered}.values()
+    total = sum(run.seconds or 0.0 for run in runs)
+    trained_by = {run.esp_version for run in runs if run.seconds is not None and run.esp_version}
+    versions = sorted(trained_by) or [results.esp_version]
     rows = (
         ("command", "; ".join(results.command.splitlines())),
         ("version of esp", ", ".join(versions)),
-        ("runs finished", f"{sum(c.status == 'finished' for c in results.cells)} of {len(results.cells)}"),
+        ("runs finished", f"{sum(run.status == 'finished' for run in runs)} of {len(runs)}"),
         ("training", f"{format_duration(total)}, all runs added up"),
     )
     return Table("Provenance", ("", ""), rows)

@@ -97,7 +97,9 @@ class LocalJob:
         with self.log.open("rb") as file:
             file.seek(0, os.SEEK_END)
             file.seek(max(0, file.tell() - _TAIL_BYTES))
-            lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+            written = file.read().decode(errors="replace")
+        attempt = f"\n{written}".rpartition("\n$ esp")[2].partition("\n")[2]  # the log holds earlier attempts too
+        lines = [line.strip() for line in attempt.splitlines() if line.strip()]
         errors = [line for line in lines if line.startswith("error: ")]
         return (errors or lines or ["it said nothing"])[-1].removeprefix("error: ")
 

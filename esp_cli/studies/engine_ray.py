@@ -220,6 +220,8 @@ class RayJob:
             complete = self._fetch(mirror, news, lease["folder"])
             if complete and news["code"] is not None:
                 self._words = f"{news['words']} (on the node {lease['node']})"
+                if news["code"] < 0:  # the process could not say it itself
+                    mirror.say(self._words)
                 return news["code"]
             if self._stopping.is_set() and not told:
                 self._ask(actor.stop.remote(owner))

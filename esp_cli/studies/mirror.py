@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from esp_cli.files.opening import open_own
-from esp_cli.files.writing import remove_file, replace_file, replacing
+from esp_cli.files.writing import remove_file, replace_file, replacing, sync_file
 from esp_cli.studies.worker import CHUNK_BYTES, WHOLE_FILES, News
 from esp_cli.training.checkpoint_names import FILE_NAME, checkpoints_in, place_of, step_of, superseded
 from esp_cli.training.folder_names import FINAL, LOG, METRICS
@@ -97,7 +97,7 @@ class Mirror:
         else:
             place_of(self.path, name).parent.mkdir(exist_ok=True)
             if FILE_NAME.fullmatch(name):
-                _sync(self.path / METRICS)
+                sync_file(self.path / METRICS)
             with replacing(place_of(self.path, name)) as write:
                 for part in _parts(stamp[0], read):
                     write(part)
@@ -130,9 +130,3 @@ def _append(path: Path, content: bytes) -> None:
     if content:
         with os.fdopen(open_own(path, os.O_WRONLY | os.O_APPEND), "ab") as file:
             file.write(content)
-
-
-def _sync(path: Path) -> None:
-    if path.exists():
-        with path.open("rb+") as file:
-            os.fsync(file.fileno())

@@ -34,7 +34,6 @@ class Run:
         status: "elsewhere" is in use by a process that an earlier, killed scheduler left; it is waited for.
         step: environment steps per seed so far.
         trained_s: seconds of training behind these steps, summed over interruptions.
-        resumed_at: step at which this scheduler found it.
         message: why it failed.
     """
 
@@ -42,7 +41,6 @@ class Run:
     status: Status = "waiting"
     step: int = 0
     trained_s: float = 0.0
-    resumed_at: int = 0
     message: str = ""
     job: Job | None = field(default=None, repr=False)
 
@@ -51,7 +49,6 @@ class Run:
         """Return where a cell stands by its folder alone."""
         run = cls(cell, "finished" if folder.is_finished(cell) else "waiting")
         run.look(folder)
-        run.resumed_at = run.step
         return run
 
     def look(self, folder: StudyFolder) -> None:

@@ -160,9 +160,10 @@ class StudyFolder:
         again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
         changed = [new.name for new, old in again if new != old.model_copy(update={"reference": new.reference})]
         if there.kind != study.kind or there.episodes != study.episodes or changed:
+            which = f" ({changed[0]} has other seeds or settings)" if changed else ""
             raise StudyError(
-                f"{path} holds another study{f' ({changed[0]} differs)' if changed else ''}; go on with it by "
-                f"'{there.command.splitlines()[-1]}', or choose another --out"
+                f"{path} holds another study{which}; go on with it by '{there.command.splitlines()[-1]}', or choose "
+                "another --out"
             )
         for cell, _ in again:
             cls(path, there)._refuse_old_rules(cell)

@@ -82,11 +82,6 @@ class FiniteGroup(Group):
         """The product table [G, G]: entry (i, j) is the index of elements[i] @ elements[j]."""
         return np.array([[self._index[g @ h] for h in self.elements] for g in self.elements])
 
-    @cached_property
-    def inverses(self) -> NDArray[np.int64]:
-        """The index of each element's inverse [G]."""
-        return np.array([self._index[g.inverse()] for g in self.elements])
-
     def draw(self, generator: torch.Generator) -> Element:
         """Draw uniformly; see `Group.draw`."""
         return self.elements[int(torch.randint(self.order, (), generator=generator))]

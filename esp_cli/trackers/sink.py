@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,10 @@ class Guarded:
         try:
             action()
         except Exception as error:  # a tracker is foreign code: whatever it raises, the run goes on
-            self._tracker = None
+            failed, self._tracker = self._tracker, None
+            if failed is not None and verb == "write":
+                with contextlib.suppress(Exception):
+                    failed.close()
             reason = next(iter(str(error).splitlines()), "") or type(error).__name__
             self._tell(f"tracking with {self._name} ended: it cannot {verb} ({reason[:200]}); the run goes on")
 

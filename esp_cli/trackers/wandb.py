@@ -34,16 +34,20 @@ class WeightsAndBiases:
             x_disable_stats=True,
             x_disable_meta=True,
         )
-        self._run = wandb.init(
-            project=os.environ.get("WANDB_PROJECT", "esp"),
-            name=folder.name,
-            id=_run_id(run),
-            resume="allow",
-            dir=str(folder),
-            mode=mode,
-            config=dict(run.config),
-            settings=quiet,
-        )
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "esp"),
+                name=folder.name,
+                id=_run_id(run),
+                resume="allow",
+                dir=str(folder),
+                mode=mode,
+                config=dict(run.config),
+                settings=quiet,
+            )
+        except BaseException:
+            self._forget_places()
+            raise
         # not wandb's own step, which may not go back as that of a resumed run does
         self._run.define_metric("*", step_metric="step")
 
@@ -59,8 +63,11 @@ class WeightsAndBiases:
         try:
             self._run.finish()
         finally:
-            for name in self._set:
-                os.environ.pop(name, None)
+            self._forget_places()
+
+    def _forget_places(self) -> None:
+        for name in self._set:
+            os.environ.pop(name, None)
 
 
 def _run_id(run: TrackedRun) -> str:

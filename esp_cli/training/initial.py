@@ -40,7 +40,7 @@ def _matching(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, s
     if others not in (1, seeds):
         raise ValueError(
             f"cannot start {seeds} seed(s) from {source}, which holds {others}; "
-            f"train {others} seeds, or start from a policy of one seed"
+            f"train {others} seeds, or start from one of its seeds: 'esp export {source} --seed K -f policy' writes it"
         )
     own = policy.state_dict()
     # names before shapes: those that differ are of another algorithm or network

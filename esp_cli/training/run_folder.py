@@ -29,7 +29,7 @@ from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
-from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file
+from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
     CheckpointError,
@@ -204,9 +204,7 @@ class RunFolder:
         path = self.checkpoint_path(step, final)
         with attempting("write", path, RunFolderError):
             path.parent.mkdir(exist_ok=True)
-            if self.metrics_path.exists():
-                with self.metrics_path.open("rb+") as metrics:
-                    os.fsync(metrics.fileno())
+            sync_file(self.metrics_path)
         save_checkpoint(path, tensors, {**meta, "step": step})
         with attempting("remove old checkpoints beside", path, RunFolderError):
             for file in superseded(self.checkpoints(), step):
@@ -249,7 +247,8 @@ class RunFolder:
                 if meta.get("step") != step_of(file):
                     raise CheckpointError(f"{file} does not hold the step that its name says")
             except CheckpointError as error:
-                problem = problem or str(error)
+                if file.exists():  # another process may have ended the run, and removed it, since it was listed
+                    problem = problem or str(error)
                 continue
             if problem:
                 note(f"{problem}; going back to step {step_of(file)}")

@@ -74,6 +74,18 @@ def test_only_the_filled_part_is_saved_and_comes_back():
         replay(capacity=2).load_state_dict(saved)
 
 
+def test_a_recurrent_policy_is_collected_with_what_it_did_before():
+    trained, env = learner("qmix", network__name="gru"), make("navigation", 4, (0, 1))
+    trained.policy.head.explore(0.0)
+    with torch.no_grad():
+        for parameter in trained.policy.parameters():
+            parameter.mul_(3)  # so that the action before matters
+        batch, _ = EpisodeCollector(env, trained.policy, generators((0, 1), "noise")).collect()
+        values, forgetful = (trained.policy.unroll(batch.obs, done) for done in (batch.action, 0 * batch.action))
+    assert torch.equal(values[:, :, :-1].argmax(-1), batch.action)
+    assert not torch.equal(forgetful[:, :, :-1].argmax(-1), batch.action), "the control"
+
+
 def played(task="navigation", seeds=(0, 1), num_envs=4, **settings):
     """A collector after one round, and what it collected."""
     trained = learner("qmix" if settings.get("actions") != "continuous" else "maddpg", task, seeds)

@@ -288,6 +288,16 @@ def test_a_gap_of_variance_weighs_as_the_shift_that_costs_it(monkeypatch: pytest
     measured._breaking.cache_clear()
 
 
+def test_the_p_value_of_an_element_by_hand() -> None:
+    """A tolerance of 0.15 is two standard errors above the worst gap: 2.3 % of a normal variable lies beyond two."""
+    fields = (FieldVerdict("reward", "holds", 0.05, 0.05), FieldVerdict("obs.velocity", "holds", 0.0, 0.01))
+    broken = (*fields, FieldVerdict("end", "broken", 0.2, 0.01))
+    verdicts = [ElementVerdict(name, False, found) for name, found in (("a", fields), ("b", broken))]
+    tried = judged_elements(verdicts, 0.15)
+    assert [one.p_value for one in tried] == pytest.approx([0.02275, 1.0], abs=1e-5)
+    assert [one.accepted for one in tried] == [True, False]
+
+
 def test_a_gap_that_is_no_number_is_not_accepted() -> None:
     verdicts = [ElementVerdict("a", False, (FieldVerdict("reward", "holds", gap, 0.01),)) for gap in (0.0, np.nan)]
     assert [one.accepted for one in judged_elements(verdicts, 0.15)] == [True, False]

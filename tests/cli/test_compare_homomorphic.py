@@ -49,7 +49,7 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
     assert again.stdout == first.stdout
     assert "4 of them finished" in again.stderr
     assert (out / "runs" / "wildlife-mappo-64-empn" / "metrics.jsonl").read_bytes() == metrics
-    assert "wildlife-mappo-64-mpn-esp differs" in refused(*command, "--group", "d4")
+    assert "wildlife-mappo-64-mpn-esp has other seeds or settings" in refused(*command, "--group", "d4")
     fewer = ("compare-homomorphic", "--methods", "empn,mpn", "--steps", 64, "--seeds", 2, *board, *OPTIONS)
     reused = (*fewer, "--out", tmp_path / "copied", "--reuse", out)
     assert "0 runs to do" in esp(*reused, "--dry-run").stdout

@@ -139,10 +139,10 @@ def test_progress_in_a_pipe_is_a_line_every_ten_seconds_and_the_last(capsys: pyt
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.splitlines() == [
-        "train   21%  21k/100k  10k steps/s  1 min 19 s left  return -131",
-        "train   31%  31k/100k  10k steps/s  1 min 09 s left  return -141",
-        "train   41%  41k/100k  10k steps/s  59 s left  return -151",
-        "train   44%  44k/100k  10k steps/s  56 s left  return -154",
+        "train   21%  21k/100k  10k seed-steps/s  1 min 19 s left  return -131",
+        "train   31%  31k/100k  10k seed-steps/s  1 min 09 s left  return -141",
+        "train   41%  41k/100k  10k seed-steps/s  59 s left  return -151",
+        "train   44%  44k/100k  10k seed-steps/s  56 s left  return -154",
     ]
 
 

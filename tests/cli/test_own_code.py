@@ -57,6 +57,31 @@ class Starts(Rendezvous):
     def _start(self, generator):
         return {"position": 1}
 
+class StartsAlone(Rendezvous):
+    def _start(self, generator):
+        return super()._start(generator)["position"]
+
+class PaysAlone(Rendezvous):
+    def _advance(self, world, action):
+        return super()._advance(world, action)[0]
+
+class Counts(Rendezvous):
+    def _advance(self, world, action):
+        return super()._advance(world, action)[0], None
+
+class Averages(Rendezvous):
+    def _advance(self, world, action):
+        return super()._advance(world, action)[0], {"spread": 0.5}
+
+class Sees(Rendezvous):
+    def _observe(self, world):
+        return super()._observe(world), world
+
+class Differs(Rendezvous):
+    def _advance(self, world, action):
+        reward, metrics = super()._advance(world, action)
+        return reward.unsqueeze(-1) * torch.arange(3), metrics
+
 class Pays(Rendezvous):
     def _advance(self, world, action):
         reward, metrics = super()._advance(world, action)
@@ -70,8 +95,14 @@ class Pays(Rendezvous):
         ("Raises", "your code raises in '_advance' (wrong.py, line 11): KeyError: 'lost'"),
         ("Builds", "your code raises in '__init__' (wrong.py, line 16): RuntimeError: no simulator here"),
         ("Describes", "'_describe' of Describes returns None; return a TaskSpec"),
-        ("Starts", "'position' of what '_start' of rendezvous drew is no tensor; give tensors"),
-        ("Pays", "the reward has shape (1, 1, 3), expected"),
+        ("Starts", "'position' of what '_start' of rendezvous gives is no tensor; give tensors"),
+        ("StartsAlone", "'_start' of rendezvous gives Tensor; give a dict of tensors by name"),
+        ("PaysAlone", "'_advance' of rendezvous gives Tensor; return a tensor of rewards and a dict of metrics"),
+        ("Counts", "'_advance' of rendezvous gives NoneType; give a dict of tensors by name"),
+        ("Averages", "'spread' of what '_advance' of rendezvous gives is no tensor; give tensors"),
+        ("Sees", "'_observe' of rendezvous gives tuple; return a tensor [S, E, N, D]"),
+        ("Differs", "agents of rendezvous get different rewards, but its spec says that they share them"),
+        ("Pays", "the reward that '_advance' of rendezvous gives has shape (1, 1, 3), expected"),
     ],
 )
 def test_a_task_that_fails_is_answered_by_one_sentence(folder, name, sentence):

@@ -234,7 +234,7 @@ def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
         f"training {plain.cell.name}",
         f"  {plain.cell.name}  0/200",
         "0%  0/2 runs finished  ? left",
-        f"  {plain.cell.name}  100/200  30 steps/s  10 s left",
+        f"  {plain.cell.name}  100/200  30 seed-steps/s  10 s left",
         "25%  0/2 runs finished  25 s left",
         f"finished {plain.cell.name} after 10 s",
         f"error: {esp_run.cell.name} failed: no disk; the others go on",
@@ -256,7 +256,7 @@ def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     terminal.file.close()
     screen = (tmp_path / "screen").read_text()
     assert runs[0].cell.name in screen
-    assert "30 steps/s" in screen
+    assert "30 seed-steps/s" in screen
     assert "whole study" in screen
     assert runs[1].cell.name not in screen
 

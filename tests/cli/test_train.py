@@ -123,7 +123,8 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
     gaps = (0.0, 0.0, 0.0, 0.1, 0.5, 0.5, 0.5)
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple(zip(names, gaps, strict=True)))
     told = esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "auto").stderr
-    assert "prior esp (d4, c = 0.1), 4 of 7 elements broken and weighed 0.018 to 0.45, 1 seed(s)" in told
+    weighed = "prior esp (d4, c = 0.1), 4 of 7 elements broken and weighed 0.018 to 0.45"
+    assert f"{weighed}, fading out over 50% of the run, 1 seed(s)" in told
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple((name, 0.0) for name in names))
     assert "broken" not in esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "b").stderr
     nothing = Discovery("navigation", "paired states", "c1", "", ())

@@ -93,6 +93,20 @@ def test_another_choice_that_is_no_tie_is_found() -> None:
         compare(sample, lambda obs, memory, mask: (others, sample.outputs, sample.after))
 
 
+@pytest.mark.parametrize(("kind", "spoilt"), [("choice, recurrent", "memory"), ("wheels", "action")])
+def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: str) -> None:
+    alone = drawn_policy(kind)
+    sample = take_sample(alone, program_of(alone.policy), 100)
+    right, wrong = {"action": sample.action, "memory": sample.after}, 0.01
+
+    def runner(said: dict[str, np.ndarray]) -> check.Runner:
+        return lambda obs, memory, mask: (said["action"], sample.outputs, said["memory"])
+
+    assert compare(sample, runner(right)).max_difference == 0
+    with pytest.raises(RuntimeError, match=r"differs from the policy by 0\.01"):
+        compare(sample, runner(right | {spoilt: right[spoilt] + wrong}))
+
+
 def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
     program = program_of(drawn_policy("wheels", hidden=(3,)).policy)
     first, _, last = program.layers

@@ -258,6 +258,17 @@ def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
     assert asked == [(-0.9, 0.5), (0.5, -0.3)]
 
 
+def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    team, wheels = SimpleNamespace(poses=np.zeros((1, 3)), pillars=np.zeros((1, 0, 2))), np.zeros((1, 2))
+    robot = Robot(team, 0, wheels)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    monkeypatch.setattr(Motor, "getMaxVelocity", lambda motor: 4.0)
+    pilot = SimpleNamespace(wheels=lambda *_: np.array([[6.28, -5.0]]))
+    module.Driver(robot, pilot).act()
+    assert wheels.tolist() == [[4.0, -4.0]]
+
+
 def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = drawn_policy("wheels")
     export(alone, ["webots"], tmp_path)
@@ -379,7 +390,8 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
     nodes: list[RosNode] = []
     module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
     module.main()
-    assert nodes[0].published["epuck0/wheel_speeds"].data == [0.0, 0.0], "interrupted robots stand still"
+    stopped = [nodes[0].published[f"epuck{k}/wheel_speeds"].data for k in range(8)]
+    assert stopped == [[0.0, 0.0]] * 8, "interrupted robots stand still"
     gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
     assert gap < 1e-3
 
@@ -398,3 +410,14 @@ def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
     monkeypatch.setattr(RosNode, "parameters", {"goals": [1.0, 2.0, 3.0]})
     with pytest.raises(ValueError, match="the parameter goals lists x and y in turn, but has 3 numbers"):
         module.Driver()
+
+
+def test_a_ros_node_stops_a_team_of_another_size_than_its_goals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(drawn_policy("wheels"), ["ros2"], tmp_path)
+    monkeypatch.setattr(RosNode, "parameters", {"goals": [0.5, 0.0, -0.5, 0.0]})
+    driver = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes()).Driver()
+    driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0], [0.0, 0.6, 0.0]])))
+    driver.act()
+    assert [driver.published[f"epuck{k}/wheel_speeds"].data for k in range(3)] == [[0.0, 0.0]] * 3

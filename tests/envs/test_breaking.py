@@ -13,6 +13,7 @@ from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
 from esp_envs import make
 from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.epuck.robot import MAX_WHEEL_SPEED
 from esp_envs.spec import Spaces
 from tests.envs.test_frozen_prey import write
 
@@ -103,6 +104,12 @@ def test_a_wind_is_a_share_of_the_full_force() -> None:
     assert still("navigation", wind=0.3) == pytest.approx(torch.tensor([[0.15, 0.0]] * 3))  # 0.3 x 5 x 0.1 s
 
 
+def test_a_wind_is_as_strong_for_a_weak_agent_and_nobody_is_faster_for_it() -> None:
+    assert still("navigation", wind=0.3, weak_agent=0.5) == pytest.approx(torch.tensor([[0.15, 0.0]] * 3))
+    # 10 x 3 x 0.1 s is more than a predator's greatest speed, 1
+    assert still("predator-prey", wind=10.0, prey="still") == pytest.approx(torch.tensor([[1.0, 0.0]] * 3))
+
+
 def test_a_gust_with_a_mean_pushes_along_both_axes() -> None:
     assert still("navigation", gust_mean=2.0) == pytest.approx(torch.tensor([[0.2, 0.2]] * 3))
 
@@ -152,6 +159,20 @@ def test_the_reward_counts_places_to_the_right() -> None:
     assert float(step.metrics["touches"]) == 0, "nobody really touches it"
 
 
+def test_the_prey_is_no_predator_beside_a_place_that_is_rewarded() -> None:
+    """The place is 0.1 right of the prey, nearer than a touch; only predators count, and they are far away."""
+    env = make("predator-prey", 1, [0], {"reward_offset": 0.1, "prey": "still", "num_predators": 2, "num_obstacles": 0})
+    env.set_state(torch.tensor([0.0] * 6 + [3.0, 3.0, -3.0, 3.0, 0.0, 0.0]).view(env.state_shape))
+    assert env.step(torch.zeros(env.action_shape, dtype=torch.int64)).reward[0, 0].tolist() == [0.0, 0.0]
+
+
+def test_predators_that_chase_run_at_the_place_that_is_rewarded() -> None:
+    """The prey is half a length left of the origin: one predator is there already, the other comes from below."""
+    env = make("predator-prey", 1, [0], {"reward_offset": 0.5, "prey": "still", "num_predators": 2, "num_obstacles": 0})
+    env.set_state(torch.tensor([0.0] * 6 + [0.0, 0.0, 0.0, -1.0, -0.5, 0.0]).view(env.state_shape))
+    assert [env.spec.action.names[k] for k in env.heuristic().flatten()] == ["no-op", "up"]
+
+
 def test_heuristics_know_where_forces_and_rewards_point() -> None:
     """The reference policies reach their goals with actions that are turned and landmarks that are off."""
 
@@ -186,6 +207,21 @@ def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:
         make("predator-prey", 1, [0], settings | {"prey": "policy"})
 
 
+def test_a_prey_follows_its_policy_in_the_steps_that_were_drawn(tmp_path: Path) -> None:
+    """Up, not, up: 0.4, then 0.75 of it, then 0.75 of that and 0.4."""
+    settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.5}
+    env, other = make("predator-prey", 1, [0], settings), make("predator-prey", 1, [1], settings)
+    env.reset(), other.reset()
+    places = [3.0, 3.0, -3.0, 3.0, 3.0, -3.0, 0.0, 0.0, 5.0, 5.0, -5.0, 5.0]
+    env.set_state(torch.tensor([0.0] * 8 + places).view(env.state_shape))
+    saved = env.state_dict()
+    saved["follows"][:3] = torch.tensor([True, False, True]).view(3, 1)
+    other.load_state_dict(saved)
+    nothing = torch.zeros(env.action_shape, dtype=torch.int64)
+    speeds = [other.step(nothing).next.state[0, 0, 7].item() for _ in range(3)]
+    assert speeds == pytest.approx([0.4, 0.3, 0.625])
+
+
 def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() -> None:
     settings = {"gust_std": 1.0, "num_landmarks": 1, "num_agents": 1}
     env = make("navigation", 4, [0, 1], settings)
@@ -216,6 +252,27 @@ def test_each_step_has_a_gust_of_its_own_times_the_deviation() -> None:
     assert velocities[1] == pytest.approx(torch.tensor([0.275, 0.0125]), abs=1e-6)
 
 
+def test_saved_gusts_stay_as_they_were() -> None:
+    env = make("navigation", 2, [0], {"gust_std": 1.0})
+    env.reset()
+    saved, now = (env.state_dict()["gusts"] for _ in range(2))
+    env.reset()
+    assert torch.equal(saved, now)
+    assert not torch.equal(saved, env.state_dict()["gusts"])
+
+
+def test_gusts_add_to_the_wind() -> None:
+    """0.1 x (0.5 x 2 + 0.3 x 5) along x, and 0.1 x 0.5 x -1 along y."""
+    env = make("navigation", 1, [0], {"gust_std": 0.5, "wind": 0.3, "num_landmarks": 1, "num_agents": 1})
+    env.reset()
+    env.set_state(torch.zeros(env.state_shape))
+    saved = env.state_dict()
+    saved["gusts"][0, 0, :, 0] = torch.tensor([2.0, -1.0])
+    env.load_state_dict(saved)
+    velocity = env.step(torch.zeros(env.action_shape, dtype=torch.int64)).next.state[0, 0, :2]
+    assert velocity == pytest.approx(torch.tensor([0.25, -0.05]), abs=1e-6)
+
+
 def test_the_first_agent_is_weak() -> None:
     env = make("navigation", 1, [0], {"weak_agent": 0.5, "num_landmarks": 1})
     state = torch.zeros(env.state_shape)
@@ -242,6 +299,15 @@ def test_a_slope_is_slow_upwards_and_fast_downwards_forwards_and_backwards() -> 
     assert driven(-1.0, 0.5, slope=0.2) == pytest.approx(-1.2 * level, rel=0.02)
     assert driven(-1.0, -0.5, slope=0.2) == pytest.approx(0.8 * level, rel=0.02)
     assert driven(1.0, -0.5, slope=0.2) == pytest.approx(-1.2 * level, rel=0.02)
+
+
+def test_a_lame_wheel_is_the_left_one_of_the_first_robot() -> None:
+    env = make("formation", 2, [0], SMALL | {"lame_wheel": 0.25})
+    env.reset()
+    speeds = torch.from_numpy(env._wheel_speeds(torch.ones(env.action_shape))) / MAX_WHEEL_SPEED
+    expected = torch.ones(2, 4, 2)
+    expected[:, 0, 0] = 0.75
+    torch.testing.assert_close(speeds.float(), expected)
 
 
 def test_a_sensor_with_an_offset_turns_the_seen_heading_alone() -> None:
@@ -296,3 +362,14 @@ def test_noise_shows_nothing_of_a_hidden_body(sight: str) -> None:
     assert hidden[..., 2:].any()
     assert bool((noisy[..., 2:][hidden[..., 2:]] == 0).all())
     assert not torch.equal(noisy, plain), "what is seen has noise"
+
+
+def test_what_is_hidden_depends_on_where_bodies_are_and_not_on_the_noise() -> None:
+    blind = SMALL | {"blind_sector_rad": 2.0}
+    plain = make("formation", 8, [0], SMALL).reset().obs
+    noisy = make("formation", 8, [0], blind | {"sensor_noise_m": 1.0}).reset().obs
+    names = make("formation", 1, [0], SMALL).spec.observation.slices()
+    for name in ("robots", "obstacle"):
+        hidden = torch.atan2(*plain[..., names[name]].flip(-1).unbind(-1)).abs() < 1.0
+        assert hidden.any()
+        assert torch.equal((noisy[..., names[name]] == 0).all(-1), hidden)

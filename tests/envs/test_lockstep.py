@@ -85,6 +85,20 @@ class Plain(BatchedTask):
         return world["position"]
 
 
+def test_a_state_that_was_set_stays_the_callers() -> None:
+    class InPlace(Plain):
+        def _advance(self, world, action):
+            world["position"] += 1.0
+            return super()._advance(world, action)
+
+    env = worlds(InPlace)
+    state = env.reset().state
+    before = state.clone()
+    env.set_state(state)
+    assert not torch.equal(env.step(env.random_action()).next.state, before)
+    assert torch.equal(state, before)
+
+
 def test_actions_beyond_the_bounds_are_taken_as_the_nearest_within() -> None:
     action = torch.tensor([[3.0, -4.0, 2.0], [0.3, -0.4, -1.5], [0.0, 0.0, 0.25]])
     given = action.clone()
@@ -153,7 +167,7 @@ def test_a_start_of_another_shape_is_refused() -> None:
         (
             "_advance",
             (torch.zeros(2, 5, 2), {"met": torch.zeros(())}),
-            r"the metric met has shape \(\), expected \(2, 5\)",
+            r"the metric met that '_advance' of plain gives has shape \(\), expected \(2, 5\)",
         ),
     ],
 )
@@ -185,7 +199,10 @@ def test_an_observation_of_another_width_is_refused() -> None:
         def _observe(self, world):
             return to_others(world["position"]).repeat(1, 1, 1, 2, 1)
 
-    with pytest.raises(ValueError, match=r"the observation has shape \(2, 5, 2, 4\), expected \(2, 5, 2, 2\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"the observation that '_observe' of plain gives has shape \(2, 5, 2, 4\), expected \(2, 5, 2, 2\)",
+    ):
         worlds(Wide).reset()
 
 
@@ -212,6 +229,10 @@ class Nan(Plain):
 class Unequal(Plain):
     def _describe(self):
         return TaskSpec(**{**vars(super()._describe()), "shared_reward": True})
+
+    def _advance(self, world, action):
+        self._unproven = 0  # as after the first episode, in which the task itself would notice
+        return super()._advance(world, action)
 
 
 class EarlyClock(Plain):

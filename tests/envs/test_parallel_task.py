@@ -184,6 +184,21 @@ def test_opponents_draw_from_their_own_copys_episode() -> None:
     assert same_step(one, two)
 
 
+def test_opponents_draw_anew_in_every_episode_of_every_copy() -> None:
+    drawn = []
+
+    class Watching(Walking):
+        def opponent(self, agent, observation, generator):
+            drawn.append(generator.normal())
+            return 0
+
+    env = worlds(Watching, 2, (3,), workers=0, horizon=2)
+    env.reset()
+    for _ in range(6):
+        env.step(env.random_action())
+    assert len(set(drawn)) == len(drawn) == 2 * 6
+
+
 def test_what_an_opponent_draws_is_not_what_the_environment_draws() -> None:
     drawn = []
 

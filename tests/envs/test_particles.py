@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
+from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
 
 CPU = torch.device("cpu")
 FREE = Bodies(radius=(0.15,), gain=(5.0,), max_speed=None, contacts=())
@@ -131,8 +131,3 @@ def test_products_stay_exact_when_torch_may_round_them() -> None:
             assert torch.equal(exact_matmul(left, right), expected)
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-def test_linear_matrix_is_read_off_the_basis() -> None:
-    matrix = linear_matrix(lambda x: torch.stack([x[..., 0] - x[..., 2], x[..., 1]], dim=-1), 3)
-    assert matrix.tolist() == [[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]]

@@ -137,11 +137,25 @@ def test_starts_are_on_different_cells_and_all_choices_are_alike() -> None:
     assert possible.std().item() < 1.3 * possible.mean().sqrt().item(), "as a uniform choice scatters"
 
 
+def test_the_nearest_drone_lands_where_another_will_stand_beside_it() -> None:
+    for second, choice in (((0, 2), LEFT), ((0, 3), REST)):
+        assert put([(1, 0), second, (0, 0)]).heuristic().flatten().tolist() == [choice, DOWN]
+
+
 def test_worlds_that_end_begin_anew_where_the_plan_says() -> None:
     env = put([(0, 0), (1, 0), (0, 0)])
     step = act(env, REST, REST)
     assert step.terminated
     assert torch.equal(step.next.state.view(-1, 2), env.plan[0, 0, 0, 1:].float())
+
+
+def test_a_new_plan_follows_when_one_is_used_up() -> None:
+    env = make("wildlife", 8, [0], {"horizon": 4})
+    env.reset()
+    first = env.plan.clone()
+    for is_used_up in (False, False, False, True):
+        env.step(env.random_action())
+        assert torch.equal(env.plan, first) is not is_used_up
 
 
 @pytest.mark.parametrize(

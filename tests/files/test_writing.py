@@ -97,6 +97,14 @@ def test_a_link_at_a_name_of_the_program_is_replaced_and_never_followed(tmp_path
     assert (tmp_path / "policy").read_bytes() == b"new"
 
 
+def test_a_file_in_the_place_of_a_link_takes_no_permissions_from_its_target(tmp_path):
+    (tmp_path / "mine").write_bytes(b"mine")
+    (tmp_path / "mine").chmod(0o777)
+    (tmp_path / "policy").symlink_to("mine")
+    replace_file(tmp_path / "policy", b"new")
+    assert (tmp_path / "policy").stat().st_mode & 0o111 == 0
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
 @pytest.mark.parametrize("through_link", [False, True])
 def test_a_device_node_is_written_through_and_stays(tmp_path, through_link):

@@ -23,7 +23,7 @@ from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
-from esp_envs.spec import TaskSpec
+from esp_envs.spec import Field, Kind, TaskSpec
 from tests.networks.gradients import assert_same_gradients
 
 SEEDS, WORLDS = 2, 12
@@ -260,6 +260,17 @@ def test_convolutions_and_their_gradients_are_those_of_torch() -> None:
     torch.testing.assert_close(ours, theirs)
     weight = torch.randn(ours.shape)
     assert_same_gradients(ours, theirs, weight, list(encoder.parameters()), atol=1e-3)
+
+
+def test_a_stride_that_would_leave_out_the_last_pixels_is_not_taken() -> None:
+    """Pictures of 8 x 8 have no middle: by steps of two, a turned picture would lose other pixels."""
+    encoder = PictureEncoder(generators(0, 1), Field("view", Kind.PICTURE, pixels=(8, 8)), cyclic(4))
+    stir(encoder)
+    view = torch.rand(SEEDS, 5, 8, 8, generator=torch.Generator().manual_seed(0))
+    features = [encoder.encode(x.flatten(2)) for x in (view, view.rot90(1, (2, 3)))]
+    here, there = (x.unflatten(-1, (-1, 4)).sum(-1) for x in features)  # over the four turns of each feature
+    torch.testing.assert_close(there, here, atol=EXACT, rtol=EXACT)
+    assert not torch.allclose(*features, atol=0.1), "each by itself goes to another place"
 
 
 def test_pictures_that_all_differ_are_all_encoded() -> None:

@@ -178,6 +178,19 @@ def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
     assert found["measured weights"] == Verdict("measured weights", True, True, False)
 
 
+def test_a_method_may_be_behind_by_the_larger_of_both_errors(folder: StudyFolder):
+    """Behind by 1, with an error of 3 / sqrt(3) instead of 1 / sqrt(3)."""
+    results = collect(folder).results
+    wide = tuple(
+        cell.model_copy(update={"returns": {"greedy": (-124.0, -121.0, -118.0)}})
+        if cell.variant == "gate" and "unbroken" in cell.panel
+        else cell
+        for cell in results.cells
+    )
+    both = (results, results.model_copy(update={"cells": wide}))
+    assert [{v.method: v.unbroken for v in verdicts(one)}["gate"] for one in both] == [False, True]
+
+
 def test_the_table_has_returns_at_a_fifth_and_at_the_end(folder: StudyFolder):
     table = breaking_table(collect(folder).results)
     assert table is not None
@@ -210,6 +223,14 @@ def test_a_page_has_one_column_for_each_method_and_marks_the_best(folder: StudyF
     assert (both.headings[0], both.rows[3][0]) == ("run", "navigation, QMIX, 200, unbroken")
     cells = {name: cell.model_copy(update={"early": None}) for name, cell in series_of(results)[0].cells[0.3].items()}
     assert leaders(results, cells, early=True) == set()
+
+
+def test_who_leads_early_is_told_by_the_early_returns(tmp_path: Path):
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-110.0, -120.0, -130.0]}
+    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    cells = {cell.variant: cell.model_copy(update={"early": (-180.0, -190.0, -170.0)}) for cell in results.cells}
+    assert leaders(results, cells, early=True) == {"MAPPO", "MAPPO-ESP"}
+    assert leaders(results, cells, early=False) == {"MAPPO-ESP"}
 
 
 def test_the_report_draws_returns_over_the_strength(folder: StudyFolder, tmp_path: Path):

@@ -14,6 +14,7 @@ from esp_cli.reporting.summary import aggregates, summarise_cell
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.folder_names import POLICY
 from tests.studies.small_studies import small_study, write_study
 
 PLAIN, ESP = [-150.0, -160.0, -140.0], [-130.0, -120.0, -140.0]
@@ -158,6 +159,13 @@ def test_who_leads_by_welch():
     assert leader((4.0, 1.0, 10), (0.0, None, 10)) is None
 
 
+def test_who_leads_with_few_seeds_beside_many():
+    # error sqrt(1 + 1), (1 + 1)^2 / (1 / 3 + 1 / 15) = 10 degrees of freedom: t = 2.83 has p = 0.018, 2.12 has 0.06
+    assert leader((4.0, 1.0, 4), (0.0, 1.0, 16)) == "first"
+    assert leader((0.0, 1.0, 16), (4.0, 1.0, 4)) == "second"
+    assert leader((3.0, 1.0, 4), (0.0, 1.0, 16)) == "neither"
+
+
 def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     study = small_study(tasks=("navigation", "predator-prey"))
     found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
@@ -171,6 +179,13 @@ def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     assert aggregates(one) == {}
     assert TABLES["aggregates"](one) is None
+
+
+def test_a_variant_that_has_not_finished_every_panel_has_no_numbers_over_all(tmp_path):
+    ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
+    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
+    begun = found.cells[1].model_copy(update={"name": "third", "panel": "third", "returns": {}})
+    assert list(aggregates(found.model_copy(update={"cells": (*found.cells, begun)}))) == ["MAPPO"]
 
 
 def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
@@ -215,6 +230,15 @@ def test_what_is_unfinished_or_not_run_is_said(tmp_path):
     assert TABLES["statistics"](found).rows == ()
     fresh = collect(StudyFolder.create(tmp_path / "fresh", small_study())).results
     assert next(table.title for table in all_tables(fresh)) == "Table 1 of the paper"
+
+
+def test_an_evaluation_beside_which_no_trained_policy_lies_does_not_count(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
+    cell = folder.study.cells[0]
+    assert collect(folder).results.cells[0].status == "finished"
+    (folder.run_path(cell) / POLICY).unlink()
+    assert (folder.evaluation_path(cell).is_file(), folder.is_trained(cell)) == (True, False)
+    assert collect(folder).results.cells[0].status == "unfinished"
 
 
 def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):

@@ -9,6 +9,7 @@ import pytest
 from esp_cli.studies import forecast as module
 from esp_cli.studies.cost import Cost
 from esp_cli.studies.forecast import forecast
+from esp_cli.studies.scheduler import Run
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, write_run
 
@@ -35,6 +36,13 @@ def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed
     assert told == [1, 2, 1, 2]
     assert probed == ["none", "esp"] * 2
     assert not folder.path.exists()
+
+
+def test_a_run_that_has_begun_takes_what_is_left_of_its_training_and_its_evaluation() -> None:
+    cell = small_study().cells[0]
+    run = Run(cell, step=cell.config.steps // 4)
+    found = module._measured(run, Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70), again=False)
+    assert found.seconds_left == 75.0 + 4.0
 
 
 def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_once(tmp_path, probed) -> None:

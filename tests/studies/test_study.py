@@ -99,7 +99,7 @@ def test_a_run_may_be_compared_with_another_one_than_before_and_with_no_other_se
     assert [cell.reference for cell in StudyFolder.open(tmp_path / "s").study.cells] == [None] * len(study.cells)
     config = first.config.model_copy(update={"steps": 10**6})
     changed = study.model_copy(update={"cells": (first.model_copy(update={"config": config}), *others)})
-    with pytest.raises(StudyError, match=f"{first.name} differs"):
+    with pytest.raises(StudyError, match=f"{first.name} has other seeds or settings"):
         StudyFolder.create(tmp_path / "s", changed)
 
 

@@ -21,6 +21,7 @@ from esp_cli.symmetry import (
     rotation,
     special_orthogonal,
 )
+from esp_cli.symmetry.groups import swap_and_round
 
 ORDERS = {
     "c1": (cyclic(1), 1),
@@ -61,7 +62,8 @@ def test_identity_and_inverses(group: FiniteGroup) -> None:
     everyone = np.arange(group.order)
     np.testing.assert_array_equal(group.product[0], everyone)
     np.testing.assert_array_equal(group.product[:, 0], everyone)
-    np.testing.assert_array_equal(group.product[everyone, group.inverses], 0)
+    inverses = [group.elements.index(element.inverse()) for element in group.elements]
+    np.testing.assert_array_equal(group.product[everyone, inverses], 0)
 
 
 def test_products_associate(group: FiniteGroup) -> None:
@@ -72,7 +74,8 @@ def test_products_associate(group: FiniteGroup) -> None:
 def test_matrices_multiply_as_elements_do(group: FiniteGroup) -> None:
     matrices = np.stack([e.matrix for e in group.elements])
     np.testing.assert_allclose(matrices[:, None] @ matrices[None, :], matrices[group.product], atol=1e-15)
-    np.testing.assert_allclose(matrices[group.inverses], matrices.transpose(0, 2, 1), atol=1e-15)
+    inverses = np.stack([e.inverse().matrix for e in group.elements])
+    np.testing.assert_allclose(inverses, matrices.transpose(0, 2, 1), atol=1e-15)
 
 
 def test_d4_by_hand() -> None:
@@ -97,6 +100,13 @@ def test_too_many_elements_are_refused() -> None:
 def test_one_agent_cannot_change_places() -> None:
     with pytest.raises(ValueError, match="two or more"):
         agent_permutations(1)
+
+
+@pytest.mark.parametrize("count", range(2, 7))
+def test_the_exchange_of_two_and_the_round_of_all_generate_every_order(count: int) -> None:
+    two = [PlaneElement(permutation=places) for places in swap_and_round(count)]
+    assert FiniteGroup.generated_by("orders", two).order == math.factorial(count)
+    assert FiniteGroup.generated_by("exchange", two[:1]).order == 2, "the control"
 
 
 def test_eight_agents_are_sampled_and_every_draw_is_an_order() -> None:

@@ -123,6 +123,14 @@ def test_continuous_actions_come_home(make_spec, elements, action) -> None:
     assert torch.equal(transform.pull_back(transform.action(x)), x)
 
 
+@pytest.mark.parametrize("elements", [ELEMENTS, MOVING], ids=["plane", "agents"])
+def test_variances_come_home_as_squares_of_numbers_do(make_spec, elements) -> None:
+    transform = build_transform(elements, make_spec(action=EVERYTHING))
+    x = batch(3, 2, 4, 3, EVERYTHING.width)
+    assert torch.equal(transform.pull_back_variance(x.square()), transform.pull_back(x).square())
+    assert not torch.equal(transform.pull_back_variance(x.square()), x.square())
+
+
 def test_continuous_actions_by_hand(make_spec) -> None:
     transform = build_transform([rotation(90) @ PlaneElement(permutation=(1, 0))], make_spec(2, EVERYTHING))
     x = torch.tensor([[[1.0, 2, 3, 4, 5], [6, 7, 8, 9, 10]]])[None]

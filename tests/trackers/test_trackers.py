@@ -35,7 +35,7 @@ class Failing:
     """A tracker that fails in one of its three ways."""
 
     way = "open"
-    rows = 0
+    rows = closed = 0
 
     def __init__(self, run: TrackedRun) -> None:
         self._fail("open")
@@ -46,6 +46,7 @@ class Failing:
             self._fail("write")
 
     def close(self) -> None:
+        type(self).closed += 1
         self._fail("close")
 
     def _fail(self, way: str) -> None:
@@ -62,10 +63,12 @@ def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(
     monkeypatch.setattr(trackers, "load", lambda target: Failing)
     monkeypatch.setattr(Failing, "way", way)
     monkeypatch.setattr(Failing, "rows", 0)
+    monkeypatch.setattr(Failing, "closed", 0)
     told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", "wandb", "--out", tmp_path / "run")
     sentence = f"tracking with wandb ended: it cannot {way} (the server); the run goes on"
     assert told.stderr.splitlines().count(sentence) == 1
     assert Failing.rows == {"open": 0, "write": 2, "close": 4}[way]
+    assert Failing.closed == (way != "open"), "closed once, whatever failed"
     files = [run / "policy.safetensors" for run in (tmp_path / "run", finished)]
     weights = [load_checkpoint(file, format_name=POLICY_FORMAT)[0] for file in files]
     assert all(torch.equal(tensor, weights[1][name]) for name, tensor in weights[0].items())

@@ -48,7 +48,8 @@ class Finding:
 
 
 def check(subject: Subject) -> Iterator[Finding]:
-    """Check every promise in turn; a task that raises breaks the promise."""
+    """Check every promise in turn; a task that raises breaks the promise, and only the first where all fail alike."""
+    raised: set[str] = set()
     for promise in PROMISES:
         name = promise.__name__.replace("_", " ")
         try:
@@ -58,6 +59,11 @@ def check(subject: Subject) -> Iterator[Finding]:
         except Exception as failure:
             place = raised_in(failure)
             said = last_line(failure) + (f", in {place}" if place else "")
+            if said in raised:
+                yield Finding(name, not_asked="it fails in the same way")
+                continue
+            if not isinstance(failure, Broken):
+                raised.add(said)
             yield Finding(name, broken=str(failure) if isinstance(failure, Broken) else said)
         else:
             yield Finding(name)

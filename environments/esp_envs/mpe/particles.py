@@ -18,7 +18,7 @@ rims.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -177,16 +177,6 @@ def _products_are_rounded(device: str) -> bool:
     if precision is None:  # before PyTorch 2.9 one switch covered all devices
         return torch.get_float32_matmul_precision() != "highest" or torch.is_autocast_enabled(device)
     return precision not in ("none", "ieee") or torch.is_autocast_enabled(device)
-
-
-def linear_matrix(function: Callable[[Tensor], Tensor], num_inputs: int) -> Tensor:
-    """Return the matrix [inputs, outputs] of a linear function by applying it to the basis vectors.
-
-    Args:
-        function: maps [..., inputs] to [..., outputs] linearly.
-        num_inputs: width of its argument.
-    """
-    return function(torch.eye(num_inputs))
 
 
 def _difference_matrix(pairs: Sequence[tuple[int, int]], num_entities: int) -> Tensor:

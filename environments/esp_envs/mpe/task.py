@@ -17,7 +17,7 @@ from torch import Tensor
 from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
 from esp_envs.breaking import Breaking
 from esp_envs.lockstep import LockstepTask, Outcome
-from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul, linear_matrix
+from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
 
 STILL = (0.0, 0.0)
@@ -110,7 +110,8 @@ class ParticleTask(LockstepTask):
         gusts = (spec.horizon, bodies.num_agents, 2, lanes) if settings.gust_std else (0,)
         self._gusts = torch.zeros(gusts, device=self.device)
         self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
-        self._readout = linear_matrix(self.observation_of, spec.state.width).to(self.device)
+        # the matrix of a linear function is what it gives for the basis vectors
+        self._readout = self.observation_of(torch.eye(spec.state.width)).to(self.device)
 
     @abstractmethod
     def observation_of(self, state: Tensor) -> Tensor:

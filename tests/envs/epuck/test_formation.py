@@ -159,6 +159,67 @@ def test_arrival_counts_once_and_time_runs_until_then() -> None:
     assert distances[-1] == pytest.approx(gaps.mean().item(), abs=1e-5)
 
 
+def test_arrival_counts_anew_in_every_episode() -> None:
+    env = world([(0.48, 0.0)], [(0.5, 0.0)])
+    start = env._seen().state
+    for _ in range(2):
+        env.set_state(start)
+        assert [env.step(wheels((0, 0))).metrics["arrival_rate"].item() for _ in range(2)] == [1.0, 0.0]
+
+
+def test_a_robot_that_passes_its_goal_has_arrived_once_and_for_all() -> None:
+    env = world([(0.0, 0.0)], [(0.0, 0.0)])
+    # 8 steps of 1.256 cm lead beyond the 5 cm, and 8 back again
+    steps = [env.step(wheels((speed, speed))) for speed in (1, -1) for _ in range(8)]
+    away = [step.next.state[0, 0, env.spec.state.slices()["position"]].norm().item() for step in steps]
+    assert away[-1] < 0.05 < max(away)
+    assert [step.metrics["arrival_rate"].item() for step in steps] == [1.0] + [0.0] * 15
+    assert [step.metrics["time_to_arrival_s"].item() for step in steps] == [0.0] * 16
+
+
+def test_bodies_that_touch_from_the_start_do_not_collide() -> None:
+    touching = 2 * BODY_RADIUS_M
+    for apart, collisions in ((touching, 0), (touching + 0.002, 1)):
+        env = world([(0.0, 0.0), (apart, 0.0)], [(0.5, 0.0), (-0.5, 0.0)])
+        counts = [env.step(wheels((1, 1), (0, 0))).metrics["collisions"].item() for _ in range(3)]
+        assert sum(counts) == collisions
+
+
+def test_a_collision_with_a_pillar_counts_once_and_is_no_risk() -> None:
+    pillar = 0.4 * math.sqrt(0.5)
+    env = world([(pillar - 0.05 - BODY_RADIUS_M - 0.02, pillar)], [(-0.5, 0.0)], num_obstacles=2)
+    steps = [env.step(wheels((1, 1))) for _ in range(6)]
+    assert sum(step.metrics["collisions"].item() for step in steps) == 1
+    assert [step.metrics["risky_rate"].item() for step in steps] == [0.0] * 6, "risks are of two robots"
+
+
+def moved_furniture() -> Formation:
+    """Two robots that touch, whose goals are not opposite and whose pillars have left their ring."""
+    env = world([(-BODY_RADIUS_M, 0.0), (BODY_RADIUS_M, 0.0)], [(0.5, 0.1), (-0.5, 0.2)], num_obstacles=2)
+    state = env._seen().state
+    state[..., env.spec.state.slices()["obstacles"]] = torch.tensor([0.3, 0.3, -0.3, 0.2])
+    env.set_state(state)
+    return env
+
+
+def test_a_saved_world_keeps_its_goals_pillars_and_contacts() -> None:
+    env = moved_furniture()
+    other = world([(-0.5, 0.0), (0.5, 0.0)], [(0.0, 0.0)] * 2, num_obstacles=2)
+    assert not torch.equal(other._seen().obs, env._seen().obs)
+    other.load_state_dict(env.state_dict())
+    assert torch.equal(other._seen().obs, env._seen().obs)
+    assert torch.equal(other._seen().state, env._seen().state)
+    assert other.step(torch.zeros(1, 1, 2, 2)).metrics["collisions"].item() == 0, "they touched before"
+
+
+def test_a_reset_brings_goals_and_pillars_back() -> None:
+    env = moved_furniture()
+    state, where = env.reset().state[0, 0], env.spec.state.slices()
+    expected = {"goals": -env.arena.posts(), "obstacles": env.arena.pillars()}
+    for name, places in expected.items():
+        torch.testing.assert_close(state[where[name]], torch.from_numpy(places).flatten().float())
+
+
 def test_a_collision_counts_when_bodies_come_to_touch() -> None:
     env = world([(-0.06, 0.0), (0.06, 0.0)], [(0.5, 0.0), (-0.5, 0.0)])
     steps = [env.step(wheels((1, 1), (0, 0))) for _ in range(10)]
@@ -253,6 +314,15 @@ def test_masses_and_grip_spread_evenly_around_a_robots_own_and_a_state_brings_th
     assert all(bool((env.state_dict()[f"physics.{name}"] == 1).all()) for name in ("mass", "friction"))
 
 
+def test_masses_and_grip_are_drawn_apart() -> None:
+    env = make("formation", 40, [0], {"mass_spread": 0.3, "friction_spread": 0.6})
+    env.reset()
+    drawn = env.state_dict()
+    pairs = torch.stack([drawn[f"physics.{name}"].flatten() for name in ("mass", "friction")])
+    # 320 independent pairs: their correlation is 0 with a standard error of 0.056
+    assert abs(torch.corrcoef(pairs)[0, 1].item()) < 0.25
+
+
 def test_steering_by_hand() -> None:
     turn = MAX_SPIN_RAD_S * PERIOD_S
     heading = np.zeros((1, 4))
@@ -262,6 +332,30 @@ def test_steering_by_hand() -> None:
     expected = [[1.0, 1.0], [part - 0.5, part + 0.5], [part + 0.5, part - 0.5], [-1.0, 1.0]]
     np.testing.assert_allclose(driven, expected, atol=1e-9)
     assert not steering.towards(np.zeros((1, 4, 2)), heading, PERIOD_S).any(), "rests at its goal"
+
+
+def test_a_robot_drives_slowly_to_a_goal_that_is_nearer_than_a_step() -> None:
+    reach = MAX_SPEED_M_S * PERIOD_S
+    wish = np.array([[[0.5 * reach, 0.0], [0.2 * reach, 0.0], [0.09 * reach, 0.0]]])
+    driven = steering.towards(wish, np.zeros((1, 3)), PERIOD_S)[0]
+    np.testing.assert_allclose(driven, [[0.5, 0.5], [0.2, 0.2], [0.0, 0.0]], atol=1e-9)
+
+
+def test_heuristics_know_the_control_period() -> None:
+    # half of what a robot can turn in 0.2 s: half of full speed for the turn, and half of what is left ahead
+    angle = MAX_SPIN_RAD_S * 0.2 / 2
+    env = world([(0.0, 0.0)], [(math.cos(angle), math.sin(angle))], control_period_s=0.2)
+    part = math.cos(angle) * 0.5
+    assert env.heuristic("straight").flatten().tolist() == pytest.approx([part - 0.5, part + 0.5], abs=1e-6)
+
+
+def test_the_way_round_a_pillar_begins_at_its_rim() -> None:
+    pillar = 0.4 * math.sqrt(0.5)
+    away = 0.2 + 0.1 + BODY_RADIUS_M
+    env = world([(pillar - away, pillar)], [(0.9, pillar)], num_obstacles=2, obstacle_radius_m=0.1)
+    # 20 cm of air, of 25 at which one gives way: nearness 0.2, so 0.2^2 back and 1.5 x 0.2 to the right
+    expected = steering.towards(np.array([[[1 - 0.04, -0.3]]]), np.zeros((1, 1)), PERIOD_S)
+    assert env.heuristic("avoid").flatten().tolist() == pytest.approx(expected.flatten().tolist(), abs=1e-5)
 
 
 def test_giving_way_passes_on_the_right() -> None:

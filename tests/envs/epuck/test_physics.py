@@ -98,6 +98,37 @@ def test_wheels_at_rest_stop_the_robot(name: str) -> None:
     assert np.abs(physics.pose[0, 0, :2]).max() < 0.01
 
 
+@pytest.mark.parametrize("name", ["mujoco", "pymunk"])
+def test_a_heavier_robot_drives_and_turns_as_any_other(name: str) -> None:
+    """As much as there is more to move, the wheels press harder on the floor."""
+    reached = []
+    for mass in (1.0, 1.9):
+        physics = engine(name, OPEN, np.zeros((1, 1, 3)), mass=np.full((1, 1), mass))
+        physics.advance(np.array([[[3.0, 6.28]]]))
+        reached.append(np.concatenate([physics.pose, physics.velocity], -1))
+    np.testing.assert_allclose(reached[1], reached[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "pymunk"])
+def test_a_slippery_robot_gets_slowly_to_turn(name: str) -> None:
+    physics = engine(name, OPEN, np.zeros((1, 1, 3)), friction=np.full((1, 1), 0.05))
+    physics.advance(np.array([[[-6.28, 6.28]]]))
+    # 0.05 x 9.81 m/s^2 at half an axle of 0.052 m, over 0.037^2 / 2 for a disc: 18.63 rad/s^2 for 0.1 s
+    assert physics.velocity[0, 0, 2] == pytest.approx(0.05 * 9.81 * 0.026 / (0.037**2 / 2) * PERIOD_S, rel=1e-3)
+
+
+@every_engine
+def test_the_grip_of_a_slippery_robot_grows_with_its_weight_and_no_faster(name: str) -> None:
+    speeds = []
+    for mass in (1.0, 1.9):
+        made = {"mass": np.full((1, 1), mass), "friction": np.full((1, 1), 0.05)}
+        physics = engine(name, OPEN, np.zeros((1, 1, 3)), **made)
+        physics.advance(np.full((1, 1, 2), 6.28))
+        speeds.append(physics.velocity[0, 0, 0])
+    assert 0.01 < speeds[0] < 0.9 * MAX_SPEED_M_S, "it slips"
+    assert speeds[1] == pytest.approx(speeds[0], rel=0.05)
+
+
 @every_engine
 def test_robots_at_rest_stay_where_they_are(name: str) -> None:
     arena = Arena(2.0, 8, 2, 0.1)
