@@ -202,10 +202,11 @@ class BatchedTask(LockstepTask):
                 "of metrics, as 'return reward, {}'"
             )
         reward, metrics = outcome[0], self._named("_advance", outcome[1])
-        if reward.dim() == 2:
+        shared = reward.dim() == 2
+        if shared:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
         require_shape(f"reward that '_advance' of {self.spec.name} gives", reward, self.action_shape[:3])
-        if self._unproven and self.spec.shared_reward:  # in the first episode alone: a GPU is waited for
+        if self._unproven and self.spec.shared_reward and not shared:  # not for ever: a GPU is waited for
             self._unproven -= 1
             if bool((reward != reward[..., :1]).any()):
                 raise ValueError(

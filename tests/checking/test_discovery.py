@@ -12,6 +12,7 @@ import torch
 
 from esp_cli.checking import Transitions, check_symmetry, collect, measured
 from esp_cli.checking.discovery import (
+    Discovery,
     accepted_of,
     discover_in_task,
     discover_in_transitions,
@@ -335,6 +336,23 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
     assert build_learner(resolve_config("navigation", overrides=weighed)).prior.transforms.names == ("rot90",)
     with pytest.raises(ValueError, match="45 degrees"):
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:rot45"}))
+
+
+def test_a_task_is_searched_once_however_many_runs_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def found(make_worlds):
+        asked.append(make_worlds)
+        return Discovery("navigation", "paired states", "c4", "discovered:c4", ())
+
+    measured._discovered.cache_clear()
+    monkeypatch.setattr(measured, "discover_in_task", found)
+    choices = {"prior.transforms": "discovered"}
+    for changed in ({}, {"mappo.learning_rate": 0.01}, {"task.horizon": 9}):
+        config = prepared(resolve_config("navigation", overrides=choices | changed))
+        assert config.prior.transforms == "discovered:c4"
+    measured._discovered.cache_clear()
+    assert len(asked) == 2, "one search for each task"
 
 
 @pytest.mark.slow

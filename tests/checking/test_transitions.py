@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from esp_cli.checking import Transitions, candidates, check_transitions, collect
-from esp_cli.checking.candidates import found_group, is_declared
+from esp_cli.checking.candidates import found_group, is_declared, refused
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
@@ -137,6 +137,9 @@ def test_what_no_action_carries_is_not_tried() -> None:
     assert "rot45" not in {element.name for element in candidates(spec)}
     with pytest.raises(ValueError, match="no transform can be tried on navigation: action 'left' turned by 45"):
         candidates(spec, "rot45")
+    left_out = refused(spec, "c8")
+    assert list(left_out) == ["rot45", "rot135", "rot225", "rot315"]
+    assert left_out["rot45"] == "action 'left' turned by 45 degrees is no action"
 
 
 def test_what_moves_no_number_is_not_tried() -> None:
@@ -146,4 +149,6 @@ def test_what_moves_no_number_is_not_tried() -> None:
     with pytest.raises(ValueError, match=r"no transform can be tried on the task: rot45 moves no number of it"):
         candidates(spaces)
     leaning = replace(spaces, observation=layout(Field("speed", Kind.SCALAR), Field("lean", Kind.PSEUDOSCALAR)))
-    assert {element.name[:4] for element in candidates(leaning)} == {"flip"}, "turns move nothing of it"
+    flips = ["flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal"]
+    assert [element.name for element in candidates(leaning, "d4")] == flips, "turns move nothing of it"
+    assert [element.name for element in candidates(leaning)] == ["flip-x"], "all mirrors are one"

@@ -182,7 +182,10 @@ def test_check_says_where_a_task_raises_and_what_symmetry_is_none(folder: Path) 
     source = (folder / "rendezvous.py").read_text()
     (folder / "slips.py").write_text(source.replace("return -distance.mean(-1)", "return -distanse.mean(-1)"))
     found = json.loads(esp(folder, "check", "task", "slips:Rendezvous", "--json", "-", code=1).stdout)
-    assert any("NameError: name 'distanse' is not defined, in '_advance' (slips.py" in str(f["broken"]) for f in found)
+    slips = [f["broken"] for f in found if "NameError: name 'distanse' is not defined" in str(f["broken"])]
+    assert len(slips) == 1, "told once"
+    assert "in '_advance' (slips.py" in slips[0]
+    assert any(f["not_asked"] == "it fails in the same way" for f in found)
     (folder / "noname.py").write_text(source.replace('"o2*agents"', '"dihedral"'))
     found = json.loads(esp(folder, "check", "task", "noname:Rendezvous", "--json", "-", code=1).stdout)
     assert [f["promise"] for f in found if f["broken"]] == ["actions and layouts can carry the declared symmetry"]

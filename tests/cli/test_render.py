@@ -47,6 +47,13 @@ def test_speed_seed_and_noise_are_chosen(finished: Path, tmp_path: Path) -> None
     assert film("--view", "top") == greedy, "a flat task has no other view"
 
 
+def test_the_policy_beside_acts_by_the_same_seed_or_not_at_all(finished: Path, tmp_path: Path) -> None:
+    others = train_tiny(tmp_path / "others", "--seed-list", "3,5", steps=50)
+    words = ("render", finished, others, "-o", tmp_path / "film.gif", "--episodes", 1, "--size", 48)
+    esp(*words, "--seed", 3)
+    assert "has no seed 7; it has 3, 5" in refused(*words, "--seed", 7)
+
+
 def test_frames_per_second_of_a_picture_are_refused(finished: Path, tmp_path: Path) -> None:
     said = refused("render", finished, "-o", tmp_path / "picture.png", "--fps", 10)
     assert "is a picture without frames; leave out --fps" in said

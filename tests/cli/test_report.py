@@ -134,6 +134,7 @@ def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Pa
     assert "±" not in rows[0][3]
     assert rows[0][4] == "-"
     assert rows[2] == ["navigation, 9k", "one", "50", "at 50", "-", "-", "-", "-", "-"]
+    assert ["runs finished", "2 of 2"] in [cells(line) for line in told.stdout.splitlines()], "not of four columns"
     first, second = json.loads((tmp_path / "report.json").read_text())["runs"]
     assert (first["returns"]["50"]["sem"], first["returns"]["50"]["ci95"], first["returns"]["9000"]) == (
         None,

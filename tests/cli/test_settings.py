@@ -55,6 +55,13 @@ def test_bounds_units_presets_and_tasks_are_told() -> None:
     assert found["mappo.critic_input"].bounds == "state, observations, own"
 
 
+def test_a_value_is_told_once_and_as_set_takes_it() -> None:
+    table = " ".join(esp("settings", "prior").stdout.split())
+    assert "paper: 0.5" in table
+    assert "mappo paper 0.5" not in table
+    assert "│ weights │ {} │" in table
+
+
 def test_a_bound_that_is_told_is_a_bound() -> None:
     assert "should be greater than 0" in refused("train", "--print-config", "--set", "mappo.learning_rate=0")
 

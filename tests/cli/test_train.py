@@ -141,6 +141,9 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--transforms", "so2", "--set", "prior.copies=all", "--set", "task.actions=continuous"], "finite group"),
         (["--transforms", "spin"], "spin"),
         (["--task", "chess"], "unknown task 'chess'; the tasks are navigation, predator-prey"),
+        (["--task", "navigaton"], "unknown task 'navigaton'; did you mean 'navigation'?"),
+        (["--algo", "MAPPO"], "unknown algorithm 'MAPPO'; did you mean 'mappo'?"),
+        (["--task", "nowhere:Task"], "No module named 'nowhere'; it is looked for in /"),
         (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper, fast"),
         (

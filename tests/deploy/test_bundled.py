@@ -239,7 +239,7 @@ def test_a_manifest_that_says_something_else_of_a_file_is_refused(
         (lambda m: m | {"version": 99}, "was written by a newer esp; update esp"),
         (lambda m: m | {"version": "1"}, "is foreign"),
         (lambda m: m | {"format": "other"}, "is foreign"),
-        (lambda m: m | {"policies": {}}, "bad value {} for 'policies'"),
+        (lambda m: m | {"policies": {}}, "bad value for 'policies'"),
         (lambda m: m | {"policies": [{}]}, "the setting 'policies.0.name' is missing"),
         (lambda m: m | {"policies": m["policies"] * 2}, "names a policy twice"),
         (lambda m: m | {"policies": [m["policies"][0] | {"file": "../../etc/passwd"}]}, "'policies.0.file'"),

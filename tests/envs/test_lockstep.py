@@ -13,6 +13,7 @@ import torch
 
 from esp_envs import BatchedTask, Environment, Field, Kind, TaskSettings, generators_for, layout, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
+from esp_envs.moves import discrete_moves
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec
 from tests.own_tasks import lines_of, page_files, save_page_files
@@ -192,6 +193,12 @@ def test_heuristics_are_a_tuple_of_names(given) -> None:
     told = re.escape(f"Odd.heuristics is {given!r}; give a tuple of names, as ('greedy',)")
     with pytest.raises(ValueError, match=told):
         worlds(type("Odd", (Plain,), {"heuristics": given}))
+
+
+@pytest.mark.parametrize("moves", [4.0, None])
+def test_moves_are_a_number_or_names(moves: object) -> None:
+    with pytest.raises(ValueError, match="is neither a number of directions nor their names"):
+        discrete_moves(moves)
 
 
 def test_an_observation_of_another_width_is_refused() -> None:

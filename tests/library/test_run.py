@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from esp_cli import Progress, Run, load_policy, train
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.library.metrics import Metrics
+from esp_cli.library.run import begin
+from esp_cli.training.config import resolve_config
 from esp_cli.training.metrics import column, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from tests.cli.running import esp
@@ -23,6 +27,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Return a finished run of two seeds."""
     out = tmp_path_factory.mktemp("runs") / "cn"
     return train("navigation", steps=400, seeds=(3, 7), settings=SMALL, out=out)
+
+
+def test_a_new_folder_has_a_name_that_is_no_host_of_a_copy_command(tmp_path: Path, monkeypatch) -> None:
+    """`scp` and `rsync` read a:b as the path b on the host a."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(ALGORITHMS._registered, "mine:Learner", ALGORITHMS["mappo"])
+    config = resolve_config("navigation", overrides=SMALL).model_copy(update={"algorithm": "mine:Learner"})
+    begin(config, None, None)
+    (made,) = (tmp_path / "runs").iterdir()
+    assert re.fullmatch(r"navigation-mine-learner-esp-\d{8}-\d{6}", made.name)
 
 
 def test_a_run_has_the_weights_of_the_command(run: Run, tmp_path: Path) -> None:

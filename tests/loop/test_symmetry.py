@@ -298,6 +298,8 @@ def test_what_does_not_fit_is_told_in_one_sentence(call, sentence: str) -> None:
         ({"action": 4}, "action is 4; give discrete_moves"),
         ({"group": None}, "group is None; give a text"),
         ({"num_agents": "3"}, "num_agents is '3'; give a number of agents"),
+        ({"state": SEEN.fields[0]}, r"state is Field.*; give layout\(Field"),
+        ({"seed": "a"}, "seed is 'a'; give a number"),
     ],
 )
 def test_arguments_of_other_kinds_are_told(changed: dict[str, object], sentence: str) -> None:

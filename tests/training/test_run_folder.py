@@ -219,6 +219,16 @@ def test_only_damaged_checkpoints_are_an_error(folder):
         folder.latest_checkpoint(pytest.fail)
 
 
+def test_checkpoints_that_another_process_has_just_removed_are_not_damaged(folder, monkeypatch):
+    write_checkpoints(folder, 100, 200)
+    listed = folder.checkpoints()
+    monkeypatch.setattr(RunFolder, "checkpoints", lambda self: listed)
+    listed[-1].unlink()
+    assert folder.latest_checkpoint(pytest.fail)[1]["step"] == 100
+    listed[0].unlink()
+    assert folder.latest_checkpoint(pytest.fail) is None
+
+
 def test_a_damaged_future_does_not_push_out_good_checkpoints(folder):
     write_checkpoints(folder, 100, 300)
     flip_a_bit(folder.checkpoint_path(300))
