@@ -46,7 +46,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--for", "steps", "--reach", "nan"], "--reach"),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
-        (["--algo", "mapo"], "unknown algorithm 'mapo'; the algorithms are mappo"),
+        (["--algo", "mapo"], "unknown algorithm 'mapo'; did you mean 'mappo'?"),
         (["--set", "prior.kind=none"], "takes the kinds of prior by --prior"),
         (["--gpu-share", "0.5"], "--gpu-share is for GPUs of a Ray cluster; add --engine ray"),
         (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
