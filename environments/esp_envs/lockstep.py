@@ -118,7 +118,7 @@ class BatchedTask(LockstepTask):
                 "derive from Environment"
             )
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
-        self._unproven = self.spec.horizon
+        self._unproven = self.spec.horizon  # steps in which shared rewards are still looked at
 
     @abstractmethod
     def _describe(self) -> TaskSpec:

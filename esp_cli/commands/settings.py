@@ -85,7 +85,7 @@ def _print_section(section: Section) -> None:
 def _meaning(setting: Setting) -> str:
     """Return what a setting does, and what presets and tasks set it to instead."""
     told = "paper" if "paper:" in setting.description else None
-    changed = {name: value for name, value in setting.presets.items() if told is None or name.split()[-1] != told}
+    changed = {name: value for name, value in setting.presets.items() if name.split()[-1] != told}
     texts = [f"{name} {_written(value)}" for name, value in {**changed, **setting.tasks}.items()]
     return f"{setting.description} ({'; '.join(texts)})" if texts else setting.description
 

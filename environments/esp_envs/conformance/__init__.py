@@ -56,14 +56,13 @@ def check(subject: Subject) -> Iterator[Finding]:
             promise(subject)
         except NotAsked as reason:
             yield Finding(name, not_asked=str(reason))
+        except Broken as failure:
+            yield Finding(name, broken=str(failure))
         except Exception as failure:
             place = raised_in(failure)
             said = last_line(failure) + (f", in {place}" if place else "")
-            if said in raised:
-                yield Finding(name, not_asked="it fails in the same way")
-                continue
-            if not isinstance(failure, Broken):
-                raised.add(said)
-            yield Finding(name, broken=str(failure) if isinstance(failure, Broken) else said)
+            again = said in raised
+            raised.add(said)
+            yield Finding(name, not_asked="it fails in the same way") if again else Finding(name, broken=said)
         else:
             yield Finding(name)
