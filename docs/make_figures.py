@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from esp_cli.evaluation.curve_statistics import median_steps
+from esp_cli.policies.curve_statistics import median_steps
 from esp_cli.reporting.page import draw_over_coefficient, draw_over_strength
 from esp_cli.reporting.plots import Group, appearance, dots
 from esp_cli.reporting.results import join, read_results

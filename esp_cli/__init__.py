@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from esp_cli.checking import Transitions
-    from esp_cli.deploy.library import LoadedPolicy, load_policy
-    from esp_cli.library.metrics import Metrics
-    from esp_cli.library.run import Run, train
+    from esp_cli.defaults import __version__
     from esp_cli.loop.symmetry import Symmetry
+    from esp_cli.policies.loaded import LoadedPolicy, load_policy
+    from esp_cli.run import Run, train
+    from esp_cli.training.metrics_table import Metrics
     from esp_cli.training.trainer import Progress
     from esp_envs.moves import discrete_moves
     from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, layout
@@ -34,18 +35,18 @@ __all__ = [
     "load_policy",
     "train",
 ]
-__version__ = "0.1.0"
 
 _HOMES = {
-    "LoadedPolicy": "esp_cli.deploy.library",
-    "Metrics": "esp_cli.library.metrics",
+    "LoadedPolicy": "esp_cli.policies.loaded",
+    "Metrics": "esp_cli.training.metrics_table",
     "Progress": "esp_cli.training.trainer",
-    "Run": "esp_cli.library.run",
+    "Run": "esp_cli.run",
     "Symmetry": "esp_cli.loop.symmetry",
     "Transitions": "esp_cli.checking",
+    "__version__": "esp_cli.defaults",
     "discrete_moves": "esp_envs.moves",
-    "load_policy": "esp_cli.deploy.library",
-    "train": "esp_cli.library.run",
+    "load_policy": "esp_cli.policies.loaded",
+    "train": "esp_cli.run",
 }
 """Where a public name is defined; the others describe spaces."""
 

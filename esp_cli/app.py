@@ -12,16 +12,18 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
 
 import typer
 from typer.core import TyperGroup
 
-from esp_cli import __version__, console, machine
+from esp_cli import console, machine
 from esp_cli.commands import COMMANDS
 from esp_cli.commands.help import arrange
+from esp_cli.defaults import __version__
 from esp_cli.files import failures
 from esp_cli.files.suggesting import did_you_mean
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from pydantic import ValidationError
@@ -70,10 +72,6 @@ class LazyGroup(TyperGroup):
             raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-class UserError(ValueError):
-    """A mistake on the command line itself; the engine raises ValueError and its subclasses."""
-
-
 def _refuse_empty(words: Sequence[str]) -> None:
     """Refuse an argument without text, as a variable of the shell that is not set leaves one."""
     for place, word in enumerate(words):
@@ -102,7 +100,7 @@ def report(failure: Exception) -> int | None:
     if isinstance(failure, typer.Abort):
         console.note("aborted")
         return EXIT_MACHINE
-    if isinstance(failure, ValueError):
+    if isinstance(failure, UserError) or _is_validation(failure):
         console.error(_sentence(failure))
         return EXIT_USER
     if isinstance(failure, OSError) and failure.errno is not None:
@@ -129,11 +127,16 @@ def _report_usage(failure: typer.TyperException) -> int:
     return failure.exit_code
 
 
-def _sentence(failure: ValueError) -> str:
+def _is_validation(failure: Exception) -> TypeGuard[ValidationError]:
+    """Return whether pydantic refused settings; told apart without importing pydantic."""
+    return type(failure).__module__.startswith("pydantic") and hasattr(failure, "errors")
+
+
+def _sentence(failure: UserError | ValidationError) -> str:
     """Return the message in one line; what pydantic found wrong is listed by setting."""
-    if hasattr(failure, "errors") and callable(failure.errors):
-        return _validation_sentence(failure)  # type: ignore[arg-type] # told apart without importing pydantic
-    return str(failure) or type(failure).__name__
+    if isinstance(failure, UserError):
+        return str(failure) or type(failure).__name__
+    return _validation_sentence(failure)
 
 
 def _validation_sentence(failure: ValidationError) -> str:

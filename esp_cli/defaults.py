@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+__version__ = "0.1.0"
+
 PriorKind = Literal["esp", "none", "augment", "consistency"]
 """What a prior consists of, in the order in which a task's bundled policies are preferred."""
 Mode = Literal["greedy", "stochastic"]

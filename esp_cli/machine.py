@@ -6,6 +6,8 @@ import ctypes
 import os
 import platform
 
+from esp_envs.errors import UserError
+
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_THRESHOLD = -1, -2, -3
 _MEBIBYTE = 1 << 20
 
@@ -42,13 +44,13 @@ def resolve_device(wanted: str) -> str:
     """Return "cpu" or "cuda" for what --device asks for.
 
     Raises:
-        ValueError: a GPU is asked for and there is none, or something else is asked for.
+        UserError: a GPU is asked for and there is none, or something else is asked for.
     """
     if wanted not in ("cpu", "cuda", "auto"):
-        raise ValueError(f"there is no device '{wanted}'; choose cpu, cuda or auto")
+        raise UserError(f"there is no device '{wanted}'; choose cpu, cuda or auto")
     import torch  # noqa: PLC0415 - takes a second
 
     available = torch.cuda.is_available()
     if wanted == "cuda" and not available:
-        raise ValueError("there is no CUDA device here; use --device cpu or auto")
+        raise UserError("there is no CUDA device here; use --device cpu or auto")
     return "cuda" if wanted != "cpu" and available else "cpu"

@@ -60,7 +60,7 @@ def forked_jobs() -> Iterator[None]:
 @pytest.fixture
 def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let exports compare observations in a few states; test_epuck.py does it in all of them."""
-    from esp_cli.deploy import epuck
+    from esp_cli.export import epuck
 
     monkeypatch.setattr(epuck, "take_scenes", partial(epuck.take_scenes, count=50))
 

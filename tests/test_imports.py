@@ -1,7 +1,7 @@
 """Imports point one way, heavy or chatty libraries stay in their rooms, and no file format can run code.
 
-commands -> deploy, reporting -> drawing -> evaluation -> training -> algorithms -> prior, networks -> symmetry
-reporting -> studies -> evaluation; all that knows tasks by their contract alone -> esp_envs.spec
+commands -> export, reporting -> drawing -> policies -> training -> algorithms -> prior, networks -> symmetry
+reporting -> studies -> policies; all that knows tasks by their contract alone -> esp_envs.spec
 
 The environment classes behind the contract (`esp_envs.spec` and `esp_envs.base`) are known to training and above only.
 """
@@ -23,25 +23,22 @@ RANKS = {
     "defaults": 0,
     "files": 0,
     "machine": 0,
-    "formatting": 0,
     "settings_index": 0,
-    "kernels": 0,
     "console": 0.5,
-    "trackers": 0.5,
     "symmetry": 1,
     "prior": 2,
     "networks": 2,
     "algorithms": 3,
-    "loop": 5.5,
     "training": 4,
-    "evaluation": 5,
-    "checking": 5,
+    "policies": 5,
+    "checking": 6,
+    "loop": 6.5,
     "drawing": 6,
     "studies": 6,
-    "deploy": 7,
+    "export": 7,
     "reporting": 7,
-    "library": 7.5,
-    "": 7.7,  # esp_cli itself: the version, and what other programs use of deploy
+    "run": 7.5,
+    "": 7.7,  # esp_cli itself: what other programs use
     "commands": 8,
     "app": 9,
     "__main__": 10,
@@ -49,7 +46,7 @@ RANKS = {
 """A part may import parts of a lower rank, and itself; parts of one rank do not know each other."""
 CONTRACT_ONLY_UP_TO = RANKS["algorithms"]
 """Up to this rank, tasks are known by their contract alone; those above make environments by name."""
-CONTRACT = ("esp_envs.spec.", "esp_envs.base.", "esp_envs.installed.", "esp_envs.scene.", "esp_envs.extras.")
+CONTRACT = ("esp_envs.spec.", "esp_envs.base.", "esp_envs.installed.", "esp_envs.scene.", "esp_envs.extras.", "esp_envs.errors.")
 PRINTING = {"app", "commands", "console"}
 STUDIES = {"studies", "reporting"}
 ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING, "ray": STUDIES, "optuna": STUDIES}
@@ -97,7 +94,7 @@ def forbidden(module: str, imported: str) -> str | None:
     if top != "esp_cli" or imported.startswith("esp_cli.console"):
         return None
     if part == "console":
-        known = f"{imported}.".startswith(("esp_cli.formatting.", "esp_cli.files."))
+        known = f"{imported}.".startswith(("esp_cli.files.formatting.", "esp_cli.files."))
         return None if known else "the console knows nothing of the application"
     wanted = imported.split(".")[1] if "." in imported else ""
     if wanted == part or wanted.startswith("__"):
@@ -194,7 +191,7 @@ def test_both_packages_are_looked_at() -> None:
         ("environments/esp_envs/base.py", "from esp_cli.symmetry import groups", "knows nothing of esp_cli"),
         ("environments/esp_envs/base.py", "import rich", "does not print"),
         ("environments/esp_envs/mpe/world.py", "import mujoco", "mujoco belongs in esp_envs.epuck"),
-        ("esp_cli/deploy/export.py", "from pymunk import Body", "pymunk belongs in esp_envs.epuck"),
+        ("esp_cli/export/export.py", "from pymunk import Body", "pymunk belongs in esp_envs.epuck"),
     ],
 )
 def test_a_forbidden_import_is_found(tmp_path: Path, path: str, source: str, rule: str) -> None:
@@ -215,8 +212,8 @@ def test_a_forbidden_import_is_found(tmp_path: Path, path: str, source: str, rul
             "from esp_cli import console\nfrom esp_cli.training import loop\nimport esp_envs",
         ),
         ("esp_cli/prior/losses.py", "from esp_cli.symmetry.groups import Group\nfrom esp_envs.spec import Layout"),
-        ("esp_cli/console.py", "from esp_cli.formatting import format_count as format_count"),
-        ("esp_cli/reporting/tables.py", "from esp_cli.formatting import format_count"),
+        ("esp_cli/console.py", "from esp_cli.files.formatting import format_count as format_count"),
+        ("esp_cli/reporting/tables.py", "from esp_cli.files.formatting import format_count"),
         ("esp_cli/training/loop.py", "import torch\nfrom esp_envs import make\nfrom esp_cli.prior import losses"),
         ("esp_cli/symmetry/transforms.py", "from esp_cli.symmetry.groups import Group\nfrom .groups import Element"),
         ("environments/esp_envs/epuck/planar.py", "import mujoco\nfrom esp_envs.spec import Layout"),

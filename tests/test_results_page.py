@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.evaluation.statistics import mean_and_sem
+from esp_cli.policies.statistics import mean_and_sem
 from esp_cli.reporting.breaking import series_of
 from esp_cli.reporting.pages import files_of, filled
 from esp_cli.reporting.results import read_results

@@ -16,6 +16,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
+from esp_envs.errors import UserError
 from esp_envs.scene import Painter, Scene
 from esp_envs.spec import Continuous, TaskSpec
 
@@ -88,32 +89,32 @@ def require_attributes(task: object, *names: str) -> None:
     """Refuse a task whose class leaves out what its base class asks for.
 
     Raises:
-        ValueError: names what is missing.
+        UserError: names what is missing.
     """
     missing = [name for name in names if getattr(task, name, None) is None]
     if missing:
-        raise ValueError(f"the class {type(task).__name__} does not say its {', '.join(missing)}; set it in the class")
+        raise UserError(f"the class {type(task).__name__} does not say its {', '.join(missing)}; set it in the class")
 
 
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
     """Refuse a tensor of another shape.
 
     Raises:
-        ValueError: names both shapes.
+        UserError: names both shapes.
     """
     if tuple(tensor.shape) != expected:
-        raise ValueError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
+        raise UserError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
 
 
 def require_flags(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
     """Refuse a tensor of another shape, or of other numbers than flags.
 
     Raises:
-        ValueError: says which.
+        UserError: says which.
     """
     require_shape(what, tensor, expected)
     if tensor.dtype != torch.bool:
-        raise ValueError(f"the {what} is {tensor.dtype}, expected torch.bool")
+        raise UserError(f"the {what} is {tensor.dtype}, expected torch.bool")
 
 
 OTHER_SIZE = "the saved environment has other seeds, worlds or bodies than this one; use its settings"
@@ -134,10 +135,10 @@ def restore_generators(generators: Sequence[torch.Generator], states: Tensor) ->
     """Put generators into the states that `generator_states` returned.
 
     Raises:
-        ValueError: another number of generators, or no states.
+        UserError: another number of generators, or no states.
     """
     if len(states) != len(generators):
-        raise ValueError(f"{len(states)} generator states are given for {len(generators)} generators")
+        raise UserError(f"{len(states)} generator states are given for {len(generators)} generators")
     for generator, state in zip(generators, states, strict=True):
         # A copy: torch 2.13 reads a row of a larger tensor at the wrong place, and crashes.
         generator.set_state(state.cpu().clone())
@@ -182,9 +183,9 @@ class Environment(ABC):
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         if num_envs < 1 or not generators:
-            raise ValueError("an environment needs at least one world and one seed")
+            raise UserError("an environment needs at least one world and one seed")
         if not isinstance(self.heuristics, tuple) or not all(isinstance(name, str) for name in self.heuristics):
-            raise ValueError(
+            raise UserError(
                 f"{type(self).__name__}.heuristics is {self.heuristics!r}; give a tuple of names, as ('greedy',)"
             )
         self.settings = settings
@@ -226,9 +227,9 @@ class Environment(ABC):
             state: [S, E, state width]; it fixes the physics completely, up to the task's own noise.
 
         Raises:
-            ValueError: the task cannot be put into a state.
+            UserError: the task cannot be put into a state.
         """
-        raise ValueError(f"task {self.spec.name} cannot be put into a state; its class has no 'set_state'")
+        raise UserError(f"task {self.spec.name} cannot be put into a state; its class has no 'set_state'")
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of a hand-written policy in the present state (shape as for `step`).
@@ -237,28 +238,28 @@ class Environment(ABC):
             name: one of `heuristics`; the first by default.
 
         Raises:
-            ValueError: the task has no such policy.
+            UserError: the task has no such policy.
         """
-        raise ValueError(f"task {self.spec.name} has no hand-written policy; its class has no 'heuristic'")
+        raise UserError(f"task {self.spec.name} has no hand-written policy; its class has no 'heuristic'")
 
     def named_heuristic(self, name: str | None) -> str:
         """Return a heuristic's name with its default filled in.
 
         Raises:
-            ValueError: the task has no heuristic of this name.
+            UserError: the task has no heuristic of this name.
         """
         name = name or self.heuristics[0]
         if name not in self.heuristics:
-            raise ValueError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
+            raise UserError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
         return name
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return what there is to draw of one world (seed index, world index).
 
         Raises:
-            ValueError: the task cannot be drawn.
+            UserError: the task cannot be drawn.
         """
-        raise ValueError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
+        raise UserError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
 
     def has(self, method: str) -> bool:
         """Return whether the task offers one of the optional methods `set_state`, `heuristic` and `scene`."""

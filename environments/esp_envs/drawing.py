@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
+from esp_envs.errors import UserError
 from esp_envs.scene import Body, Scene
 
 _OVERSAMPLING = 3
@@ -39,11 +40,11 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
         [H, W, 3] uint8, red, green and blue; the first row is the top.
 
     Raises:
-        ValueError: the size is below 16 pixels, the window is empty, or a body has an unknown shape.
+        UserError: the size is below 16 pixels, the window is empty, or a body has an unknown shape.
     """
     x_min, x_max, y_min, y_max = scene.window
     if size < 16 or x_max <= x_min or y_max <= y_min:
-        raise ValueError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
+        raise UserError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
     canvas = _Canvas(scene.window, size)
     canvas.grid(*scene.grid)
     for body, path in trails(scene, trail):
@@ -126,7 +127,7 @@ class _Canvas:
     def body(self, body: Body) -> None:
         """Draw a body with its rim and, where it has a heading, a nose mark."""
         if body.shape not in _SHAPES:
-            raise ValueError(f"cannot draw a body of shape '{body.shape}'; the shapes are {', '.join(_SHAPES)}")
+            raise UserError(f"cannot draw a body of shape '{body.shape}'; the shapes are {', '.join(_SHAPES)}")
         x, y = self._at(body.position)
         radius = body.radius * self._scale
         color = ImageColor.getrgb(body.color)

@@ -16,6 +16,8 @@ from inspect import isabstract
 from pathlib import Path
 from typing import Any, TypeVar
 
+from esp_envs.errors import UserError
+
 T = TypeVar("T")
 _FOREIGN: set[str] = set()
 """Top-level modules of the classes that are registered or installed."""
@@ -50,7 +52,7 @@ class Registry(Mapping[str, type[T]]):
             given: "module:Class", or the class itself. Any other name is returned as it is.
 
         Raises:
-            ValueError: the module cannot be imported, or holds no such class.
+            UserError: the module cannot be imported, or holds no such class.
         """
         if isinstance(given, str):
             if ":" not in given:
@@ -66,7 +68,7 @@ class Registry(Mapping[str, type[T]]):
         """Return a class by its name, imported if it is built in or installed.
 
         Raises:
-            ValueError: there is no such class, or it is neither installed nor registered.
+            UserError: there is no such class, or it is neither installed nor registered.
         """
         if name in self._registered:
             return self._registered[name]
@@ -77,16 +79,14 @@ class Registry(Mapping[str, type[T]]):
             try:
                 return self._checked(entry.load(), name)
             except (Exception, SystemExit) as error:
-                raise ValueError(
-                    f"the installed {self.noun} '{name}' cannot be imported: {last_line(error)}"
-                ) from error
+                raise UserError(f"the installed {self.noun} '{name}' cannot be imported: {last_line(error)}") from error
         if _MODULE_AND_CLASS.fullmatch(name):
-            raise ValueError(
+            raise UserError(
                 f"the {self.noun} '{name}' is not installed; add {self.option} {name} to let esp import and run it"
             )
         near = get_close_matches(name.lower(), self, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"the {self.noun}s are {', '.join(self)}"
-        raise ValueError(f"unknown {self.noun} '{name[:80]}'; {hint}; name your own as module:Class")
+        raise UserError(f"unknown {self.noun} '{name[:80]}'; {hint}; name your own as module:Class")
 
     def __contains__(self, name: object) -> bool:
         """Return whether there is a class of this name."""
@@ -109,7 +109,7 @@ class Registry(Mapping[str, type[T]]):
 
     def _import(self, name: str) -> type[T]:
         if not _MODULE_AND_CLASS.fullmatch(name):
-            raise ValueError(f"'{name[:80]}' names no {self.noun}; write module:Class, as in {self.example}")
+            raise UserError(f"'{name[:80]}' names no {self.noun}; write module:Class, as in {self.example}")
         module_name, class_name = name.split(":")
         here = str(Path.cwd())
         # First while the module is found, as for a script; last afterwards, so that no other import meets the user's
@@ -121,7 +121,7 @@ class Registry(Mapping[str, type[T]]):
         except (Exception, SystemExit) as error:
             missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(error.name or "?")
             place = f"; it is looked for in {here} and among installed packages, without .py" if missing else ""
-            raise ValueError(
+            raise UserError(
                 f"cannot import the module '{module_name}' of the {self.noun}: {last_line(error)}{place}"
             ) from error
         finally:
@@ -129,20 +129,20 @@ class Registry(Mapping[str, type[T]]):
             if here not in sys.path:
                 sys.path.append(here)
         if not hasattr(module, class_name):
-            raise ValueError(f"the module '{module_name}' has no class '{class_name}'; check the name after the colon")
+            raise UserError(f"the module '{module_name}' has no class '{class_name}'; check the name after the colon")
         return self._checked(getattr(module, class_name), name)
 
     def _checked(self, cls: object, name: str) -> type[T]:
         base: type[T] = load(self._base)
         if not (isinstance(cls, type) and issubclass(cls, base)):
             article = "an" if self.noun[0] in "aeiou" else "a"
-            raise ValueError(
+            raise UserError(
                 f"'{name}' is not {article} {self.noun}; {article} {self.noun} is a subclass of "
                 f"{self._base.replace(':', '.')}"
             )
         if isabstract(cls):
             missing = ", ".join(sorted(vars(cls)["__abstractmethods__"]))
-            raise ValueError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")
+            raise UserError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")
         return cls
 
 

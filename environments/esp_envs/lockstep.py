@@ -29,6 +29,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
 World = dict[str, Tensor]
@@ -68,7 +69,7 @@ class LockstepTask(Environment):
         """Advance every world by one step.
 
         Raises:
-            ValueError: the action has another shape than [S, E, N] (discrete) or [S, E, N, width] (continuous).
+            UserError: the action has another shape than [S, E, N] (discrete) or [S, E, N, width] (continuous).
         """
         require_shape("joint action", action, self.action_shape)
         reward, metrics = self._play(action)
@@ -91,7 +92,7 @@ class LockstepTask(Environment):
         """Put every world into a global state at the start of an episode.
 
         Raises:
-            ValueError: the state has another shape than [S, E, state width].
+            UserError: the state has another shape than [S, E, state width].
         """
         require_shape("state", state, self.state_shape)
         self._time = 0
@@ -111,9 +112,9 @@ class BatchedTask(LockstepTask):
         super().__init__(settings, num_envs, generators)
         self.spec = self._describe()
         if not isinstance(self.spec, TaskSpec):
-            raise ValueError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
+            raise UserError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
         if self.spec.terminates:
-            raise ValueError(
+            raise UserError(
                 f"{self.spec.name}: all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out, or "
                 "derive from Environment"
             )
@@ -151,7 +152,7 @@ class BatchedTask(LockstepTask):
         """Return which actions each agent may take now."""
         mask = self._allow(self.world)
         if (mask is not None) != self.spec.masks:
-            raise ValueError(f"{self.spec.name}: implement '_allow' and set 'masks' in the spec, or do neither")
+            raise UserError(f"{self.spec.name}: implement '_allow' and set 'masks' in the spec, or do neither")
         if mask is None:
             return None
         assert isinstance(self.spec.action, Discrete), "masks are for discrete actions"
@@ -176,10 +177,10 @@ class BatchedTask(LockstepTask):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size.
+            UserError: the tensors belong to an environment of another size.
         """
         if tensors["world"].shape != self.state_shape or len(tensors["generators"]) != self.num_seeds:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         self._put(tensors["world"].to(self.device))
         self._time = int(tensors["time"])
         restore_generators(self.generators, tensors["generators"])
@@ -192,12 +193,12 @@ class BatchedTask(LockstepTask):
             expected = (self.num_seeds, self.num_envs, field.count, field.item_width)
             if found is None or tuple(found.shape) != expected:
                 got = "is missing" if found is None else f"has shape {tuple(found.shape[1:])}"
-                raise ValueError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
+                raise UserError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
 
     def _play(self, action: Tensor) -> Outcome:
         outcome: object = self._advance(self.world, self.spec.action.admissible(action))
         if not isinstance(outcome, tuple) or len(outcome) != 2 or not isinstance(outcome[0], Tensor):
-            raise ValueError(
+            raise UserError(
                 f"'_advance' of {self.spec.name} gives {type(outcome).__name__}; return a tensor of rewards and a dict "
                 "of metrics, as 'return reward, {}'"
             )
@@ -209,7 +210,7 @@ class BatchedTask(LockstepTask):
         if self._unproven and self.spec.shared_reward and not shared:  # not for ever: a GPU is waited for
             self._unproven -= 1
             if bool((reward != reward[..., :1]).any()):
-                raise ValueError(
+                raise UserError(
                     f"agents of {self.spec.name} get different rewards, but its spec says that they share them; return "
                     "one reward [S, E], or set shared_reward=False in the spec"
                 )
@@ -221,15 +222,13 @@ class BatchedTask(LockstepTask):
     def _seen(self) -> Observation:
         seen: object = self._observe(self.world)
         if not isinstance(seen, Tensor):
-            raise ValueError(
-                f"'_observe' of {self.spec.name} gives {type(seen).__name__}; return a tensor [S, E, N, D]"
-            )
+            raise UserError(f"'_observe' of {self.spec.name} gives {type(seen).__name__}; return a tensor [S, E, N, D]")
         obs = seen.flatten(3).float().clone(memory_format=torch.contiguous_format)
         width = self.spec.observation.width
         require_shape(f"observation that '_observe' of {self.spec.name} gives", obs, (*self.action_shape[:3], width))
         alive = self._living(self.world)
         if (alive is not None) != self.spec.agents_end:
-            raise ValueError(f"{self.spec.name}: implement '_living' and set 'agents_end' in the spec, or do neither")
+            raise UserError(f"{self.spec.name}: implement '_living' and set 'agents_end' in the spec, or do neither")
         if alive is not None:
             require_flags("tensor of '_living'", alive, self.action_shape[:3])
         return Observation(obs, self._state(), self.action_mask(), None if alive is None else alive.clone())
@@ -237,12 +236,12 @@ class BatchedTask(LockstepTask):
     def _named(self, method: str, named: object) -> Mapping[str, Tensor]:
         """Refuse what a method of a subclass gives instead of tensors by name."""
         if not isinstance(named, Mapping):
-            raise ValueError(
+            raise UserError(
                 f"'{method}' of {self.spec.name} gives {type(named).__name__}; give a dict of tensors by name"
             )
         for name, value in named.items():
             if not isinstance(value, Tensor):
-                raise ValueError(f"'{name}' of what '{method}' of {self.spec.name} gives is no tensor; give tensors")
+                raise UserError(f"'{name}' of what '{method}' of {self.spec.name} gives is no tensor; give tensors")
         return named
 
     def _put(self, state: Tensor) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from esp_envs.base import Observation, put_back
 from esp_envs.drawing import draw
+from esp_envs.errors import UserError
 from esp_envs.extras import install
 from esp_envs.registry import make
 from esp_envs.spec import Continuous
@@ -46,12 +47,12 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         **settings: task settings that differ from the defaults.
 
     Raises:
-        ValueError: unknown task, unknown setting, or a value out of range.
+        UserError: unknown task, unknown setting, or a value out of range.
     """
 
     def __init__(self, task_name: str, seed: int = 0, render_mode: str | None = None, **settings: object) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"unknown render mode '{render_mode}'; use 'rgb_array' or none")
+            raise UserError(f"unknown render mode '{render_mode}'; use 'rgb_array' or none")
         self._env = make(task_name, 1, [seed], settings)
         spec = self._env.spec
         self.metadata: dict[str, Any] = {
@@ -139,7 +140,7 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         """Return the joint action [1, 1, N] or [1, 1, N, width] of a dictionary of actions."""
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
-            raise ValueError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
+            raise UserError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
         space = self._env.spec.action
         idle = np.zeros(space.width, np.float32) if isinstance(space, Continuous) else np.zeros((), np.int64)
         checked = {agent: self._checked(agent, actions[agent]) for agent in self.agents}
@@ -156,13 +157,13 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         shape = (space.width,) if isinstance(space, Continuous) else ()
         if array.shape != shape and not (shape == () and array.shape == (1,)):
             wanted = f"an array of shape {shape}" if shape else "one integer"
-            raise ValueError(f"{agent}'s action has shape {array.shape}; give {wanted}")
+            raise UserError(f"{agent}'s action has shape {array.shape}; give {wanted}")
         if isinstance(space, Continuous):
             if array.dtype.kind not in "fiu" or not ((array >= -1) & (array <= 1)).all():  # false for NaN too
-                raise ValueError(f"{agent}'s action {action!r} is not within -1 and 1; give numbers from there")
+                raise UserError(f"{agent}'s action {action!r} is not within -1 and 1; give numbers from there")
             return array.astype(np.float32)
         if array.dtype.kind not in "iu" or not 0 <= int(array.reshape(())) < space.count:
-            raise ValueError(f"{agent}'s action {action!r} is not an integer from 0 to {space.count - 1}")
+            raise UserError(f"{agent}'s action {action!r} is not an integer from 0 to {space.count - 1}")
         return array.reshape(()).astype(np.int64)
 
     def _take(self, observation: Observation) -> dict[str, _Array]:

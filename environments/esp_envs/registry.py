@@ -35,7 +35,7 @@ def register(task: str | type[Environment]) -> str:
     """Admit a task that is not installed and return its name; see `Registry.register`.
 
     Raises:
-        ValueError: the module cannot be imported, or holds no such task.
+        UserError: the module cannot be imported, or holds no such task.
     """
     return TASKS.register(task)
 
@@ -44,7 +44,7 @@ def task_class(name: str) -> type[Environment]:
     """Return the environment class of a task; see `Registry.__getitem__`.
 
     Raises:
-        ValueError: no such task, or one that is neither installed nor registered.
+        UserError: no such task, or one that is neither installed nor registered.
     """
     return TASKS[name]
 
@@ -66,7 +66,7 @@ def make(
         device: where the worlds live.
 
     Raises:
-        ValueError: unknown task, unknown setting, or a value out of range.
+        UserError: unknown task, unknown setting, or a value out of range.
     """
     cls = task_class(name)
     return cls(cls.Settings(**(settings or {})), num_envs, generators_for(seeds, device))

@@ -18,6 +18,8 @@ from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar
 
+from esp_envs.errors import UserError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -99,19 +101,19 @@ class Field:
     def __post_init__(self) -> None:
         for name, kind, example in _FIELD_TYPES:
             if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"field '{self.name}': {name} is {getattr(self, name)!r}; give {example}")
+                raise UserError(f"field '{self.name}': {name} is {getattr(self, name)!r}; give {example}")
         if self.count < 0:
-            raise ValueError(f"field '{self.name}': count is {self.count}; give how many items it has")
+            raise UserError(f"field '{self.name}': count is {self.count}; give how many items it has")
         if (self.kind == Kind.PICTURE) != (self.pixels is not None):
-            raise ValueError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
+            raise UserError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
         if self.pixels is not None and min(self.pixels) < 1:
-            raise ValueError(f"field '{self.name}': pixels are {self.pixels}; give at least one row and one column")
+            raise UserError(f"field '{self.name}': pixels are {self.pixels}; give at least one row and one column")
         if (self.kind == Kind.RING) != (self.rays > 0) or self.rays < 0:
-            raise ValueError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
+            raise UserError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
         if (self.kind == Kind.RECORD) != bool(self.parts):
-            raise ValueError(f"field '{self.name}': a record, and nothing else, says what parts it has")
+            raise UserError(f"field '{self.name}': a record, and nothing else, says what parts it has")
         if any(part.items is not Items.FIXED or part.pixels is not None for part in self.parts):
-            raise ValueError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
+            raise UserError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
 
     @property
     def item_width(self) -> int:
@@ -154,10 +156,10 @@ class Layout:
 
     def __post_init__(self) -> None:
         if stranger := next((repr(f) for f in self.fields if not isinstance(f, Field)), None):
-            raise ValueError(f"a layout is made of fields, and {stranger} is none; write layout(Field(...), ...)")
+            raise UserError(f"a layout is made of fields, and {stranger} is none; write layout(Field(...), ...)")
         names = [f.name for f in self.fields]
         if len(set(names)) != len(names):
-            raise ValueError(f"field names must differ, got {names}")
+            raise UserError(f"field names must differ, got {names}")
 
     @cached_property
     def width(self) -> int:
@@ -218,9 +220,9 @@ class Discrete:
 
     def __post_init__(self) -> None:
         if len(self.points) != len(self.names) or len(set(self.names)) != len(self.names):
-            raise ValueError("each action needs one meaning and a name of its own")
+            raise UserError("each action needs one meaning and a name of its own")
         if any(len(p) != self.kind.width for p in self.points):
-            raise ValueError(f"a meaning of kind {self.kind.name} has {self.kind.width} numbers")
+            raise UserError(f"a meaning of kind {self.kind.name} has {self.kind.width} numbers")
 
     @property
     def count(self) -> int:
@@ -246,11 +248,11 @@ class Continuous:
         """Refuse what is no vector of numbers.
 
         Raises:
-            ValueError: a field is a picture, a ring or a record.
+            UserError: a field is a picture, a ring or a record.
         """
         for part in self.layout.fields:
             if part.kind in (Kind.PICTURE, Kind.RING, Kind.RECORD):
-                raise ValueError(f"an action cannot hold '{part.name}', a {part.kind.name}; give vectors and numbers")
+                raise UserError(f"an action cannot hold '{part.name}', a {part.kind.name}; give vectors and numbers")
 
     @property
     def width(self) -> int:
@@ -342,11 +344,11 @@ class TaskSpec(Spaces):
 
     def __post_init__(self) -> None:
         if self.num_agents < 1 or self.horizon < 1:
-            raise ValueError(f"task {self.name}: agents and horizon must be positive")
+            raise UserError(f"task {self.name}: agents and horizon must be positive")
         if not 0 < self.control_period_s < math.inf:
-            raise ValueError(f"task {self.name}: control_period_s is {self.control_period_s}; give seconds above 0")
+            raise UserError(f"task {self.name}: control_period_s is {self.control_period_s}; give seconds above 0")
         if self.masks and not isinstance(self.action, Discrete):
-            raise ValueError(f"task {self.name}: masks are for discrete actions; leave 'masks' out")
+            raise UserError(f"task {self.name}: masks are for discrete actions; leave 'masks' out")
 
 
 def describe_action(action: ActionSpace) -> Sequence[tuple[str, str]]:

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.closed_form import gathers, reordered
-from esp_cli.kernels import actor
-from esp_cli.kernels.library import computes
+from esp_cli.networks.kernels import actor
+from esp_cli.networks.kernels.library import computes
 from esp_cli.symmetry import Transform
 
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from esp_cli.kernels import policy_gradient as kernels
-from esp_cli.kernels.library import computes
+from esp_cli.networks.kernels import policy_gradient as kernels
+from esp_cli.networks.kernels.library import computes
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
 

@@ -17,6 +17,7 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators
+from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 
@@ -119,7 +120,7 @@ class Learner(ABC):
         """Make networks, statistics, optimisers and collector; initial weights are drawn from the generators "learner".
 
         Raises:
-            ValueError: settings, network and task do not go together.
+            UserError: settings, network and task do not go together.
         """
 
     @classmethod
@@ -169,7 +170,7 @@ class Learner(ABC):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: tensors of another shape or name, so of another configuration.
+            UserError: tensors of another shape or name, so of another configuration.
         """
         try:
             for name, module in self.modules.items():
@@ -181,7 +182,7 @@ class Learner(ABC):
             self.collector.load_state_dict(below(tensors, "collector"))
         except (KeyError, RuntimeError, IndexError, TypeError, ValueError) as error:
             reason = str(error).split("\n")[0]
-            raise ValueError(f"the checkpoint does not fit this configuration ({reason})") from None
+            raise UserError(f"the checkpoint does not fit this configuration ({reason})") from None
 
     def start_from(self, policy: Mapping[str, Tensor]) -> None:
         """Give the policy, and the target policy where there is one, these weights."""

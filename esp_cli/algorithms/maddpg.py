@@ -19,11 +19,11 @@ from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw
 from esp_cli.algorithms.closed_form import carries
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
-from esp_cli.kernels.library import begin
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.joint_q import OneValueEach
+from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed

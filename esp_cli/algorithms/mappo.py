@@ -21,14 +21,15 @@ from esp_cli.algorithms.losses import clipped_surrogate, explained_variance, gae
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
-from esp_cli.kernels.library import begin
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.critic import Critic
 from esp_cli.networks.heads import Categorical
+from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 PROBE_STEPS = 100
@@ -42,7 +43,7 @@ class Mappo(Learner):
     """The learner: policy, centralised critic, optimiser and prior of S seeds; arguments as of `Learner`.
 
     Raises:
-        ValueError: a recurrent network whose rollouts are not whole episodes, more minibatches than rows, or a critic
+        UserError: a recurrent network whose rollouts are not whole episodes, more minibatches than rows, or a critic
             of each agent's own observation where agents end one by one and share a reward.
     """
 
@@ -59,24 +60,24 @@ class Mappo(Learner):
         self.critic = Critic(spec, config.critic_input, critic_network, generators).to(device)
         self.num_values = self.critic.num_values
         if spec.agents_end and spec.shared_reward and self.num_values > 1:
-            raise ValueError(
+            raise UserError(
                 f"mappo.critic_input=own values each agent up to its own end, but agents of {spec.name} share a reward "
                 "that goes on behind it; set mappo.critic_input to observations or state"
             )
         self.normaliser = ValueNormaliser(env.num_seeds, config.value_decay).to(device)
         self.recurrent = self.policy.actor.memory_width > 0
         if self.recurrent and spec.terminates:
-            raise ValueError(
+            raise UserError(
                 f"mappo needs episodes of one length for a recurrent network, but those of {spec.name} may end early; "
                 "choose a network without memory"
             )
         if self.recurrent and config.num_steps % spec.horizon:
-            raise ValueError(
+            raise UserError(
                 f"a recurrent network needs whole episodes: set mappo.num_steps to a multiple of {spec.horizon}"
             )
         sequences = config.num_envs * config.num_steps // (spec.horizon if self.recurrent else 1)
         if config.num_minibatches > sequences:
-            raise ValueError(
+            raise UserError(
                 f"mappo.num_minibatches is {config.num_minibatches}, but a rollout has {sequences} rows to share"
             )
         self.optimiser = SeedAdam(

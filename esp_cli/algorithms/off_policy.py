@@ -20,6 +20,7 @@ from esp_cli.networks.joint_q import OneValue
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
 
 
 class OffPolicyConfig(LearnerConfig):
@@ -58,7 +59,7 @@ class OffPolicyLearner(Learner):
         watched: names of what `update` returns that has to be finite for a seed to go on.
 
     Raises:
-        ValueError: the replay cannot hold what one round collects.
+        UserError: the replay cannot hold what one round collects.
     """
 
     replays = True
@@ -72,7 +73,7 @@ class OffPolicyLearner(Learner):
         config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
         per_round = config.num_envs * (1 + self.prior.num_stored)
         if per_round > config.replay_episodes:
-            raise ValueError(
+            raise UserError(
                 f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
             )
         self.joint = OneValue(spec, config.critic_input)
@@ -233,7 +234,7 @@ class OffPolicyLearner(Learner):
         super().load_state_dict(tensors)
         replay = below(tensors, "replay")
         if "counters" not in tensors or tensors["counters"].shape != (2,):
-            raise ValueError("the checkpoint does not fit this configuration (it has no counters)")
+            raise UserError("the checkpoint does not fit this configuration (it has no counters)")
         self.episodes, self.updates = tensors["counters"].tolist()
         if replay:
             self.replay.load_state_dict(replay)

@@ -8,6 +8,8 @@ config class.
 
 from __future__ import annotations
 
+from esp_envs.errors import UserError
+
 Sections = dict[str, dict[str, object]]
 """Settings by section: the algorithm's name, "network", "prior" or "evaluation"."""
 
@@ -187,16 +189,14 @@ def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
     """Return the settings of a preset on a task, layer by layer; a later one has the last word.
 
     Raises:
-        ValueError: the algorithm has no such preset, or has none called fast for this task.
+        UserError: the algorithm has no such preset, or has none called fast for this task.
     """
     presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
     if preset == "fast" and fast:
         if task not in fast:
-            raise ValueError(f"{algorithm} has no preset 'fast' for {task}; it has one for {', '.join(fast)}")
+            raise UserError(f"{algorithm} has no preset 'fast' for {task}; it has one for {', '.join(fast)}")
         return [presets["default"], TUNED.get(algorithm, {}).get(task, {}), fast[task]]
     if preset not in presets:
-        raise ValueError(
-            f"{algorithm} has no preset '{preset}'; it has {', '.join([*presets, *['fast'][: len(fast)]])}"
-        )
+        raise UserError(f"{algorithm} has no preset '{preset}'; it has {', '.join([*presets, *['fast'][: len(fast)]])}")
     of_task = {"default": TUNED, "paper": PAPER}.get(preset, {})
     return [presets[preset], of_task.get(algorithm, {}).get(task, {})]

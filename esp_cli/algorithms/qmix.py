@@ -27,6 +27,7 @@ from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
 
@@ -49,7 +50,7 @@ class Qmix(OffPolicyLearner):
     """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`.
 
     Raises:
-        ValueError: continuous actions.
+        UserError: continuous actions.
     """
 
     config_class = QmixConfig
@@ -79,10 +80,10 @@ class Qmix(OffPolicyLearner):
         """Return new epsilon-greedy policies.
 
         Raises:
-            ValueError: continuous actions.
+            UserError: continuous actions.
         """
         if not isinstance(spec.action, Discrete):
-            raise ValueError(
+            raise UserError(
                 f"qmix chooses among discrete actions, but those of this {spec.name} are continuous; "
                 "use maddpg or mappo, or discrete actions"
             )

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.prior import SeedBatch
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
 
@@ -96,11 +97,11 @@ class EpisodeReplay:
         """Store episodes; the oldest give way.
 
         Raises:
-            ValueError: more episodes at once than there is room for.
+            UserError: more episodes at once than there is room for.
         """
         count = episodes.obs.shape[1]
         if count > self.capacity:
-            raise ValueError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
+            raise UserError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
         places = (self.cursor + torch.arange(count, device=episodes.obs.device)) % self.capacity
         for name, tensor in self._store.tensors.items():
             tensor.index_copy_(1, places, getattr(episodes, name).to(tensor.dtype))
@@ -128,14 +129,14 @@ class EpisodeReplay:
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: episodes of another task or another number of seeds, or more than fit.
+            UserError: episodes of another task or another number of seeds, or more than fit.
         """
         if tensors.keys() != {*self._store.tensors, "cursor"} or tensors["obs"].dim() < 2:
-            raise ValueError("the saved episodes do not fit into the replay of this configuration")
+            raise UserError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]
         for name, tensor in self._store.tensors.items():
             saved = tensors[name]
             if size > self.capacity or saved.shape != tensor[:, :size].shape:
-                raise ValueError("the saved episodes do not fit into the replay of this configuration")
+                raise UserError("the saved episodes do not fit into the replay of this configuration")
             tensor[:, :size] = saved
         self.size, self.cursor = size, int(tensors["cursor"]) % self.capacity

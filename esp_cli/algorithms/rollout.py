@@ -13,6 +13,7 @@ from esp_cli.networks.critic import Critic
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import SeedBatch
 from esp_envs.base import Environment, Observation
+from esp_envs.errors import UserError
 
 
 @dataclass
@@ -155,7 +156,7 @@ class Collector:
         """Restore what `state_dict` returned."""
         own = {name: tensors[name].to(self.env.device) for name in ("obs", "state", "memory", "episode_return")}
         if own["obs"].shape != self.observation.obs.shape:
-            raise ValueError("the saved worlds have other seeds, worlds or observations than these; use their settings")
+            raise UserError("the saved worlds have other seeds, worlds or observations than these; use their settings")
         mask = tensors["action_mask"].to(self.env.device) if self.env.spec.masks else None
         alive = tensors["alive"].to(self.env.device) if self.env.spec.agents_end else None
         self.observation = Observation(own["obs"], own["state"], mask, alive)

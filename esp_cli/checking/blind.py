@@ -24,6 +24,7 @@ from esp_cli.checking.recorded import Transitions, collect, outputs_of
 from esp_cli.checking.verdicts import NEGLIGIBLE, SIGNIFICANT, ElementVerdict, FieldVerdict, Outcome
 from esp_cli.symmetry import Element, build_transform
 from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 BLIND = "transitions whose numbers nobody explained"
@@ -59,14 +60,14 @@ def discover_blindly(source: str, spaces: Spaces | None, data: Transitions) -> D
         data: of a policy that prefers no direction, from starts that prefer none.
 
     Raises:
-        ValueError: there are too many numbers, or masks of actions.
+        UserError: there are too many numbers, or masks of actions.
     """
     actions = None if data.action.is_floating_point() else int(data.action.max()) + 1
     if spaces is not None and isinstance(spaces.action, Discrete):
         actions = spaces.action.count
     _refuse_wide(data.obs.shape[-1] + (actions or data.action.shape[-1]))
     if data.action_mask is not None:
-        raise ValueError("--blind does not look at masks of actions, which these transitions have; leave --blind out")
+        raise UserError("--blind does not look at masks of actions, which these transitions have; leave --blind out")
     tried, is_complete = search(data, actions)
     results = judged_elements([verdict for _, verdict in tried], TOLERATED)
     maps = [one for (one, _), result in zip(tried, results, strict=True) if result.accepted]
@@ -114,7 +115,7 @@ def search(data: Transitions, actions: int | None) -> tuple[list[tuple[NumberMap
 
 def _refuse_wide(numbers: int) -> None:
     if numbers > WIDEST:
-        raise ValueError(f"--blind searches up to {WIDEST} numbers that an agent sees and does, not {numbers}")
+        raise UserError(f"--blind searches up to {WIDEST} numbers that an agent sees and does, not {numbers}")
 
 
 def _held(

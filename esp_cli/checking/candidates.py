@@ -10,6 +10,7 @@ from esp_cli.symmetry.admission import exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.groups import swap_and_round
 from esp_cli.symmetry.parse import Factors
+from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
 _TRIED = "d8,rot57,flip23"
@@ -31,7 +32,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
         transforms: text as `--transforms` takes it.
 
     Raises:
-        ValueError: the text means nothing, or nothing that is asked for can be tried.
+        UserError: the text means nothing, or nothing that is asked for can be tried.
     """
     texts = [transforms] if transforms is not None else [_TRIED, Factors.of(spaces.symmetry).plane]
     if transforms is None:
@@ -46,7 +47,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
             found.append(element)
     if not found:
         said = next(iter(refusals.values()), None)
-        raise ValueError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
+        raise UserError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
     return found
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from esp_cli.checking.recorded import Transitions
 from esp_cli.checking.transitions import FEWEST
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 _MOST_BYTES = 2**31
@@ -26,16 +27,16 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
         spaces: what the numbers are; None where nobody knows, so that the arrays alone say how many there are.
 
     Raises:
-        ValueError: it is missing, damaged or too large, or does not fit the spaces.
+        UserError: it is missing, damaged or too large, or does not fit the spaces.
     """
     arrays = _arrays(path)
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
-        raise ValueError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
+        raise UserError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
     if spaces is None:
         flat = [name for name in ("obs", "action", "action_mask") if name in arrays and arrays[name].ndim < 2]
         if flat:
-            raise ValueError(f"'{flat[0]}' of {path} has no axis of agents; save [episodes, steps, agents, width]")
+            raise UserError(f"'{flat[0]}' of {path} has no axis of agents; save [episodes, steps, agents, width]")
         agents, width = arrays["obs"].shape[-2:]
         count, acts = None, arrays["action"].shape[-1]
         discrete = arrays["action"].dtype.kind in "iu"
@@ -51,17 +52,17 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
         tensors[name] = _tensor(path, name, arrays[name], shape, integer=discrete and name == "action")
     lengths = {tuple(tensor.shape[:2]) for tensor in tensors.values()}
     if len(lengths) != 1:
-        raise ValueError(f"the arrays of {path} hold different numbers of transitions; give each the same")
+        raise UserError(f"the arrays of {path} hold different numbers of transitions; give each the same")
     if len(tensors["obs"]) < FEWEST:
-        raise ValueError(f"{path} holds {len(tensors['obs'])} episodes; record at least {FEWEST}")
+        raise UserError(f"{path} holds {len(tensors['obs'])} episodes; record at least {FEWEST}")
     empty = [name for name, tensor in tensors.items() if not tensor.numel()]
     if empty:
-        raise ValueError(f"'{empty[0]}' of {path} holds no number; record at least one step of one agent")
+        raise UserError(f"'{empty[0]}' of {path} holds no number; record at least one step of one agent")
     if discrete:
         chosen = tensors["action"]
         if int(chosen.min()) < 0 or (count is not None and int(chosen.max()) >= count):
             known = "on" if count is None else f"to {count - 1}"
-            raise ValueError(f"the actions of {path} are not all from 0 {known}; save indices")
+            raise UserError(f"the actions of {path} are not all from 0 {known}; save indices")
     mask = tensors.get("action_mask")
     return Transitions(
         tensors["obs"], tensors["action"], tensors["reward"], tensors["next_obs"], None if mask is None else mask > 0
@@ -71,18 +72,18 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     """Return the arrays that are looked for."""
     if not path.is_file():
-        raise ValueError(f"there is no file {path}; give the path of an .npz file")
+        raise UserError(f"there is no file {path}; give the path of an .npz file")
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(item.file_size for item in archive.infolist())
         if size > _MOST_BYTES:
-            raise ValueError(f"it unpacks to {size / 1e9:.1f} GB, and at most {_MOST_BYTES / 1e9:.1f} GB are read")
+            raise UserError(f"it unpacks to {size / 1e9:.1f} GB, and at most {_MOST_BYTES / 1e9:.1f} GB are read")
         with np.load(path, allow_pickle=False) as file:
             found = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.files]
             return {name: file[name] for name in found}
     except Exception as error:  # whatever a damaged archive or header makes zipfile and NumPy raise
         reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise ValueError(f"{path} is not an intact .npz file ({reason}); save it again with np.savez") from None
+        raise UserError(f"{path} is not an intact .npz file ({reason}); save it again with np.savez") from None
 
 
 def _tensor(path: Path, name: str, array: np.ndarray, shape: tuple[int, ...], integer: bool) -> Tensor:
@@ -90,10 +91,10 @@ def _tensor(path: Path, name: str, array: np.ndarray, shape: tuple[int, ...], in
     found = tuple(array.shape)
     if found[-len(shape) :] != shape or array.ndim - len(shape) not in (1, 2):
         wanted = ", ".join(map(str, ("episodes", "steps", *shape)))
-        raise ValueError(f"'{name}' of {path} has shape {found}, expected ({wanted}) or the same without steps")
+        raise UserError(f"'{name}' of {path} has shape {found}, expected ({wanted}) or the same without steps")
     if array.dtype.kind not in ("iu" if integer else "fiub"):
-        raise ValueError(f"'{name}' of {path} holds {array.dtype}; save {'integers' if integer else 'numbers'}")
+        raise UserError(f"'{name}' of {path} holds {array.dtype}; save {'integers' if integer else 'numbers'}")
     tensor = torch.from_numpy(array.astype(np.int64 if integer else np.float32))
     if not bool(torch.isfinite(tensor).all()):
-        raise ValueError(f"'{name}' of {path} holds numbers that are not finite; leave those transitions out")
+        raise UserError(f"'{name}' of {path} holds numbers that are not finite; leave those transitions out")
     return tensor if array.ndim - len(shape) == 2 else tensor.unsqueeze(1)

@@ -15,6 +15,7 @@ from esp_cli.symmetry import Group, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestricted
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
 from esp_envs.registry import make, task_class
 
 _EPISODES = 1024
@@ -32,13 +33,13 @@ def prepared(config: RunConfig) -> RunConfig:
     measured stands in the configuration: nothing is measured twice.
 
     Raises:
-        ValueError: there is a compass, which leaves nothing to be measured, or the task cannot carry the elements.
+        UserError: there is a compass, which leaves nothing to be measured, or the task cannot carry the elements.
     """
     prior = config.prior
     if prior.kind == "none":
         return config
     if prior.compass and prior.trust != "full":
-        raise ValueError(
+        raise UserError(
             f"with prior.compass nothing is false that prior.trust={prior.trust} could find; leave one of the two out"
         )
     if prior.transforms == DISCOVERED.rstrip(":"):
@@ -99,13 +100,13 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     """Return by how many standard deviations of its worst field each element is off; 0 where it holds.
 
     Raises:
-        ValueError: the task cannot carry the elements, or they cannot be listed.
+        UserError: the task cannot carry the elements, or they cannot be listed.
     """
     env = make_worlds(_WORLDS, [0])
     spec = env.spec
     elements = admitted_elements(transforms, unrestricted(spec))  # what is weighed need not be declared
     if isinstance(elements, Group):
-        raise ValueError(
+        raise UserError(
             f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "
             "finite group, such as d4"
         )

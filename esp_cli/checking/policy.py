@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import candidates
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.symmetry import build_transform
 from esp_cli.training.build import with_compass
-from esp_cli.training.loading import TrainedPolicy
 from esp_envs.base import Observation
 from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.errors import UserError
 
 _WORLDS, _STEPS = 64, 10
 _CLOSE = 0.1
@@ -37,11 +38,11 @@ def check_policy(trained: TrainedPolicy, make: MakeWorlds, transforms: str | Non
         transforms: which elements; see `check_symmetry`.
 
     Raises:
-        ValueError: the policy is of another task.
+        UserError: the policy is of another task.
     """
     env = with_compass(make(_WORLDS, trained.config.seeds), trained.config.prior)
     if (env.spec.observation, env.spec.action) != (trained.spec.observation, trained.spec.action):
-        raise ValueError(f"{trained.source} is a policy of {trained.config.task}, which sees or does other things")
+        raise UserError(f"{trained.source} is a policy of {trained.config.task}, which sees or does other things")
     policy = deepcopy(trained.policy).cpu()
     steps: list[tuple[Observation, Tensor]] = []
     observation = env.reset()

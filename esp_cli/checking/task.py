@@ -50,7 +50,7 @@ def check_symmetry(make: MakeWorlds, transforms: str | None = None) -> SymmetryR
         transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
 
     Raises:
-        ValueError: the transforms mean nothing, or the task can carry none of them.
+        UserError: the transforms mean nothing, or the task can carry none of them.
     """
     probe = make(1, [0])
     spec = probe.spec

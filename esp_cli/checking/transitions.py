@@ -21,6 +21,7 @@ from esp_cli.checking.regression import MATERIAL, check_by_regression
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
 from esp_cli.prior.regression import moments, orders_of_others, own_inputs, ridge
 from esp_cli.symmetry import Element, build_transform
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 FEWEST = 64
@@ -38,7 +39,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
         elements: to try.
 
     Raises:
-        ValueError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
+        UserError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
     """
     data = _in_float32(data)
     _refuse_what_says_nothing(spaces, data)
@@ -77,16 +78,16 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
     for name, shape in (("obs", seen), ("action", (*lead, *width)), ("reward", lead), ("next_obs", seen)):
         if (found := tuple(getattr(data, name).shape)) != shape or len(lead) != 3:
             axes = "[episodes, steps, agents]" + (" and the width" if len(shape) > 3 else "")
-            raise ValueError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
+            raise UserError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
     if len(data.obs) < FEWEST:
-        raise ValueError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
+        raise UserError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
     for name in ("obs", "action", "reward", "next_obs"):
         if not bool(getattr(data, name).isfinite().all()):
-            raise ValueError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
+            raise UserError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
     if isinstance(spaces.action, Discrete):
         count, action = spaces.action.count, data.action
         if action.is_floating_point() or not bool(((action >= 0) & (action < count)).all()):
-            raise ValueError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
+            raise UserError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
 
 
 def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -> ElementVerdict:

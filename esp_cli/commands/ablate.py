@@ -9,6 +9,7 @@ import typer
 
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
+from esp_envs.errors import UserError
 
 EPILOG = """Examples:\n
     esp ablate transforms --algo maddpg --task navigation\n
@@ -54,7 +55,7 @@ def ablate(
     kind, settings = f"ablate-{part}", parse_names(broken_by)
     names = parse_names(methods, KINDS[kind].variants)
     if settings and part != "breaking":
-        raise ValueError("--broken-by is for esp ablate breaking; leave it out")
+        raise UserError("--broken-by is for esp ablate breaking; leave it out")
     words = [
         *(("--methods", ",".join(names)) if names else ()),
         *(("--broken-by", ",".join(settings)) if settings else ()),

@@ -17,6 +17,7 @@ from esp_cli.commands.options import (
     parse_task_settings,
     register_named,
 )
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.checking import PolicyVerdict, SymmetryReport
@@ -59,7 +60,7 @@ def check(
 
     if what == "task" and any((transforms, policy, algo, network)):
         names = "--transforms, --policy, --algo and --network"
-        raise ValueError(f"{names} belong to 'esp check symmetry'; leave them out")
+        raise UserError(f"{names} belong to 'esp check symmetry'; leave them out")
     register_named([task], algo, network)
     chosen = resolve_task_settings(task, parse_task_settings(settings or []))
 
@@ -104,7 +105,7 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
     report = check_symmetry(make_worlds, transforms)
     measured: list[PolicyVerdict] = []
     if policy is not None:
-        from esp_cli.deploy.bundled import open_policy
+        from esp_cli.policies.bundled import open_policy
 
         measured = check_policy(open_policy(policy), make_worlds, transforms)
     found = {"report": report, "holds": report.holds, "policy": measured}

@@ -11,6 +11,7 @@ from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 from esp_cli.defaults import Mode
+from esp_envs.errors import UserError
 
 EPILOG = """Examples:\n
     esp compare-homomorphic --dry-run\n
@@ -52,6 +53,6 @@ def compare_homomorphic(
     request = choices.request("homomorphic", "compare-homomorphic", *words)
     board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
     if twice := sorted(board.keys() & request.overrides.keys()):
-        raise ValueError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
+        raise UserError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
     request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
     run_study("homomorphic", request, choices, mode, limits)

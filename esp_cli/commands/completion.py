@@ -60,14 +60,14 @@ def settings(context: typer.Context, incomplete: str) -> list[str]:
 
 def trackers(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the trackers."""
-    from esp_cli.trackers import TRACKERS
+    from esp_cli.training.trackers import TRACKERS
 
     return _starting(incomplete, [*TRACKERS])
 
 
 def policies(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the bundled policies by task and by name, and the files and folders here."""
-    from esp_cli.deploy.manifest import read_bundled
+    from esp_cli.policies.manifest import read_bundled
 
     bundled = read_bundled()
     names = [*(entry.task for entry in bundled), *(entry.name for entry in bundled)]

@@ -8,6 +8,7 @@ from decimal import Decimal
 
 from esp_cli import console
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS
+from esp_envs.errors import UserError
 
 _MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
 _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
@@ -18,17 +19,17 @@ def parse_count(value: str | int) -> int:
     """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6.
 
     Raises:
-        ValueError: no number, not positive, not a whole number of steps, or more than `MAX_STEPS`.
+        UserError: no number, not positive, not a whole number of steps, or more than `MAX_STEPS`.
     """
     text = str(value).strip()
     match = _COUNT.fullmatch(text)
     if match is None:
-        raise ValueError(f"'{text}' is not a number of steps; write for example 20000, 500k or 1.5M")
+        raise UserError(f"'{text}' is not a number of steps; write for example 20000, 500k or 1.5M")
     count = Decimal(match["number"].replace("_", "")) * _MULTIPLIERS[match["letter"].lower()]
     if count != count.to_integral_value() or count < 1:
-        raise ValueError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
+        raise UserError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
     if count > MAX_STEPS:
-        raise ValueError(f"'{text}' is more than the {MAX_STEPS:.0e} steps that can be asked for; write for example 3M")
+        raise UserError(f"'{text}' is more than the {MAX_STEPS:.0e} steps that can be asked for; write for example 3M")
     return int(count)
 
 
@@ -36,7 +37,7 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
     """Read how many seeds a run has: "10" means the ten seeds 0..9; a list, as 3,7, is taken too, with a note.
 
     Raises:
-        ValueError: not a number of seeds, or too many.
+        UserError: not a number of seeds, or too many.
     """
     if not isinstance(value, str | int):
         return tuple(value)
@@ -44,12 +45,12 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
     if re.fullmatch(r"\d{1,9}", text):
         count = int(text)
         if not 1 <= count <= MAX_SEEDS:
-            raise ValueError(
+            raise UserError(
                 f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one by --seed-list {text}"
             )
         return tuple(range(count))
     if not _SEED_LIST.fullmatch(text):
-        raise ValueError(f"'{text}' does not name seeds; write how many, as --seeds 10, or which, as --seed-list 3,7")
+        raise UserError(f"'{text}' does not name seeds; write how many, as --seeds 10, or which, as --seed-list 3,7")
     seeds = parse_seed_list(text)
     console.note(f"--seeds {text} is now --seed-list {','.join(map(str, seeds))}")
     return seeds
@@ -59,16 +60,16 @@ def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
     """Read the seeds of a run by their numbers: "3,7" means the seeds 3 and 7, "7" the seed 7 alone.
 
     Raises:
-        ValueError: not a list of seeds, a seed twice, or too many seeds.
+        UserError: not a list of seeds, a seed twice, or too many seeds.
     """
     text = str(value).strip() if isinstance(value, str) else ",".join(map(str, value))
     if not _SEED_LIST.fullmatch(text):
-        raise ValueError(f"'{text}' is not a list of seeds; write their numbers, as 3,7")
+        raise UserError(f"'{text}' is not a list of seeds; write their numbers, as 3,7")
     seeds = tuple(int(item) for item in text.split(",") if item.strip())
     if len(seeds) > MAX_SEEDS:
-        raise ValueError(f"{len(seeds)} seeds cannot be trained at once; name at most {MAX_SEEDS}")
+        raise UserError(f"{len(seeds)} seeds cannot be trained at once; name at most {MAX_SEEDS}")
     if len(set(seeds)) < len(seeds):
-        raise ValueError(f"the seeds '{text}' name one seed twice; name each once")
+        raise UserError(f"the seeds '{text}' name one seed twice; name each once")
     return seeds
 
 
@@ -78,8 +79,8 @@ def chosen_seeds(
     """Return the seeds that `--seeds` and `--seed-list` ask for.
 
     Raises:
-        ValueError: both are given.
+        UserError: both are given.
     """
     if named is not None and counted is not None:
-        raise ValueError("--seeds and --seed-list both say which seeds to train; leave one of them out")
+        raise UserError("--seeds and --seed-list both say which seeds to train; leave one of them out")
     return counted or named or default

@@ -10,6 +10,7 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_named
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.checking.discovery import Discovery
@@ -54,7 +55,7 @@ def discover(
     at most 5 % are false, in expectation.
     """
     if blind and transforms is not None:
-        raise ValueError("--blind searches for maps by itself; leave --transforms out")
+        raise UserError("--blind searches for maps by itself; leave --transforms out")
     found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, blind)
     console.result(json, found, lambda: _print(found))
 
@@ -71,29 +72,29 @@ def _discovery(
     register_named([task, None if path.exists() else what])
     if path.suffix == ".npz" or path.is_file():
         if settings and task is None:
-            raise ValueError(f"--set is for a task, and {what} is a file; add --task, or leave --set out")
+            raise UserError(f"--set is for a task, and {what} is a file; add --task, or leave --set out")
         if logs:
-            raise ValueError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
+            raise UserError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
         spec = None if task is None else make(task, 1, [0], resolve_task_settings(task, settings)).spec
         data = read_transitions(path, spec)
         if spec is None or blind:
             from esp_cli.checking.blind import discover_blindly
 
             if transforms is not None:
-                raise ValueError(f"{what} does not say what its numbers are, as --transforms needs; add --task")
+                raise UserError(f"{what} does not say what its numbers are, as --transforms needs; add --task")
             return discover_blindly(what, spec, data)
         return discover_in_transitions(what, spec, data, transforms)
     name = what
     if task is not None and not path.is_dir():
-        raise ValueError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
+        raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
     if path.is_dir():
-        from esp_cli.training.loading import parse_config
+        from esp_cli.training.config_file import parse_config
         from esp_cli.training.run_folder import RunFolder
 
         config = parse_config(RunFolder.open(path).config, path)
         name, settings = config.task, config.task_settings | settings
         if task not in (None, name):
-            raise ValueError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
+            raise UserError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
     settings = resolve_task_settings(name, settings)
 
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:

@@ -22,7 +22,7 @@ from esp_cli.commands.options import (
 from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
-    from esp_cli.evaluation.final import FinalEvaluation
+    from esp_cli.policies.evaluation import FinalEvaluation
 
 EPILOG = """Examples:\n
     esp eval navigation --algo mappo --prior none\n
@@ -46,9 +46,9 @@ def evaluate(
 
     The task may have other settings than in training: another physics, more noise.
     """
-    from esp_cli.deploy.bundled import open_policy
-    from esp_cli.evaluation.final import evaluate as evaluate_policy
-    from esp_cli.training.loading import transfer
+    from esp_cli.policies.bundled import open_policy
+    from esp_cli.policies.evaluation import evaluate as evaluate_policy
+    from esp_cli.policies.loading import transfer
 
     register_named(task, [algo], network)
     trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))

@@ -20,11 +20,12 @@ from esp_cli.commands.options import (
     register_named,
 )
 from esp_cli.defaults import EPISODES
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.deploy.export import Exported
-    from esp_cli.deploy.manifest import Entry
-    from esp_cli.training.loading import TrainedPolicy
+    from esp_cli.export.export import Exported
+    from esp_cli.policies.loading import TrainedPolicy
+    from esp_cli.policies.manifest import Entry
 
 EPILOG = """Examples:\n
     esp export formation -f c -o formation-c\n
@@ -75,18 +76,18 @@ def export(
     Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
     """
     for unknown in set(formats) - set(FORMATS):
-        raise ValueError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
-    from esp_cli.deploy.bundled import open_policy
-    from esp_cli.deploy.bundling import bundle
-    from esp_cli.deploy.export import export as write
-    from esp_cli.training.loading import single_seed
+        raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
+    from esp_cli.export.export import export as write
+    from esp_cli.policies.bundled import open_policy
+    from esp_cli.policies.bundling import bundle
+    from esp_cli.policies.loading import single_seed
 
     if "policy" in formats and len(formats) > 1:
-        raise ValueError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
+        raise UserError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
     if name is not None and "policy" not in formats:
-        raise ValueError("--name is for -f policy alone; leave it out")
+        raise UserError("--name is for -f policy alone; leave it out")
     if seed is not None and episodes is not None and "policy" not in formats:
-        raise ValueError("--episodes finds the best seed, and --seed names one; leave one of them out")
+        raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
     register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
@@ -109,7 +110,7 @@ def _announce(entry: Entry, out: Path) -> None:
 
 
 def _best(trained: TrainedPolicy, episodes: int) -> int:
-    from esp_cli.deploy.bundling import best_seed
+    from esp_cli.policies.bundling import best_seed
 
     seeds = trained.config.seeds
     best = best_seed(trained, episodes)

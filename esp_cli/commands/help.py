@@ -9,7 +9,7 @@ from typing import Any, get_args, get_origin
 import typer
 
 from esp_cli.commands.completion import COMPLETERS, Completer
-from esp_cli.formatting import format_count
+from esp_cli.files.formatting import format_count
 
 _TRAINED, _SEARCHED, _PRIOR, _SETTINGS = "What is trained", "What is searched", "Symmetry prior", "Settings"
 _RUN, _OUTPUT, _POLICY, _PICTURE = "How it runs", "Output", "What is evaluated", "Picture"

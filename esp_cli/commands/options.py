@@ -18,6 +18,7 @@ import typer
 from esp_cli import console
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 from esp_cli.defaults import PriorKind
+from esp_envs.errors import UserError
 
 T = TypeVar("T")
 
@@ -28,7 +29,7 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
     "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; "prey=random" -> {"prey": "random"}.
 
     Raises:
-        ValueError: an item without "=" or without a name, or a name twice.
+        UserError: an item without "=" or without a name, or a name twice.
     """
     from esp_cli.files.documents import parse_value  # pydantic comes with it, which no help needs
 
@@ -37,16 +38,16 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
         name, equals, text = item.partition("=")
         name = name.strip()
         if not equals or not name:
-            raise ValueError(
+            raise UserError(
                 f"--set {item} is not a setting; write --set name=value, as in --set mappo.learning_rate=5e-4"
             )
         if name in settings:
-            raise ValueError(f"--set names '{name}' twice; set it once")
+            raise UserError(f"--set names '{name}' twice; set it once")
         try:
             settings[name] = parse_value(text)
         except ValueError:
             if text.lstrip()[:1] in ("[", "{"):
-                raise ValueError(f"--set {name} has a value that is not JSON; write lists as [64,64]") from None
+                raise UserError(f"--set {name} has a value that is not JSON; write lists as [64,64]") from None
             settings[name] = text.strip()
     return settings
 
@@ -63,12 +64,12 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
     ["task.sensor_noise_m=0.005"], "pymunk" -> {"sensor_noise_m": 0.005, "physics": "pymunk"}; a setting goes before it.
 
     Raises:
-        ValueError: as `parse_assignments`, or a setting that is not the task's.
+        UserError: as `parse_assignments`, or a setting that is not the task's.
     """
     settings = parse_assignments(items)
     for name in settings:
         if not name.startswith("task."):
-            raise ValueError(f"--set {name} is not a setting of the task; this command takes only task.NAME=VALUE")
+            raise UserError(f"--set {name} is not a setting of the task; this command takes only task.NAME=VALUE")
     own = {name.removeprefix("task."): value for name, value in settings.items()}
     return own if physics is None else {"physics": physics, **own}
 
@@ -77,11 +78,11 @@ def check_finite(option: str, *values: float) -> None:
     """Refuse numbers of an option that are not finite, which typer lets through.
 
     Raises:
-        ValueError: one of them is NaN or infinite.
+        UserError: one of them is NaN or infinite.
     """
     for value in values:
         if not math.isfinite(value):
-            raise ValueError(f"{option} {value} is not a finite number; write for example {option} -125")
+            raise UserError(f"{option} {value} is not a finite number; write for example {option} -125")
 
 
 def was_given(context: typer.Context, name: str | None) -> bool:
@@ -100,7 +101,7 @@ def register_named(
     """Admit what this command line names as module:Class; a name of any other form needs nothing.
 
     Raises:
-        ValueError: a module cannot be imported, or holds no such class.
+        UserError: a module cannot be imported, or holds no such class.
     """
     from esp_envs.installed import load
 
@@ -130,7 +131,7 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
 
 def _named_class(value: str) -> str:
     if ":" not in value:
-        raise ValueError(f"'{value}' is no module:Class; only a class of yours has to be named, so leave it out")
+        raise UserError(f"'{value}' is no module:Class; only a class of yours has to be named, so leave it out")
     return value
 
 
@@ -143,7 +144,7 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     Only `esp eval` may write the final evaluation of a run.
 
     Raises:
-        ValueError: the path is that of a document or weights in the folder of a run, a study or a tuning.
+        UserError: the path is that of a document or weights in the folder of a run, a study or a tuning.
     """
     from esp_cli.training import folder_names as of
 
@@ -158,7 +159,7 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     home = next((folder.parent for folder in real.parents if folder.name == of.CHECKPOINTS), None)
     for folder in (real.parent if owned else None, home):
         if folder and any(begins_with(folder / name, '"format": "esp-') for name in documents):
-            raise ValueError(f"{path} belongs to the run or study in {folder}; write to another file")
+            raise UserError(f"{path} belongs to the run or study in {folder}; write to another file")
     return path
 
 

@@ -92,9 +92,9 @@ def render(
 
     The picture shows paths; of navigation also who covers which landmark when, of wildlife the last steps.
     """
-    from esp_cli.deploy.bundled import open_policy
     from esp_cli.drawing.draw import check_target, draw
-    from esp_cli.training.loading import transfer
+    from esp_cli.policies.bundled import open_policy
+    from esp_cli.policies.loading import transfer
 
     kind = check_target(out, episodes, fps)
     register_named(task, [algo], network)

@@ -22,6 +22,7 @@ from esp_cli.commands.options import (
     register_named,
 )
 from esp_cli.defaults import Mode
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material
@@ -114,7 +115,7 @@ def report(
     of_the_picture = reference or y_limits
     of_runs = any((out, films, results, at, threshold, of_the_picture, mode, plot, csv, json))
     if not runs and (of_runs or fill is None):
-        raise ValueError("there is nothing to report; name a study folder or run folders")
+        raise UserError("there is nothing to report; name a study folder or run folders")
     if fill is not None:
         _fill(fill)
     if not runs:
@@ -124,11 +125,11 @@ def report(
     _check_limits(y_limits)
     if TUNING_FORMAT.is_one(Path(runs[0]) / TUNING):  # the report of a tuning has a file of this name too
         fresh = shlex.quote(str(Path(runs[0]) / FRESH))
-        raise ValueError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
+        raise UserError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
     is_study = StudyFolder.is_one(Path(runs[0]))
     if is_study:
         if len(runs) > 1 or at or reference or plot or y_limits:
-            raise ValueError(
+            raise UserError(
                 "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
             )
         out = out or Path(runs[0]) / "report"
@@ -162,19 +163,19 @@ def _refuse_idle(films: bool, of_the_picture: bool) -> None:
     """Refuse options of what is not written.
 
     Raises:
-        ValueError: films without a page, or lines and limits without a picture.
+        UserError: films without a page, or lines and limits without a picture.
     """
     if films:
-        raise ValueError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
+        raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
     if of_the_picture:
-        raise ValueError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
+        raise UserError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
 
 
 def _check_limits(limits: tuple[float, float] | None) -> None:
     """Refuse limits of the picture that leave nothing to see."""
     check_finite("--y-limits", *(limits or ()))
     if limits is not None and limits[0] >= limits[1]:
-        raise ValueError(f"--y-limits {limits[0]:g} {limits[1]:g} is empty; write the lowest return before the highest")
+        raise UserError(f"--y-limits {limits[0]:g} {limits[1]:g} is empty; write the lowest return before the highest")
 
 
 def threshold_words(thresholds: Sequence[float]) -> list[str]:
@@ -247,5 +248,5 @@ def _references(items: Sequence[str]) -> dict[str, float]:
         except ValueError:
             name = ""
         if not name or not math.isfinite(out[name]):
-            raise ValueError(f"--reference {item} is no line to draw; write --reference NAME=VALUE")
+            raise UserError(f"--reference {item} is no line to draw; write --reference NAME=VALUE")
     return out

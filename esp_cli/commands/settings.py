@@ -11,6 +11,7 @@ import typer
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, installed_tasks
 from esp_cli.settings_index import Section, Setting, read_index
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +43,7 @@ def _sections(of: str | None) -> Sequence[Section]:
     """Return the sections that a name asks for.
 
     Raises:
-        ValueError: there is nothing of that name.
+        UserError: there is nothing of that name.
     """
     built_in = read_index()
     found = [section for section in built_in if of in (None, section.name)]
@@ -56,7 +57,7 @@ def _sections(of: str | None) -> Sequence[Section]:
 
     names = [section.name for section in built_in]
     hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
-    raise ValueError(f"nothing with settings is called '{of}'{hint}")
+    raise UserError(f"nothing with settings is called '{of}'{hint}")
 
 
 def _print(sections: Sequence[Section]) -> None:

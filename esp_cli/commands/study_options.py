@@ -26,6 +26,7 @@ from esp_cli.commands.options import (
     register_named,
 )
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
@@ -105,7 +106,7 @@ def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tup
             names.append(", ".join(parts[:end]))
             del parts[:end]
     if items and not names:
-        raise ValueError(f"'{' '.join(items)}' names nothing; name something, or leave the option out")
+        raise UserError(f"'{' '.join(items)}' names nothing; name something, or leave the option out")
     return tuple(names) or None
 
 
@@ -113,7 +114,7 @@ def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, in
     """Read numbers of steps: ["500k", "formation=1M"] -> ((None, 500000), ("formation", 1000000)).
 
     Raises:
-        ValueError: no number of steps.
+        UserError: no number of steps.
     """
     found: list[tuple[str | None, int]] = []
     for item in parse_names(items) or ():
@@ -151,7 +152,7 @@ class StudyChoices:
         """Open the studies whose finished runs are taken over.
 
         Raises:
-            ValueError: one is missing or damaged.
+            UserError: one is missing or damaged.
         """
         from esp_cli.studies.study import StudyFolder
 
@@ -170,7 +171,7 @@ class StudyChoices:
         """Return the device on which the runs train; that of a cluster need not be here.
 
         Raises:
-            ValueError: a GPU is asked for, and this machine, which is to use it, has none.
+            UserError: a GPU is asked for, and this machine, which is to use it, has none.
         """
         from esp_cli.machine import resolve_device
 
@@ -184,7 +185,7 @@ class StudyChoices:
             words: the command without these options, such as "reproduce", "table1".
 
         Raises:
-            ValueError: a name, number or setting that cannot be read.
+            UserError: a name, number or setting that cannot be read.
         """
         from esp_cli.studies.catalogue import Request
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.progress import Progress, TaskID
 
 from esp_cli import console
-from esp_cli.formatting import format_rate
+from esp_cli.files.formatting import format_rate
 
 if TYPE_CHECKING:
     from esp_cli.studies.scheduler import Run, Snapshot

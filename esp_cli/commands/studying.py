@@ -19,6 +19,7 @@ from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.machine import busy_with
 from esp_cli.training.folder_names import LOG
+from esp_envs.errors import UserError
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def run_study(
         thresholds: returns whose first passing the tables state, likewise.
 
     Raises:
-        ValueError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
+        UserError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
     from esp_cli.studies.catalogue import plan, without_effect
     from esp_cli.studies.study import StudyFolder
@@ -80,7 +81,7 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
     """End the command where runs of the study in a folder failed.
 
     Raises:
-        ValueError: some did.
+        UserError: some did.
     """
     if not names:
         return
@@ -89,7 +90,7 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
     whose = "their folders" if len(logged) == len(names) else f"the folders of {', '.join(logged)}"
     see = f" see {LOG} in {whose} below {out};" if logged else ""
     runs = "run" if len(names) == 1 else "runs"
-    raise ValueError(f"{len(names)} {runs} failed ({', '.join(names)});{see} the same command tries them again")
+    raise UserError(f"{len(names)} {runs} failed ({', '.join(names)});{see} the same command tries them again")
 
 
 @contextmanager
@@ -101,21 +102,21 @@ def open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
         out: its folder.
 
     Raises:
-        ValueError: Ray is not installed, or its cluster cannot be used.
+        UserError: Ray is not installed, or its cluster cannot be used.
     """
     from esp_cli.studies.engine_local import LocalEngine
 
     if choices.engine == "local":
         if choices.address is not None:
-            raise ValueError("--address is that of a Ray cluster; add --engine ray, or leave it out")
+            raise UserError("--address is that of a Ray cluster; add --engine ray, or leave it out")
         if choices.gpu_share != 1.0:
-            raise ValueError("--gpu-share is for GPUs of a Ray cluster; add --engine ray, or leave it out")
+            raise UserError("--gpu-share is for GPUs of a Ray cluster; add --engine ray, or leave it out")
         yield LocalEngine()
         return
     try:
         from esp_cli.studies.engine_ray import RayEngine
     except ImportError:
-        raise ValueError(f"Ray is not installed: {install('cluster')}, or use --engine local") from None
+        raise UserError(f"Ray is not installed: {install('cluster')}, or use --engine local") from None
     with RayEngine(out, choices.address, choices.gpu_share) as engine:
         yield engine
 

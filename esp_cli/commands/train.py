@@ -31,10 +31,11 @@ from esp_cli.commands.options import (
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.train_choices import with_file
 from esp_cli.defaults import STEPS, PriorKind
-from esp_cli.kernels.library import begin
+from esp_cli.networks.kernels.library import begin
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.library.run import Run
+    from esp_cli.run import Run
     from esp_cli.training.config import RunConfig
     from esp_cli.training.trainer import Progress, Trainer
 
@@ -116,12 +117,12 @@ def train(
     if named.get("network.compiled"):
         begin("perceptron")  # while torch is imported
 
-    from esp_cli.library import run as runs
+    from esp_cli import run as runs
     from esp_cli.machine import resolve_device
-    from esp_cli.trackers import require
+    from esp_cli.policies.initial import OwnCopy
     from esp_cli.training.config import resolve_config
-    from esp_cli.training.initial import OwnCopy
     from esp_cli.training.run_folder import RUN_FORMAT
+    from esp_cli.training.trackers import require
 
     trackers = tuple(track or ())
     register_named([task], [algo], [network, named.get("network.name")])
@@ -174,7 +175,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
         if parameter.name not in ("resume", "track", *allowed) and was_given(context, parameter.name)
     ]
     if given:
-        raise ValueError(
+        raise UserError(
             f"--resume continues a run with its own settings; leave out {', '.join(given)}, or start a new run"
         )
 
@@ -241,7 +242,7 @@ def _shown(news: Progress) -> dict[str, float]:
 def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
     import numpy as np
 
-    from esp_cli.evaluation.statistics import mean_and_sem
+    from esp_cli.policies.statistics import mean_and_sem
 
     rows = []
     for mode, values in trainer.final_returns().items():

@@ -10,10 +10,11 @@ import typer
 
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 from esp_cli.commands.options import Device, was_given
+from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
+    from esp_cli.policies.initial import OwnCopy
     from esp_cli.training.config import RunConfig
-    from esp_cli.training.initial import OwnCopy
 
 _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""
@@ -34,7 +35,7 @@ def with_file(
         The choices, the settings, and the names of settings that somebody chose: not those of a whole configuration.
 
     Raises:
-        ValueError: the file cannot be read, or does not go with what was given.
+        UserError: the file cannot be read, or does not go with what was given.
     """
     from esp_cli.prior.config import SAID_BY_AUTO
     from esp_cli.training.config_file import read_config_file
@@ -46,7 +47,7 @@ def with_file(
         for name in ("task", "algorithm", "preset"):
             if name in said and given[name] != file.choices[name]:
                 flag = _flag(name)
-                raise ValueError(
+                raise UserError(
                     f"{path} holds every setting of a run with {flag} {file.choices[name]}; leave {flag} out, "
                     "or name a file with only what differs"
                 )
@@ -86,10 +87,10 @@ def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
     """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same.
 
     Raises:
-        ValueError: there is neither.
+        UserError: there is neither.
     """
-    from esp_cli.deploy.bundled import open_policy
-    from esp_cli.training.initial import OwnCopy, is_start_of
+    from esp_cli.policies.bundled import open_policy
+    from esp_cli.policies.initial import OwnCopy, is_start_of
 
     if path.is_dir() and (own := OwnCopy.find(path, config)) is not None:
         return own
@@ -97,10 +98,10 @@ def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
     try:
         trained = open_policy(Path(source))
     except ValueError:
-        raise ValueError(f"{started}, which cannot be read here; add --init-from POLICY") from None
+        raise UserError(f"{started}, which cannot be read here; add --init-from POLICY") from None
     if not is_start_of(trained, config):
         folder = "" if path.is_dir() else ", or name the folder of the run, which holds a copy"
-        raise ValueError(f"{started}, which holds other weights now; add --init-from POLICY{folder}")
+        raise UserError(f"{started}, which holds other weights now; add --init-from POLICY{folder}")
     return source
 
 
@@ -114,10 +115,10 @@ def _read(path: Path, name: str, value: Any) -> Any:
         if name == "seeds" and isinstance(value, list):
             return parse_seed_list(value)
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise UserError(f"{path}: {error}") from None
     known = get_args(Device) if name == "device" else (value,)
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{path} sets '{name}' to {value!r}; write it as esp train {_flag(name)} takes it")
+        raise UserError(f"{path} sets '{name}' to {value!r}; write it as esp train {_flag(name)} takes it")
     return value
 
 

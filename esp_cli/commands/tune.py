@@ -15,6 +15,7 @@ from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
+from esp_envs.errors import UserError
 from esp_envs.extras import install
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def _tuning(
     """Return what is asked for.
 
     Raises:
-        ValueError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
+        UserError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
     """
     from esp_cli.algorithms.registry import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
@@ -105,14 +106,14 @@ def _tuning(
 
     for flag, names in (("--task", request.tasks), ("--algo", request.algorithms), ("--steps", request.steps)):
         if names is not None and len(names) != 1:
-            raise ValueError(f"esp tune takes one {flag}, not {len(names)}; run it once for each")
+            raise UserError(f"esp tune takes one {flag}, not {len(names)}; run it once for each")
     for name in priors:
         if name not in NAMES or priors.count(name) > 1:
-            raise ValueError(f"--prior names each kind once; they are {', '.join(NAMES)}")
+            raise UserError(f"--prior names each kind once; they are {', '.join(NAMES)}")
     task, algorithm = (request.tasks or ("navigation",))[0], (request.algorithms or ("mappo",))[0]
     meant, steps = (request.steps or ((None, 500_000),))[0]
     if meant not in (None, task):
-        raise ValueError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
+        raise UserError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
     ALGORITHMS[algorithm]  # a name that nobody has is refused as such, and not for the space that it lacks
     tried_settings = read_space(space) if space else default_space(algorithm)
     tuning = Tuning(
@@ -145,12 +146,12 @@ def _tune(
     """Search, then judge the best settings; report both.
 
     Raises:
-        ValueError: the folder holds something else or is in use, Optuna is not installed, or runs failed.
+        UserError: the folder holds something else or is in use, Optuna is not installed, or runs failed.
     """
     try:
         from esp_cli.studies.tuner import Trials, Tuner, write_presets
     except ImportError:
-        raise ValueError(f"Optuna is not installed: {install('tune')}") from None
+        raise UserError(f"Optuna is not installed: {install('tune')}") from None
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TuningFolder, fresh_study
     from esp_cli.training.folder_names import FRESH
@@ -176,7 +177,7 @@ def _tune(
         raise typer.Exit(130)
     refuse_failed(failed, out)
     if not best:
-        raise ValueError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
+        raise UserError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 
 
 def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path], quiet: bool) -> None:

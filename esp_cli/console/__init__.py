@@ -26,12 +26,12 @@ from esp_cli.console.streams import paged as paged
 from esp_cli.console.streams import say as say
 from esp_cli.console.streams import text as text
 from esp_cli.console.tables import lay_out
+from esp_cli.files.formatting import format_count as format_count  # also console's
+from esp_cli.files.formatting import format_duration as format_duration  # also console's
+from esp_cli.files.formatting import format_interval as format_interval  # also console's
+from esp_cli.files.formatting import format_mean as format_mean  # also console's
+from esp_cli.files.formatting import format_span as format_span  # also console's
 from esp_cli.files.writing import write_file
-from esp_cli.formatting import format_count as format_count  # also console's
-from esp_cli.formatting import format_duration as format_duration  # also console's
-from esp_cli.formatting import format_interval as format_interval  # also console's
-from esp_cli.formatting import format_mean as format_mean  # also console's
-from esp_cli.formatting import format_span as format_span  # also console's
 
 PIPE_WIDTH = 200
 """Columns of a table written to a file or a pipe, which has no width of its own."""

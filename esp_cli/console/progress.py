@@ -11,7 +11,7 @@ from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
 from esp_cli.console.streams import err, note
-from esp_cli.formatting import format_count, format_duration, format_rate
+from esp_cli.files.formatting import format_count, format_duration, format_rate
 
 LINE_INTERVAL_S = 10.0
 """Seconds between two plain progress lines where standard error is no terminal."""

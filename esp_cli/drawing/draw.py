@@ -15,10 +15,11 @@ from esp_cli.defaults import SLOWEST
 from esp_cli.drawing import films, rendering
 from esp_cli.drawing.figures import summary
 from esp_cli.drawing.recording import Episode, framed, record, record_both
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
-from esp_cli.training.loading import TrainedPolicy
 from esp_envs.base import Environment
 from esp_envs.drawing import TopPainter
+from esp_envs.errors import UserError
 from esp_envs.scene import Painter
 
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
@@ -45,16 +46,16 @@ def check_target(out: Path, episodes: int | None, fps: float | None = None) -> s
     """Return the ending of a file that can be drawn into.
 
     Raises:
-        ValueError: another ending, or what a picture does not have: more episodes, or frames per second.
+        UserError: another ending, or what a picture does not have: more episodes, or frames per second.
         OSError: the file is a folder.
     """
     kind = out.suffix.lower()
     if kind not in (*FILMS, PICTURE):
-        raise ValueError(f"cannot write {out}: name a .gif, .mp4 or .png file")
+        raise UserError(f"cannot write {out}: name a .gif, .mp4 or .png file")
     if kind == PICTURE and episodes is not None and episodes > 1:
-        raise ValueError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
+        raise UserError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
     if kind == PICTURE and fps is not None:
-        raise ValueError(f"{out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
+        raise UserError(f"{out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
     if out.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
     return kind
@@ -92,14 +93,14 @@ def draw(
         watch: told how many frames of how many are drawn.
 
     Raises:
-        ValueError: another ending, no such seed, a view that cannot be drawn, no episodes, no speed, or policies that
+        UserError: another ending, no such seed, a view that cannot be drawn, no episodes, no speed, or policies that
             cannot be compared.
     """
     kind = check_target(out, episodes)
     if episodes is not None and episodes < 1:
-        raise ValueError(f"episodes is {episodes}; a film has at least one")
+        raise UserError(f"episodes is {episodes}; a film has at least one")
     if not SLOWEST <= speed < math.inf:  # false for what is no number
-        raise ValueError(f"speed is {speed}; give times real time, {SLOWEST:g} or more")
+        raise UserError(f"speed is {speed}; give times real time, {SLOWEST:g} or more")
     count = 1 if kind == PICTURE else episodes
     env = build_environment(trained.config, 1, "film")
     recorded = _recorded(trained, other, env, seed, count, greedy)
@@ -140,7 +141,7 @@ def _recorded(
     if other is None:
         return [record(trained, env, own, count, greedy)]
     if other.config.task != trained.config.task:
-        raise ValueError(
+        raise UserError(
             f"{trained.source} is a policy of {trained.config.task}, {other.source} of {other.config.task}; "
             "compare two policies of one task"
         )

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from esp_cli.policies.loading import TrainedPolicy, single_seed
 from esp_cli.training.build import build_environment
-from esp_cli.training.loading import TrainedPolicy, single_seed
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
 from esp_envs.base import Environment, put_back
+from esp_envs.errors import UserError
 from esp_envs.scene import Scene
 
 FILM_SECONDS = 8.0
@@ -53,11 +54,11 @@ def record(
         greedy: act greedily, or draw actions.
 
     Raises:
-        ValueError: the run has no such seed.
+        UserError: the run has no such seed.
     """
     seeds = trained.config.seeds
     if seed not in seeds:
-        raise ValueError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
+        raise UserError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
     noise = None if greedy else generators(seeds, "film", "noise")
     controller = PolicyController(trained.policy, noise)
     recorded: list[Episode] = []
@@ -105,7 +106,7 @@ def record_both(
         greedy: act greedily, or draw actions.
 
     Raises:
-        ValueError: the tasks differ, or episodes do not begin alike.
+        UserError: the tasks differ, or episodes do not begin alike.
     """
     recorded: list[list[Episode]] = []
     for trained, seed in zip((first, second), seeds, strict=True):
@@ -117,7 +118,7 @@ def record_both(
     for one, other in zip(*recorded, strict=True):
         places = [[body.position for body in episode.scenes[0].bodies] for episode in (one, other)]
         if places[0] != places[1]:
-            raise ValueError(
+            raise UserError(
                 f"the episodes of {first.source} and {second.source} begin differently; "
                 "compare policies whose task has the same settings"
             )

@@ -14,6 +14,7 @@ from esp_cli.drawing.frames import Moment, frame
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode
 from esp_envs.base import Environment
 from esp_envs.drawing import TopPainter
+from esp_envs.errors import UserError
 from esp_envs.scene import Painter
 
 View = Literal["auto", "top", "3d"]
@@ -35,13 +36,13 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
         size: of the longer side, pixels.
 
     Raises:
-        ValueError: "3d", and the task has no view in space or the machine cannot draw it.
+        UserError: "3d", and the task has no view in space or the machine cannot draw it.
     """
     if view not in get_args(View):
-        raise ValueError(f"there is no view '{view}'; choose {', '.join(get_args(View))}")
+        raise UserError(f"there is no view '{view}'; choose {', '.join(get_args(View))}")
     own = None if view == "top" else env.painter(size)
     if own is None and view == "3d":
-        raise ValueError(f"{env.spec.name} is a flat task without a view in space; leave out --view 3d")
+        raise UserError(f"{env.spec.name} is a flat task without a view in space; leave out --view 3d")
     with ExitStack() as stack:
         painter: Painter = TopPainter(size)
         if own is not None:

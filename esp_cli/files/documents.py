@@ -16,6 +16,7 @@ from esp_cli.files.failures import attempting, own_words
 from esp_cli.files.opening import read_regular
 from esp_cli.files.suggesting import nearest
 from esp_cli.files.writing import replace_file
+from esp_envs.errors import UserError
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -31,7 +32,7 @@ class Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class DocumentError(ValueError):
+class DocumentError(UserError):
     """A JSON document cannot be read or written; the text is one sentence for the user."""
 
 
@@ -49,7 +50,7 @@ class DocumentFormat:
     name: str
     version: int
     noun: str
-    error: type[ValueError] = DocumentError
+    error: type[UserError] = DocumentError
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
         """Read a document.
@@ -58,7 +59,7 @@ class DocumentFormat:
             Its content, without ``format`` and ``version``.
 
         Raises:
-            ValueError: of the kind `error`; it is missing, too large, damaged, foreign or of a newer version.
+            UserError: of the kind `error`; it is missing, too large, damaged, foreign or of a newer version.
             OSError: the machine failed.
         """
         with attempting("read", path, self.error):
@@ -84,7 +85,7 @@ class DocumentFormat:
         """Read a document and validate its content.
 
         Raises:
-            ValueError: as `read`, or the content is not what the model asks for.
+            UserError: as `read`, or the content is not what the model asks for.
             OSError: the machine failed.
         """
         content = self.read(path)
@@ -97,7 +98,7 @@ class DocumentFormat:
         """Write a document as a whole or not at all.
 
         Raises:
-            ValueError: of the kind `error`; the content is not JSON (NaN and infinity are not), or its keys are taken.
+            UserError: of the kind `error`; the content is not JSON (NaN and infinity are not), or its keys are taken.
             OSError: the file cannot be written; what was there is as it was.
         """
         if "format" in content or "version" in content:
@@ -126,11 +127,11 @@ def validate(model: type[Model], content: object) -> Model:
     return model.model_validate_json(json.dumps(content), strict=True)
 
 
-def encode(value: object, path: str | os.PathLike[str], error: type[ValueError] = DocumentError) -> bytes:
+def encode(value: object, path: str | os.PathLike[str], error: type[UserError] = DocumentError) -> bytes:
     """Return a value as indented JSON.
 
     Raises:
-        ValueError: of the kind `error`; it is not JSON (NaN and infinity are not).
+        UserError: of the kind `error`; it is not JSON (NaN and infinity are not).
     """
     try:
         return (json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode()
@@ -161,20 +162,20 @@ def parse_value(text: str) -> Any:
     """Parse strict JSON: no NaN, no infinity, no key twice, integers of 64 bits, nesting of at most `MAX_NESTING`.
 
     Raises:
-        ValueError: it is not.
+        UserError: it is not.
     """
     try:
         value = json.loads(
             text, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite, parse_int=_bounded
         )
     except RecursionError:
-        raise ValueError(f"brackets are nested more than {MAX_NESTING} deep") from None
+        raise UserError(f"brackets are nested more than {MAX_NESTING} deep") from None
     level = [value]
     for _ in range(MAX_NESTING):
         level = [item for outer in level for item in _inside(outer)]
         if not level:
             return value
-    raise ValueError(f"brackets are nested more than {MAX_NESTING} deep")
+    raise UserError(f"brackets are nested more than {MAX_NESTING} deep")
 
 
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
@@ -217,7 +218,7 @@ def _inside(value: object) -> list[Any]:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) != len(pairs):
-        raise ValueError("a key stands twice")
+        raise UserError("a key stands twice")
     return result
 
 
@@ -225,12 +226,12 @@ def _finite(number: str) -> float:
     # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
     value = float(number)
     if not math.isfinite(value):
-        raise ValueError(f"{shortened(number)} is no finite number")
+        raise UserError(f"{shortened(number)} is no finite number")
     return value
 
 
 def _bounded(number: str) -> int:
     value = int(number) if len(number) <= 20 else _MAX_INTEGER
     if abs(value) >= _MAX_INTEGER:
-        raise ValueError("an integer has more than 64 bits")
+        raise UserError("an integer has more than 64 bits")
     return value

@@ -7,6 +7,8 @@ import errno
 import os
 from collections.abc import Iterator
 
+from esp_envs.errors import UserError
+
 _CORRECTABLE = {
     errno.ENOENT,
     errno.EEXIST,
@@ -48,7 +50,7 @@ def own_words(message: str) -> str:
 
 
 @contextlib.contextmanager
-def attempting(verb: str, path: str | os.PathLike[str], kind: type[ValueError]) -> Iterator[None]:
+def attempting(verb: str, path: str | os.PathLike[str], kind: type[UserError]) -> Iterator[None]:
     """Turn a failure of the file system into one sentence.
 
     Args:

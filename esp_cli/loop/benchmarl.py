@@ -15,6 +15,7 @@ from benchmarl.experiment import Callback
 from esp_cli.loop.symmetry import Symmetry
 from esp_cli.loop.tensordicts import Role
 from esp_cli.loop.torchrl import SymmetricLoss
+from esp_envs.errors import UserError
 
 
 class SymmetryCallback(Callback):
@@ -41,11 +42,11 @@ class SymmetryCallback(Callback):
         """Wrap the losses of the experiment.
 
         Raises:
-            ValueError: there is no such group, or its algorithm has another kind of loss.
+            UserError: there is no such group, or its algorithm has another kind of loss.
         """
         losses = self.experiment.losses
         chosen = self.symmetry if isinstance(self.symmetry, Mapping) else dict.fromkeys(losses, self.symmetry)
         for group, symmetry in chosen.items():
             if group not in losses:
-                raise ValueError(f"there is no group '{group}'; the groups are {', '.join(losses)}")
+                raise UserError(f"there is no group '{group}'; the groups are {', '.join(losses)}")
             losses[group] = SymmetricLoss(losses[group], symmetry, self.coefficient, self.augment, self.roles)

@@ -11,6 +11,7 @@ from torch import distributions as td
 from esp_cli.loop.shapes import check_alike
 from esp_cli.prior.losses import policy_consistency_loss
 from esp_cli.symmetry import Transform
+from esp_envs.errors import UserError
 
 Policy = Any
 """What a policy returns: a distribution, or a tensor (logits of discrete actions, continuous actions)."""
@@ -43,7 +44,7 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
         [..., N], or [...] without an agent axis.
 
     Raises:
-        ValueError: another kind of distribution, another number of actions, or different shapes.
+        UserError: another kind of distribution, another number of actions, or different shapes.
     """
     there, here = _bare(there), _bare(here)
     if transform.action_index is not None:
@@ -60,12 +61,12 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
             return _normals_apart(transform, inner, own)
         return _samples_apart(transform, there, here, samples)
     if isinstance(there, Tensor) != isinstance(here, Tensor):
-        raise ValueError(
+        raise UserError(
             f"the policy says {type(there).__name__} of the moved data, but of the originals (here) there is "
             f"{type(here).__name__}; give both in one form"
         )
     action = "discrete" if transform.action_index is not None else "continuous"
-    raise ValueError(f"the policy's {type(there).__name__} is not known for {action} actions; give {_KNOWN}")
+    raise UserError(f"the policy's {type(there).__name__} is not known for {action} actions; give {_KNOWN}")
 
 
 def split_policy(policy: Policy, size: int) -> list[Policy]:
@@ -83,13 +84,13 @@ def split_policy(policy: Policy, size: int) -> list[Policy]:
     if _is_squashed(policy):
         inner = split_policy(policy.base_dist, size)
         return [td.TransformedDistribution(part, policy.transforms, validate_args=False) for part in inner]
-    raise ValueError(f"the policy's {type(policy).__name__} is not known; give {_KNOWN}")
+    raise UserError(f"the policy's {type(policy).__name__} is not known; give {_KNOWN}")
 
 
 def _bare(policy: Policy) -> Policy:
     """Return a distribution without `Independent` around it."""
     if isinstance(policy, tuple | list):
-        raise ValueError(
+        raise UserError(
             f"the policy returned {len(policy)} things, but a stored hidden state cannot be transformed; give whole "
             "histories from their first step, and return the distribution alone"
         )
@@ -107,7 +108,7 @@ def _pulled(transform: Transform, outputs: Tensor) -> Tensor:
     width = transform.num_outputs
     if outputs.shape[-1:] != (width,):
         what = "actions" if transform.action_index is not None else "numbers in an action"
-        raise ValueError(f"the policy's outputs have shape {list(outputs.shape)}, but there are {width} {what}")
+        raise UserError(f"the policy's outputs have shape {list(outputs.shape)}, but there are {width} {what}")
     return transform.pull_back(outputs)
 
 

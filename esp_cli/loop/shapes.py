@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry import Transform
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Layout, Spaces
 
 HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
@@ -18,7 +19,7 @@ def lead_of(spaces: Spaces, obs: Tensor) -> torch.Size:
     """Return the leading axes of observations.
 
     Raises:
-        ValueError: their shape or type does not fit.
+        UserError: their shape or type does not fit.
     """
     return _check_rows("obs", obs, spaces.observation, agents=_agents(spaces))
 
@@ -27,7 +28,7 @@ def check_state(spaces: Spaces, state: Tensor, lead: torch.Size | None = None) -
     """Return the leading axes of states.
 
     Raises:
-        ValueError: their shape or type does not fit, or the leading axes are not those of the observations.
+        UserError: their shape or type does not fit, or the leading axes are not those of the observations.
     """
     return _check_rows("state", state, spaces.state, lead)
 
@@ -36,26 +37,26 @@ def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) 
     """Return K_g a; shapes as of `augment`.
 
     Raises:
-        ValueError: another shape or type, or an action outside.
+        UserError: another shape or type, or an action outside.
     """
     _check_tensor("action", action)
     space, axes, shape = spaces.action, (*lead, *_agents(spaces)), list(action.shape)
     if not isinstance(space, Discrete):
         if action.shape != (*axes, space.width):
-            raise ValueError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
+            raise UserError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
         if not action.is_floating_point():
-            raise ValueError(f"the action is {action.dtype}; give floating-point numbers")
+            raise UserError(f"the action is {action.dtype}; give floating-point numbers")
         return transform.action(action)
     if action.shape == (*axes, space.count) and space.count > 1:
         return transform.push_outputs(action)
     if action.shape not in (axes, (*axes, 1)):
-        raise ValueError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
+        raise UserError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
     if action.is_floating_point() or action.dtype == torch.bool:
-        raise ValueError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
+        raise UserError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
     low, high = torch.aminmax(action) if action.numel() else (0, 0)
     if low < 0 or high >= space.count:
         outside = int(low if low < 0 else high)
-        raise ValueError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
+        raise UserError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
     return transform.action(action.reshape(axes).long()).reshape(action.shape).to(action.dtype)
 
 
@@ -63,7 +64,7 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
     """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`.
 
     Raises:
-        ValueError: another shape.
+        UserError: another shape.
     """
     _check_tensor(name, x)
     agents, tail = (*lead, *_agents(spaces)), x.shape[len(lead) :]
@@ -72,14 +73,14 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
     if x.shape in (agents, (*agents, 1)):
         return move(x.reshape(agents)).reshape(x.shape)
     reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
-    raise ValueError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
+    raise UserError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
 
 
 def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Size, name: str) -> Tensor:
     """Move what goes with its agent: a number as by `carry`, or an action mask.
 
     Raises:
-        ValueError: another shape.
+        UserError: another shape.
     """
     _check_tensor(name, x)
     space = spaces.action
@@ -92,24 +93,24 @@ def check_mask(spaces: Spaces, mask: Tensor, lead: torch.Size) -> None:
     """Refuse what is no mask of discrete actions [..., N, A].
 
     Raises:
-        ValueError: another shape or type, or continuous actions.
+        UserError: another shape or type, or continuous actions.
     """
     if not isinstance(spaces.action, Discrete):
-        raise ValueError("an action mask is for discrete actions; leave it out")
+        raise UserError("an action mask is for discrete actions; leave it out")
     shape = [*lead, *_agents(spaces), spaces.action.count]
     if list(mask.shape) != shape or mask.dtype != torch.bool:
-        raise ValueError(f"the action mask is {mask.dtype} {list(mask.shape)}, but torch.bool {shape} is needed")
+        raise UserError(f"the action mask is {mask.dtype} {list(mask.shape)}, but torch.bool {shape} is needed")
 
 
 def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
     """Refuse to compare what was said of moved and of original data in different shapes, such as [B, 1] and [B].
 
     Raises:
-        ValueError: the shapes differ.
+        UserError: the shapes differ.
     """
     for x in moved:
         if x.shape != here.shape:
-            raise ValueError(
+            raise UserError(
                 f"{name} has shape {list(x.shape)} for the moved data, but {list(here.shape)} for the originals "
                 "(here); give both in one shape"
             )
@@ -124,19 +125,19 @@ def _check_rows(
     found = x.shape[: max(cut, 0)]
     if x.shape[-1:] != (layout.width,):
         width = x.shape[-1] if x.dim() else 0
-        raise ValueError(f"{name} has rows of {width} numbers, but its layout has {layout.width}: {layout.summary}")
+        raise UserError(f"{name} has rows of {width} numbers, but its layout has {layout.width}: {layout.summary}")
     if cut < 0 or x.shape[cut:-1] != agents:
-        raise ValueError(f"{name} has shape {list(x.shape)}, but axis -2 must hold {agents[0]} agents")
+        raise UserError(f"{name} has shape {list(x.shape)}, but axis -2 must hold {agents[0]} agents")
     if lead is not None and found != lead:
-        raise ValueError(f"{name} has leading axes {list(found)}, but those of obs are {list(lead)}")
+        raise UserError(f"{name} has leading axes {list(found)}, but those of obs are {list(lead)}")
     if not x.is_floating_point():
-        raise ValueError(f"{name} is {x.dtype}; give floating-point numbers")
+        raise UserError(f"{name} is {x.dtype}; give floating-point numbers")
     return found
 
 
 def _check_tensor(name: str, x: object) -> None:
     if not isinstance(x, Tensor):
-        raise ValueError(f"{name} is of type {type(x).__name__}; give a tensor")
+        raise UserError(f"{name} is of type {type(x).__name__}; give a tensor")
 
 
 def _agents(spaces: Spaces) -> tuple[int, ...]:

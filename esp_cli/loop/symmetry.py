@@ -15,6 +15,7 @@ from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet, transform_set
 from esp_cli.symmetry.admission import unrestricted
+from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces, joint_layout
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class Symmetry:
         generator: draws the elements; its state belongs into a checkpoint.
 
     Raises:
-        ValueError: the actions or layouts cannot carry the group, all elements of an infinite group are asked for, or
+        UserError: the actions or layouts cannot carry the group, all elements of an infinite group are asked for, or
             an argument is none of those above.
     """
 
@@ -81,11 +82,11 @@ class Symmetry:
         given = (observation, action, group, num_agents, state, seed)
         for value, (name, (kind, example)) in zip(given, _ARGUMENTS.items(), strict=True):
             if not isinstance(value, kind):
-                raise ValueError(f"{name} is {value!r}; give {example}")
+                raise UserError(f"{name} is {value!r}; give {example}")
         if copies not in ("draw", "all"):
-            raise ValueError(f"copies is {copies!r}; choose 'draw' or 'all'")
+            raise UserError(f"copies is {copies!r}; choose 'draw' or 'all'")
         if num_agents < 1:
-            raise ValueError(f"num_agents is {num_agents}; there is at least one agent")
+            raise UserError(f"num_agents is {num_agents}; there is at least one agent")
         joint = joint_layout(observation, num_agents)
         self.spaces = unrestricted(
             Spaces(num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="c1")
@@ -94,9 +95,7 @@ class Symmetry:
         self.generator = torch.Generator().manual_seed(seed)
         self._sets: dict[tuple[torch.device, torch.dtype], TransformSet] = {}
         if not self._set(torch.device("cpu"), torch.float32).is_finite and copies == "all":
-            raise ValueError(
-                f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'"
-            )
+            raise UserError(f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'")
 
     def transforms(self, like: Tensor) -> list[Transform]:
         """Return the elements of one call, on the device of `like`: one that is drawn, or all."""
@@ -137,13 +136,13 @@ class Symmetry:
             obs, action, (state where it is given,) and the tuple of numbers, with 1 + copies times the rows.
 
         Raises:
-            ValueError: a shape that does not fit the layouts, or an action outside.
+            UserError: a shape that does not fit the layouts, or an action outside.
         """
         lead = lead_of(self.spaces, obs)
         if isinstance(per_agent, Tensor):
-            raise ValueError("per_agent is one tensor; give a tuple of them, as per_agent=(log_prob, advantage)")
+            raise UserError("per_agent is one tensor; give a tuple of them, as per_agent=(log_prob, advantage)")
         if not 0 <= dim < len(lead):
-            raise ValueError(
+            raise UserError(
                 f"obs of shape {list(obs.shape)} has {len(lead)} leading axes; copies cannot go along {dim}"
             )
         transforms = self.transforms(obs)
@@ -173,7 +172,7 @@ class Symmetry:
             roles: of keys by their last part, where `esp_cli.loop.tensordicts.ROLES` says it otherwise.
 
         Raises:
-            ValueError: the numbers under a key do not fit, or have no role.
+            UserError: the numbers under a key do not fit, or have no role.
         """
         return torch.cat(with_copies(self.spaces, data, self.transforms, roles)[0], 0)
 
@@ -199,7 +198,7 @@ class Symmetry:
             A scalar, 0 if and only if the policy turns with the scene.
 
         Raises:
-            ValueError: a shape that does not fit, or a distribution that is not known.
+            UserError: a shape that does not fit, or a distribution that is not known.
         """
         lead = lead_of(self.spaces, obs)
         if action_mask is not None:
@@ -234,7 +233,7 @@ class Symmetry:
             mask: [...] which rows count; the loss is 0 where none does.
 
         Raises:
-            ValueError: a shape that does not fit.
+            UserError: a shape that does not fit.
         """
         if state is not None and obs is None:
             lead = check_state(self.spaces, state)
@@ -245,7 +244,7 @@ class Symmetry:
             here = value(obs) if here is None else here
             moved = [(g, value(g.obs(obs))) for g in self.transforms(obs)]
         else:
-            raise ValueError("value_loss takes either state or obs; give the one that the critic sees")
+            raise UserError("value_loss takes either state or obs; give the one that the critic sees")
         carried = [carry(self.spaces, g.values, x, lead, "value") for g, x in moved]
         check_alike("value", carried, here)
         return _mean([value_consistency_loss(x, here) for x in carried], mask)
@@ -262,10 +261,10 @@ class Symmetry:
             mask: [...] which rows count; the loss is 0 where none does.
 
         Raises:
-            ValueError: a shape that does not fit, or continuous actions.
+            UserError: a shape that does not fit, or continuous actions.
         """
         if not isinstance(self.spaces.action, Discrete):
-            raise ValueError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
+            raise UserError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
         lead_of(self.spaces, obs)
         here = value(obs) if here is None else here
         pulled = [g.pull_back(value(g.obs(obs))) for g in self.transforms(obs)]
@@ -283,7 +282,7 @@ class Symmetry:
             transforms: which elements; by default those of the group.
 
         Raises:
-            ValueError: the transforms mean nothing, nothing of them can be carried, or the transitions are fewer than
+            UserError: the transforms mean nothing, nothing of them can be carried, or the transitions are fewer than
                 64 episodes, hold numbers that are not finite, or actions outside.
         """
         from esp_cli.checking import Transitions, candidates, check_transitions, collect  # noqa: PLC0415 - it trains too
@@ -313,10 +312,8 @@ def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
 def _flags(mask: Tensor, shape: torch.Size) -> Tensor:
     """Return which rows count, of a mask of flags, or of zeros and ones, that goes with the first axes of `shape`."""
     if mask.shape != shape[: mask.dim()]:
-        raise ValueError(
-            f"mask has shape {list(mask.shape)}, but the rows have {list(shape)}; give a flag for each row"
-        )
+        raise UserError(f"mask has shape {list(mask.shape)}, but the rows have {list(shape)}; give a flag for each row")
     flags = mask.bool()
     if mask.dtype != torch.bool and not torch.equal(flags.to(mask.dtype), mask):
-        raise ValueError("mask holds other numbers than 0 and 1; it says which rows count, and weighs none")
+        raise UserError("mask holds other numbers than 0 and 1; it says which rows count, and weighs none")
     return flags

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from esp_cli.loop.shapes import act, carry, check_state, lead_of
 from esp_cli.symmetry import Transform
+from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
 Role = Literal["observation", "state", "action", "same", "drop"]
@@ -50,7 +51,7 @@ def with_copies(
         roles: of keys by their last part, where they differ from `ROLES`.
 
     Raises:
-        ValueError: the numbers under a key do not fit, or have no role.
+        UserError: the numbers under a key do not fit, or have no role.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
     leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
@@ -59,7 +60,7 @@ def with_copies(
     seen = [value for path, value in kept.items() if named.get(path[-1]) in ("observation", "state")]
     if not seen:
         names = ", ".join(".".join(path) for path in leaves)
-        raise ValueError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
+        raise UserError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
     transforms, copies = choose(seen[0]), []
     for transform in transforms:
         copy = data.clone(False)
@@ -85,7 +86,7 @@ def _moved(spaces: Spaces, transform: Transform, x: Tensor, role: Role | None, l
         return x if role == "same" else carry(spaces, transform.per_agent, x, lead, "it")
     except ValueError as error:
         advice = "" if role else "; name its role, 'same' or 'drop' for example"
-        raise ValueError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None
+        raise UserError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None
 
 
 def _path(key: Key) -> tuple[str, ...]:

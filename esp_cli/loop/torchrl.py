@@ -20,6 +20,7 @@ from esp_cli.loop.shapes import carry
 from esp_cli.loop.symmetry import Symmetry
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
+from esp_envs.errors import UserError
 
 
 class SymmetricCopies(TorchRLTransform):
@@ -69,7 +70,7 @@ class SymmetricLoss(nn.Module):
         roles: of keys by their last part, where they differ from `esp_cli.loop.tensordicts.ROLES`.
 
     Raises:
-        ValueError: the loss is of another kind.
+        UserError: the loss is of another kind.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class SymmetricLoss(nn.Module):
         super().__init__()
         self.mixes = hasattr(loss, "mixer_network")
         if not self.mixes and not (hasattr(loss, "actor_network") and hasattr(loss, "critic_network")):
-            raise ValueError(f"{type(loss).__name__} is not known; give a loss of PPO's family, or QMixerLoss")
+            raise UserError(f"{type(loss).__name__} is not known; give a loss of PPO's family, or QMixerLoss")
         self.loss, self.symmetry, self.coefficient = loss, symmetry, coefficient
         self.augment, self.roles = augment, roles
 
@@ -94,7 +95,7 @@ class SymmetricLoss(nn.Module):
             tensordict: [B, ...] as the loss takes it.
 
         Raises:
-            ValueError: the numbers under a key do not fit.
+            UserError: the numbers under a key do not fit.
         """
         if not self.augment and not self.coefficient:
             return self.loss(tensordict)
@@ -164,5 +165,5 @@ class SymmetricLoss(nn.Module):
             if actor is not None:
                 del actor.get_dist
         if value is None:
-            raise ValueError(f"{type(self.loss).__name__} did not ask its critic; give it one")
+            raise UserError(f"{type(self.loss).__name__} did not ask its critic; give it one")
         return _Answers(losses, policy, value)

@@ -17,6 +17,7 @@ from esp_cli.networks.contract import ActivationName, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import Symmetrised
+from esp_envs.errors import UserError
 from esp_envs.installed import Registry
 
 __all__ = ["NETWORKS", "AnyNetworkConfig", "Network", "NetworkConfig", "build_network", "network_class", "perceptron"]
@@ -44,7 +45,7 @@ def network_class(name: object) -> type[NetworkConfig]:
     """Return the settings class of a network.
 
     Raises:
-        ValueError: there is no such network.
+        UserError: there is no such network.
     """
     return NETWORKS[str(name)]
 
@@ -87,13 +88,13 @@ def build_network(
         io: what the rows mean; networks with symmetry, and the average over a group, need it.
 
     Raises:
-        ValueError: the network does not fit what is read and written there.
+        UserError: the network does not fit what is read and written there.
     """
     network = config.build(generators, inputs, outputs, output_gain, io)
     if config.symmetrise is None:
         return network
     if io is None:
-        raise ValueError(
+        raise UserError(
             f"network.symmetrise averages over images of the observation alone, but this {config.name} reads more; "
             "leave it off, or choose a network without memory"
         )

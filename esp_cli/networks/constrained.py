@@ -17,6 +17,7 @@ from esp_cli.networks.layers import GAINS, orthogonal
 from esp_cli.networks.perceptron import Pass, Shape, affine, perceptron
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
+from esp_envs.errors import UserError
 
 Relaxation = Literal["residual", "weights"]
 
@@ -173,7 +174,7 @@ class Equivariant(Memoryless):
     ) -> None:
         super().__init__()
         if any(field.pixels is not None for field in io.layout.fields):
-            raise ValueError(
+            raise UserError(
                 f"the network 'equivariant' reads numbers, but {io.spaces.label} shows pictures; use empn or mlp"
             )
         self.group = io.group(config.group)

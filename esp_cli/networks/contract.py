@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from esp_cli.files.documents import Strict
 from esp_cli.networks.io_spec import IoSpec
+from esp_envs.errors import UserError
 
 ActivationName = Literal["relu", "tanh"]
 
@@ -47,17 +48,17 @@ class NetworkConfig(Strict, ABC):
         """Build the network, without the average that `symmetrise` asks for; arguments as of `build_network`.
 
         Raises:
-            ValueError: the network does not fit `io`, or needs it and there is none.
+            UserError: the network does not fit `io`, or needs it and there is none.
         """
 
     def io_or_refuse(self, io: IoSpec | None) -> IoSpec:
         """Return `io` where it is given.
 
         Raises:
-            ValueError: it is None, though the network needs it.
+            UserError: it is None, though the network needs it.
         """
         if io is None:
-            raise ValueError(f"the network {self.name} needs the meaning of its inputs, which this place does not give")
+            raise UserError(f"the network {self.name} needs the meaning of its inputs, which this place does not give")
         return io
 
     def with_activation(self, activation: ActivationName) -> NetworkConfig:

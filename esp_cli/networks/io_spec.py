@@ -7,6 +7,7 @@ from typing import Literal
 
 from esp_cli.symmetry import FiniteGroup, admit, parse_group
 from esp_cli.symmetry.intertwiners import Block, action_blocks, layout_blocks, trivial
+from esp_envs.errors import UserError
 from esp_envs.spec import Layout, Spaces, joint_layout
 
 Reads = Literal["state", "observations", "own"]
@@ -39,11 +40,11 @@ class IoSpec:
         """Return a group of turns and mirrors by its name.
 
         Raises:
-            ValueError: there is no such group, it is infinite or moves agents or items, or the task cannot carry it.
+            UserError: there is no such group, it is infinite or moves agents or items, or the task cannot carry it.
         """
         group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.orders for element in group.elements):
-            raise ValueError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
+            raise UserError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
         admit(name, group, self.spaces, instead="use another network")
         return group
 

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.kernels.library import library
-from esp_cli.kernels.perceptron import CompiledPass
+from esp_cli.networks.kernels.library import library
+from esp_cli.networks.kernels.perceptron import CompiledPass
 from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, passed, perceptron
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
@@ -77,7 +77,7 @@ class SeedMLP(nn.Module):
         compiled: whether passes on the CPU go through the compiled kernel; has no effect with layer normalisation.
 
     Raises:
-        ValueError: there is no compiler for it.
+        UserError: there is no compiler for it.
     """
 
     def __init__(

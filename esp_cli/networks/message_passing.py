@@ -24,6 +24,7 @@ from esp_cli.networks.layers import GAINS
 from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
+from esp_envs.errors import UserError
 from esp_envs.spec import Field, Items, Kind, Layout, others_of
 
 CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
@@ -185,7 +186,7 @@ class MessagePassing(Memoryless):
     The mean divides by the number of near drones plus one, for the drone itself.
 
     Raises:
-        ValueError: the task does not show pictures and relative positions, or a critic reads all of them in a row.
+        UserError: the task does not show pictures and relative positions, or a critic reads all of them in a row.
     """
 
     def __init__(
@@ -193,7 +194,7 @@ class MessagePassing(Memoryless):
     ) -> None:
         super().__init__()
         if io.reads != "own":
-            raise ValueError(
+            raise UserError(
                 f"{config.name} passes messages between drones, each with what it sees: set mappo.critic_input=own"
             )
         picture, others = _fields(io)
@@ -253,12 +254,12 @@ def _fields(io: IoSpec) -> tuple[Field, Field]:
     others = [f for f in fields if f.kind == Kind.VECTOR and f.items is Items.OTHERS]
     if (len(pictures), len(others)) == (1, 1) and len(fields) > 2:
         more = ", ".join(field.name for field in fields if field not in (*pictures, *others))
-        raise ValueError(
+        raise UserError(
             f"message passing takes a picture and the way to each other agent, but {io.spaces.label} shows {more} too; "
             "use mlp"
         )
     if (len(pictures), len(others), len(fields)) != (1, 1, 2) or others[0].count != io.spaces.num_agents - 1:
-        raise ValueError(
+        raise UserError(
             f"message passing needs a picture and the way to each other agent, but {io.spaces.label} does not show "
             "them; use mlp, gru or equivariant"
         )

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.functional import elu_
 
-from esp_cli.kernels.library import begin, computes
-from esp_cli.kernels.mixer import CompiledMixer
+from esp_cli.networks.kernels.library import begin, computes
+from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
 

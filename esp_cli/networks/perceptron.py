@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from esp_cli.kernels.library import computes
-from esp_cli.kernels.perceptron import CompiledPass
+from esp_cli.networks.kernels.library import computes
+from esp_cli.networks.kernels.perceptron import CompiledPass
 
 CACHED_ROWS = 4096
 """Rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache."""

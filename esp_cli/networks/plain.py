@@ -15,6 +15,7 @@ from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
+from esp_envs.errors import UserError
 
 
 class PlainConfig(NetworkConfig):
@@ -38,9 +39,9 @@ class PlainConfig(NetworkConfig):
     @model_validator(mode="after")
     def _fits(self) -> PlainConfig:
         if self.separate_parts and self.symmetrise:
-            raise ValueError("separate_parts and symmetrise exclude each other; leave one of them off")
+            raise UserError("separate_parts and symmetrise exclude each other; leave one of them off")
         if self.compiled and self.precision != "float32":
-            raise ValueError("compiled perceptrons compute in float32; leave compiled off, or precision as it is")
+            raise UserError("compiled perceptrons compute in float32; leave compiled off, or precision as it is")
         return self
 
     def without_effect(self) -> frozenset[str]:

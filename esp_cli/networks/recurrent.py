@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import Function
 
-from esp_cli.kernels.library import begin, computes
-from esp_cli.kernels.recurrent import CompiledUnroll
+from esp_cli.networks.kernels.library import begin, computes
+from esp_cli.networks.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
 from esp_cli.networks.perceptron import activate_
 

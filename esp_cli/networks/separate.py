@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import Network
+from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete
 
 
@@ -15,7 +16,7 @@ def action_parts(space: ActionSpace) -> Tensor:
     """Return the 0/1 matrix [values of all parts, actions] of the part values that make up each action.
 
     Raises:
-        ValueError: the actions are not all combinations of part values.
+        UserError: the actions are not all combinations of part values.
     """
     if isinstance(space, Discrete):
         columns = list(zip(*space.points, strict=True))
@@ -27,7 +28,7 @@ def action_parts(space: ActionSpace) -> Tensor:
                 for value in choices
             ]
             return torch.tensor(has, dtype=torch.float32)
-    raise ValueError(
+    raise UserError(
         "network.separate_parts is for discrete actions that are all combinations of part values, "
         "such as pairs of wheel speeds; leave it off"
     )

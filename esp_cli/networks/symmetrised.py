@@ -23,7 +23,7 @@ class Symmetrised(Network):
         group: name of the group.
 
     Raises:
-        ValueError: see `IoSpec.group`.
+        UserError: see `IoSpec.group`.
     """
 
     def __init__(self, network: Network, io: IoSpec, group: str) -> None:

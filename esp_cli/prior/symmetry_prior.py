@@ -13,6 +13,7 @@ from esp_cli.prior.gate import Gate, gated, moved_share
 from esp_cli.prior.seed_batch import Rows, SeedBatch
 from esp_cli.symmetry import Transform, carried_groups, transform_set
 from esp_cli.symmetry.admission import under_a_compass, unrestricted
+from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class SymmetryPrior:
         gate: says which rows are copied; whoever builds a learner that asks for one sets it.
 
     Raises:
-        ValueError: the task cannot carry an element, all copies of an infinite group are asked for, or some element
+        UserError: the task cannot carry an element, all copies of an infinite group are asked for, or some element
             has no weight though trust is measured.
     """
 
@@ -59,7 +60,7 @@ class SymmetryPrior:
             admitting = under_a_compass(spaces) if config.compass else unrestricted(spaces)
         self.transforms = transform_set(config.transforms, admitting, device) if active else None
         if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
-            raise ValueError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
+            raise UserError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
         self._probe = _probe(spaces, device)
         self.strength = 1.0
         self.gate: Gate | None = None
@@ -86,7 +87,7 @@ class SymmetryPrior:
             return [1.0] * len(names)
         if set(self.config.weights) != set(names) and names:
             told = ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-            raise ValueError(
+            raise UserError(
                 f"prior.trust is {self.config.trust}, but prior.weights does not weigh just these elements: {told}; "
                 "weigh each, or have them weighed by --set prior.weights={}"
             )
@@ -154,15 +155,13 @@ class SymmetryPrior:
         """Return one transform per copy of a batch, where trust is a gate of those rows alone that it lets through.
 
         Raises:
-            ValueError: there is no gate.
+            UserError: there is no gate.
         """
         drawn = self._draw(generators)
         if self.config.trust != "gate" or all(weight == 1 for weight in self._weights):
             return drawn
         if self.gate is None:
-            raise ValueError(
-                "prior.trust=gate needs predictors of its task, which esp train fits; here choose measured"
-            )
+            raise UserError("prior.trust=gate needs predictors of its task, which esp train fits; here choose measured")
         chosen = [self._gated(self.gate, g, batch, generators) for g in drawn]
         shares = [moved_share(g, len(generators)).to(batch.obs.device, non_blocking=True) for g in chosen]
         self._copied = torch.stack(shares).mean(0) if shares else None

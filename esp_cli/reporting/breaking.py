@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from esp_cli.evaluation.statistics import Floats, difference, summarise
+from esp_cli.policies.statistics import Floats, difference, summarise
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import Side, floats, returns_of, side_of
 from esp_cli.studies.kinds import UNBROKEN, kind_of

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from esp_cli.evaluation.curve_statistics import curve_band
-from esp_cli.formatting import format_count
+from esp_cli.files.formatting import format_count
+from esp_cli.policies.curve_statistics import curve_band
 from esp_cli.reporting.panels import Panel
 from esp_cli.reporting.plots import appearance
 

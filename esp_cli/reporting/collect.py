@@ -11,12 +11,12 @@ import numpy as np
 from pydantic import JsonValue
 
 from esp_cli.defaults import Mode
-from esp_cli.evaluation.curve_statistics import area_under_curve, steps_to_threshold
-from esp_cli.evaluation.final import FinalEvaluation
-from esp_cli.evaluation.network_cost import flops_per_action, network_parameters
-from esp_cli.evaluation.statistics import summarise
 from esp_cli.files.tables import flat
+from esp_cli.policies.curve_statistics import area_under_curve, steps_to_threshold
+from esp_cli.policies.evaluation import FinalEvaluation
+from esp_cli.policies.statistics import summarise
 from esp_cli.reporting.curves import RunCurve, read_curve
+from esp_cli.reporting.network_cost import flops_per_action, network_parameters
 from esp_cli.reporting.results import CellResult, Passing, Results
 from esp_cli.reporting.summary import returns_of
 from esp_cli.studies.kinds import kind_of

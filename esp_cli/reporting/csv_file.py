@@ -26,7 +26,7 @@ def write_csv(path: Path, runs: Mapping[str, Path]) -> int:
         The number of rows.
 
     Raises:
-        ValueError: a metrics file is damaged.
+        UserError: a metrics file is damaged.
     """
     rows = [row for name, folder in runs.items() for row in _rows(name, folder)]
     names = sorted({key for row in rows for key in row} - set(_KEYS))

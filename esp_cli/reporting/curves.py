@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from esp_cli.defaults import Mode
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
-from esp_cli.training.loading import parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import MetricsError, column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 
@@ -63,7 +64,7 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     """Read the evaluations of a run folder.
 
     Raises:
-        ValueError: no run folder, or no evaluation in it yet.
+        UserError: no run folder, or no evaluation in it yet.
     """
     folder = RunFolder.open(path)
     rows = read_metrics(folder.metrics_path)
@@ -73,7 +74,7 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
         raise type(error)(f"{folder.metrics_path}: {error}") from None
     config = parse_config(folder.config, path)
     if values.shape[1] != len(config.seeds):
-        raise ValueError(
+        raise UserError(
             f"{path} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
         )
     seconds = max(map(elapsed_s, rows), default=0.0)

@@ -8,14 +8,15 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from esp_cli.defaults import Mode
-from esp_cli.evaluation.statistics import Interval, SeedSummary, summarise
-from esp_cli.formatting import format_exactly
+from esp_cli.files.formatting import format_exactly
+from esp_cli.policies.statistics import Interval, SeedSummary, summarise
 from esp_cli.reporting.collect import Material, RunState, results_of
 from esp_cli.reporting.curves import RunCurve
 from esp_cli.reporting.plots import Curve, learning_curves
 from esp_cli.reporting.results import CellResult
 from esp_cli.reporting.summary import floats, summarise_cell
 from esp_cli.studies.study import Cell, Study
+from esp_envs.errors import UserError
 
 
 def put_together(
@@ -37,18 +38,18 @@ def put_together(
         thresholds: returns whose first passing is stated.
 
     Raises:
-        ValueError: a label twice, or runs of different tasks, versions or settings of the task, whose returns do not
+        UserError: a label twice, or runs of different tasks, versions or settings of the task, whose returns do not
             compare.
     """
     labels = [curve.label for curve in curves]
     twice = next((label for label in labels if labels.count(label) > 1), None)
     if twice is not None:
-        raise ValueError(f"two runs are called '{twice}'; give each a label of its own, as in plain={paths[0]}")
+        raise UserError(f"two runs are called '{twice}'; give each a label of its own, as in plain={paths[0]}")
     if len({(c.config.task, str(sorted(c.config.task_settings.items()))) for c in curves}) > 1:
-        raise ValueError("these runs have different tasks or task settings, so their returns do not compare")
+        raise UserError("these runs have different tasks or task settings, so their returns do not compare")
     versions = sorted({curve.spec.version for curve in curves})
     if len(versions) > 1:
-        raise ValueError(
+        raise UserError(
             f"these runs were trained on versions {' and '.join(map(str, versions))} of {curves[0].config.task}, in "
             "which observations, actions or rewards differ, so their returns do not compare; train the older ones again"
         )

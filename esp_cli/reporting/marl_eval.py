@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from esp_cli.formatting import format_count
+from esp_cli.files.formatting import format_count
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.curves import RunCurve
 from esp_cli.studies.study import Cell

@@ -14,11 +14,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
-from esp_cli import __version__
+from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import draw
-from esp_cli.evaluation.statistics import Floats
 from esp_cli.files.documents import encode
 from esp_cli.files.writing import replace_file
+from esp_cli.policies.loading import load_policy
+from esp_cli.policies.statistics import Floats
 from esp_cli.reporting.breaking import series_of
 from esp_cli.reporting.charts import chart, stroke
 from esp_cli.reporting.collect import Material
@@ -30,7 +31,7 @@ from esp_cli.reporting.summary import floats, returns_of
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
-from esp_cli.training.loading import load_policy
+from esp_envs.errors import UserError
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
 CURVES = "curves"
@@ -62,15 +63,15 @@ def write_report(material: Material, out: Path) -> list[Path]:
         The files: the page, the Markdown, the pictures, the results and the form for marl-eval.
 
     Raises:
-        ValueError: no run has an evaluation yet, the folder has a report of something else, or a file cannot be
+        UserError: no run has an evaluation yet, the folder has a report of something else, or a file cannot be
             written.
     """
     if not material.curves:
-        raise ValueError("no run of this study has an evaluation yet; run it first, or wait a little")
+        raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
     own = (MARKDOWN, RESULTS, PAGE, MARL_EVAL, f"{CURVES}.png", f"{CURVES}.svg")
     foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
     if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
-        raise ValueError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
+        raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
     out.mkdir(parents=True, exist_ok=True)
     panels = _panels(material)
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.

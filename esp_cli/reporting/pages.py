@@ -19,6 +19,7 @@ from esp_cli.defaults import Mode
 from esp_cli.files.opening import read_regular
 from esp_cli.reporting.results import join, read_results
 from esp_cli.reporting.tables import TABLES
+from esp_envs.errors import UserError
 
 _MOST_BYTES = 1 << 24
 _OF_EITHER_MODE = ("returns", "paper", "comparison")
@@ -34,24 +35,24 @@ def filled(page: Path) -> str:
     """Return the text of a page with every such table recomputed.
 
     Raises:
-        ValueError: the page, a file or a table is not there, a file is damaged, or the page has no such comments.
+        UserError: the page, a file or a table is not there, a file is damaged, or the page has no such comments.
     """
     try:
         content = read_regular(page, _MOST_BYTES)
         text = (content or b"").decode()
     except OSError as error:
-        raise ValueError(f"cannot read {page}: {error.strerror or error}") from None
+        raise UserError(f"cannot read {page}: {error.strerror or error}") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{page} is no text in UTF-8; give a page of Markdown") from None
+        raise UserError(f"{page} is no text in UTF-8; give a page of Markdown") from None
 
     def compute(match: re.Match[str]) -> str:
         name = match["table"]
         if name not in TABLES:
-            raise ValueError(f"{page} asks for the table '{name}'; the tables are {', '.join(TABLES)}")
+            raise UserError(f"{page} asks for the table '{name}'; the tables are {', '.join(TABLES)}")
         results = join([read_results(page.parent / file) for file in match["files"].split()])
         if match["mode"]:
             if name not in _OF_EITHER_MODE:
-                raise ValueError(f"{page} asks for '{name} {match['mode']}'; {', '.join(_OF_EITHER_MODE)} take a mode")
+                raise UserError(f"{page} asks for '{name} {match['mode']}'; {', '.join(_OF_EITHER_MODE)} take a mode")
             results = results.model_copy(update={"mode": match["mode"]})
         table = TABLES[name](results)
         content = "Nothing yet." if table is None else table.markdown()
@@ -59,7 +60,7 @@ def filled(page: Path) -> str:
 
     page_text, count = _BLOCK.subn(compute, text)
     if not count:
-        raise ValueError(
+        raise UserError(
             f"{page} has no table to compute; write '<!-- results: FILE TABLE -->' and '<!-- end of results -->', "
             "each on a line of its own"
         )

@@ -14,8 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
+from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.reporting.plots import CAPTION, Curve, appearance, draw_curve, written_figure
+from esp_envs.errors import UserError
 
 _PANEL_INCHES = (4.0, 3.2)
 _LEGEND_INCHES = 0.8
@@ -72,10 +73,10 @@ def curve_panels(panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: 
         The PNG and the SVG file.
 
     Raises:
-        ValueError: nothing to draw, shapes that do not fit, or a file that cannot be written.
+        UserError: nothing to draw, shapes that do not fit, or a file that cannot be written.
     """
     if not panels or not all(panel.curves for panel in panels):
-        raise ValueError("there is no curve to draw")
+        raise UserError("there is no curve to draw")
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     columns = min(len(panels), _MAX_COLUMNS)
     rows = math.ceil(len(panels) / columns)
@@ -148,10 +149,10 @@ def sensitivity(
         The PNG and the SVG file.
 
     Raises:
-        ValueError: nothing to draw, or a file that cannot be written.
+        UserError: nothing to draw, or a file that cannot be written.
     """
     if not lines or not all(line.values for line in lines):
-        raise ValueError("there is no line to draw")
+        raise UserError("there is no line to draw")
     known_values = dict.fromkeys(v for line in lines for v in line.values)
     ordered = [value for value in dict.fromkeys([*order, *known_values]) if value in known_values]
     places = {value: k for k, value in enumerate(ordered)}

@@ -23,10 +23,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
-from esp_cli.evaluation.curve_statistics import curve_band
-from esp_cli.evaluation.statistics import bootstrap_interval, mean_and_sem
 from esp_cli.files.failures import attempting
 from esp_cli.files.writing import write_file
+from esp_cli.policies.curve_statistics import curve_band
+from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
+from esp_envs.errors import UserError
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 """Okabe and Ito, "Color Universal Design", 2008, without the yellow, too light for lines on white, and a grey."""
@@ -106,10 +107,10 @@ def learning_curves(
         The PNG and the SVG file.
 
     Raises:
-        ValueError: no curve, shapes that do not fit, or a file that cannot be written.
+        UserError: no curve, shapes that do not fit, or a file that cannot be written.
     """
     if not curves:
-        raise ValueError("there is no curve to draw")
+        raise UserError("there is no curve to draw")
     with _figure(path, title) as (figure, axes, files):
         for index, curve in enumerate(curves):
             draw_curve(axes, curve, index)
@@ -136,12 +137,12 @@ def draw_curve(axes: Axes, curve: Curve, index: int) -> None:
         index: which colour and line style it has.
 
     Raises:
-        ValueError: shapes that do not fit.
+        UserError: shapes that do not fit.
     """
     mean, low, high = curve_band(curve.values)
     steps = np.asarray(curve.steps, dtype=np.float64)
     if steps.shape != mean.shape:
-        raise ValueError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
+        raise UserError(f"the curve '{curve.label}' has {steps.size} steps and {mean.size} evaluations")
     num_seeds = np.shape(curve.values)[1]
     colour, style = appearance(index)
     marker = "o" if steps.size == 1 else None
@@ -178,10 +179,10 @@ def dots(
         The PNG and the SVG file.
 
     Raises:
-        ValueError: no group, a value that is not finite, or a file that cannot be written.
+        UserError: no group, a value that is not finite, or a file that cannot be written.
     """
     if not groups:
-        raise ValueError("there is no group to draw")
+        raise UserError("there is no group to draw")
     with _figure(path, title, 2.1 + 0.5 * len(groups)) as (figure, axes, files):
         for index, group in enumerate(groups):
             colour = PALETTE[index % len(PALETTE)]
@@ -235,7 +236,7 @@ def written_figure(
         size: width and height, inches.
 
     Raises:
-        ValueError: the files cannot be written.
+        UserError: the files cannot be written.
     """
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg"} else path.name
@@ -247,7 +248,7 @@ def written_figure(
         for file, metadata in ((png, {"Software": None}), (svg, {"Date": None, "Creator": None})):
             content = BytesIO()
             figure.savefig(content, format=file.suffix[1:], metadata=metadata)
-            with attempting("write the figure", file, ValueError):
+            with attempting("write the figure", file, UserError):
                 write_file(file, content.getvalue())
 
 

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
+from esp_envs.errors import UserError
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
 Numbers = tuple[float | None, ...]
@@ -125,7 +126,7 @@ def read_results(path: Path) -> Results:
     """Read a results file.
 
     Raises:
-        ValueError: it is missing, damaged, foreign, or of a newer version.
+        UserError: it is missing, damaged, foreign, or of a newer version.
     """
     return RESULTS_FORMAT.parse(path, Results)
 
@@ -137,11 +138,11 @@ def join(several: Sequence[Results]) -> Results:
     of them has not finished, the other one's returns count.
 
     Raises:
-        ValueError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
+        UserError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
     """
     first = several[0]
     if any((r.kind, r.mode, r.rows) != (first.kind, first.mode, first.rows) for r in several):
-        raise ValueError("results of studies of different kinds, or of different evaluations, have no table in common")
+        raise UserError("results of studies of different kinds, or of different evaluations, have no table in common")
     cells: dict[str, CellResult] = {}
     for results in several:
         for cell in results.cells:
@@ -150,6 +151,6 @@ def join(several: Sequence[Results]) -> Results:
                 whole = {"config": results.config | cell.config, "episodes": cell.episodes or results.episodes}
                 cells[cell.name] = cell.model_copy(update=whole)
             elif cell.returns and (there.returns, there.seeds, there.step) != (cell.returns, cell.seeds, cell.step):
-                raise ValueError(f"{cell.name} stands in two of the results files, with different returns")
+                raise UserError(f"{cell.name} stands in two of the results files, with different returns")
     command = "\n".join(dict.fromkeys(results.command for results in several))
     return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells.values())})

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from esp_cli.defaults import Mode
-from esp_cli.evaluation.statistics import (
+from esp_cli.policies.statistics import (
     Estimate,
     Floats,
     SeedSummary,

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
-from esp_cli.evaluation.curve_statistics import median_steps
-from esp_cli.evaluation.statistics import Estimate, SeedSummary, summarise
-from esp_cli.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.policies.curve_statistics import median_steps
+from esp_cli.policies.statistics import Estimate, SeedSummary, summarise
 from esp_cli.reporting.breaking import ESP, PLAIN, at, leaders, series_of, side, verdicts
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import CellSummary, aggregates, summarise_cell

@@ -15,8 +15,8 @@ import matplotlib.pyplot as plt
 import optuna.visualization.matplotlib as figures
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
+from esp_cli.files.formatting import format_count, format_duration
 from esp_cli.files.writing import replace_file
-from esp_cli.formatting import format_count, format_duration
 from esp_cli.reporting.tables import markdown_rows
 from esp_cli.studies.tuner import Outcome, Trials
 from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning

@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import planned
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
-from esp_cli.formatting import file_name, format_exactly
+from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
 from esp_cli.studies.study import Cell, Study
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
+from esp_envs.errors import UserError
 from esp_envs.registry import task_names
 
 
@@ -57,7 +58,7 @@ def plan(name: str, request: Request) -> Study:
         request: what the user asked for.
 
     Raises:
-        ValueError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
+        UserError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
     """
     kind = KINDS[name]
     return Study(
@@ -78,7 +79,7 @@ def without_effect(name: str, request: Request) -> list[str]:
         request: what the user asked for.
 
     Raises:
-        ValueError: as `plan`.
+        UserError: as `plan`.
     """
     configs = [cell.config for cell in _cells(KINDS[name], request)]
     idle = [(config, config.without_effect()) for config in configs]
@@ -95,11 +96,11 @@ def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
     unknown = next((name for name in variants if name not in kind.variants), None)
     if unknown is not None or not variants or len(set(variants)) < len(variants):
         fault = "name each variant of this study once" if unknown is None else f"this study has no variant '{unknown}'"
-        raise ValueError(f"{fault}; they are {', '.join(map(repr, kind.variants))}")
+        raise UserError(f"{fault}; they are {', '.join(map(repr, kind.variants))}")
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
     for setting in request.overrides:
         if any(task_setting(setting, task) in kind.varies for task in tasks):
-            raise ValueError(f"--set {setting} is what this study varies by itself; leave it out")
+            raise UserError(f"--set {setting} is what this study varies by itself; leave it out")
     _refuse_unused(kind, request, tasks, algorithms)
     build = _pairs if kind.rows == "panels" else _variants
     return tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
@@ -208,28 +209,28 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
     """Refuse what would be ignored without a word."""
     other = next((task for task in tasks if kind.only not in (None, task)), None)
     if other is not None:
-        raise ValueError(f"this study is on {kind.only} alone, not on {other}; leave out --tasks")
+        raise UserError(f"this study is on {kind.only} alone, not on {other}; leave out --tasks")
     unknown = [task for task in tasks if kind.breakings and task not in kind.breakings]
     if unknown:
-        raise ValueError(f"this study knows no breaking of {unknown[0]}; its tasks are {', '.join(kind.breakings)}")
+        raise UserError(f"this study knows no breaking of {unknown[0]}; its tasks are {', '.join(kind.breakings)}")
     known = dict.fromkeys(setting for task in tasks for setting in kind.breakings.get(task, {}))
     for setting in request.breakings or ():
         if setting not in known:
-            raise ValueError(f"'{setting}' breaks none of these tasks here; choose from {', '.join(known)}")
+            raise UserError(f"'{setting}' breaks none of these tasks here; choose from {', '.join(known)}")
     for name in request.overrides:
         section = name.rpartition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):
-            raise ValueError(f"--set {name} concerns no run of this study; it has {', '.join((*tasks, *algorithms))}")
+            raise UserError(f"--set {name} concerns no run of this study; it has {', '.join((*tasks, *algorithms))}")
     for task, steps in request.steps or ():
         if task is not None and task not in tasks:
-            raise ValueError(f"--steps {task}={steps} concerns no run of this study; its tasks are {', '.join(tasks)}")
+            raise UserError(f"--steps {task}={steps} concerns no run of this study; its tasks are {', '.join(tasks)}")
     unserved = [task for task in tasks if not _steps(kind, task, request)]
     if unserved:
-        raise ValueError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
+        raise UserError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
     for given, noun in ((tasks, "task"), (algorithms, "algorithm")):
         twice = {name for name in given if given.count(name) > 1}
         if twice:
-            raise ValueError(f"the {noun} {twice.pop()} is named twice; name it once")
+            raise UserError(f"the {noun} {twice.pop()} is named twice; name it once")
 
 
 def _paired_name(algorithm: str, prior: str) -> str:

@@ -73,7 +73,7 @@ def probe(config: RunConfig, episodes: int) -> Cost:
         episodes: per seed, of its final evaluation.
 
     Raises:
-        ValueError: its parts do not go together.
+        UserError: its parts do not go together.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the runs of a study do

@@ -45,5 +45,5 @@ class Engine(Protocol):
 
         Raises:
             OSError: the machine failed.
-            ValueError: the job cannot be started; the run fails, and the others go on.
+            UserError: the job cannot be started; the run fails, and the others go on.
         """

@@ -28,7 +28,7 @@ from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect, offers
 from esp_cli.studies.versions import refuse_difference
 from esp_cli.studies.worker import SILENCE_S, CellWorker, Lease, LeaseLostError, News
 from esp_cli.training.build import spec_of
-from esp_cli.training.loading import parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.memory import process_bytes
 from esp_cli.training.run_folder import RunFolder
 
@@ -60,7 +60,7 @@ class RayEngine:
 
     Raises:
         ClusterError: no cluster answers, or a node cannot run esp.
-        ValueError: a node has other versions than this machine.
+        UserError: a node has other versions than this machine.
     """
 
     def __init__(

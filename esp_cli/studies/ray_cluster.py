@@ -12,6 +12,7 @@ from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from esp_cli.studies.versions import refuse_difference, versions
+from esp_envs.errors import UserError
 from esp_envs.machine import available_cores
 
 NAMESPACE = "esp"
@@ -20,7 +21,7 @@ CONNECT_S = 10.0
 _OBJECT_STORE_BYTES = 256 * 2**20
 
 
-class ClusterError(ValueError):
+class ClusterError(UserError):
     """The cluster cannot be used; the text is one sentence for the user."""
 
 
@@ -32,7 +33,7 @@ def connect(address: str | None) -> None:
 
     Raises:
         ClusterError: none answers, it is of another version of Ray or Python, or a node cannot run esp.
-        ValueError: a node has other versions of esp or its libraries than this machine.
+        UserError: a node has other versions of esp or its libraries than this machine.
     """
     ray._private.worker._worker_logs_enabled = False  # Ray prints the loss of a node to standard output
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -90,10 +91,10 @@ def _knock(address: str) -> None:
 
     Raises:
         OSError: nothing answers.
-        ValueError: it is that of a server for Ray's client.
+        UserError: it is that of a server for Ray's client.
     """
     if address.startswith("ray://"):
-        raise ValueError("the driver has to be a machine of the cluster; Ray's client is not supported")
+        raise UserError("the driver has to be a machine of the cluster; Ray's client is not supported")
     host, colon, port = address.rpartition(":")
     if colon and port.isdecimal():
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
@@ -103,7 +104,7 @@ def _refuse_other_versions() -> None:
     """Refuse a cluster of which a node that is there now has other versions, or no esp.
 
     Raises:
-        ValueError: there is such a node.
+        UserError: there is such a node.
     """
     nodes = [node for node in ray.nodes() if node["Alive"]]
     ask = ray.remote(_node_versions)

@@ -22,24 +22,25 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from esp_cli import __version__
-from esp_cli.evaluation.final import FinalEvaluation
+from esp_cli.defaults import __version__
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.files.writing import TEMPORARY_PREFIX
+from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
-from esp_cli.training.loading import parse_config
 from esp_cli.training.locking import acquire, release
 from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
 
 _FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _OLD_FINAL = "judgement.json"
 
 
-class StudyError(ValueError):
+class StudyError(UserError):
     """A study folder cannot be made, opened or used; the text is one sentence for the user."""
 
 
@@ -262,7 +263,7 @@ class StudyFolder:
         """Make the run folder of a cell, or open the one that is there.
 
         Raises:
-            ValueError: what is there is damaged or another run.
+            UserError: what is there is damaged or another run.
         """
         path, wanted = self.run_path(cell), cell.config.model_dump(mode="json")
         if not (path / CONFIG).exists():

@@ -13,13 +13,14 @@ from pydantic import Field, JsonValue
 
 from esp_cli.checking.measured import planned
 from esp_cli.files.documents import DocumentFormat, Strict
-from esp_cli.formatting import file_name, format_count
+from esp_cli.files.formatting import file_name, format_count
 from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.folder_names import METRICS, TUNING
 from esp_cli.training.metrics import column, elapsed_s, read_metrics
+from esp_envs.errors import UserError
 
 Goal = Literal["return", "steps", "seconds"]
 SMOOTHED = 3
@@ -70,7 +71,7 @@ class Tuning(Strict):
         """Resolve the run of a prior with these settings over those of all runs.
 
         Raises:
-            ValueError: a setting is unknown or out of range.
+            UserError: a setting is unknown or out of range.
         """
         config = planned(self._asked(prior, settings, self.trial_seeds if seeds is None else seeds))
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
@@ -94,28 +95,28 @@ class Tuning(Strict):
             seeds: of the runs that judge the best settings.
 
         Raises:
-            ValueError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
+            UserError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
                 learner's or changes nothing, nothing is left to search, a choice cannot be trained, or the goal lacks
                 its return.
         """
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
-            raise ValueError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
+            raise UserError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
         if (self.goal == "return") != (self.reach is None):
             what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
-            raise ValueError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
+            raise UserError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
-            raise ValueError("a tuning takes the kinds of prior by --prior, not by --set or --space")
+            raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
         for name in self.space:
             if name.partition(".")[0] in _GIVEN:
-                raise ValueError(
+                raise UserError(
                     f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
                     f"--set {name}=VALUE"
                 )
         for prior in self.priors:
             for name, dimension in space_of(self.space, prior).items():
                 if name in self.overrides:
-                    raise ValueError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
+                    raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
                 for value in dimension.corners():
                     self.config(prior, {name: value})
         self._check_effects()
@@ -126,12 +127,12 @@ class Tuning(Strict):
         """Refuse a setting that changes nothing with any prior that it is searched for, and a search of no setting.
 
         Raises:
-            ValueError: there is one.
+            UserError: there is one.
         """
         spaces = {prior: space_of(self.space, prior) for prior in self.priors}
         for prior, space in spaces.items():
             if not space:
-                raise ValueError(
+                raise UserError(
                     f"with --prior {prior} no setting of the space changes anything, so its trials would be equal; add "
                     "a setting of the learner, or leave this prior out"
                 )
@@ -139,7 +140,7 @@ class Tuning(Strict):
         for name in self.space:
             searched = [prior for prior, space in spaces.items() if name in space]
             if searched and all(name in idle[prior] for prior in searched):
-                raise ValueError(
+                raise UserError(
                     f"the space varies '{name}', which is without effect beside the other settings; leave it out"
                 )
 
@@ -150,7 +151,7 @@ class Tuning(Strict):
         minibatches with 64 worlds; then it is left to the search.
 
         Raises:
-            ValueError: there is such a choice.
+            UserError: there is such a choice.
         """
         space = space_of(self.space, prior)
         for name, dimension in space.items():
@@ -160,7 +161,7 @@ class Tuning(Strict):
                     {other: corner} for other, tried in space.items() if other != name for corner in tried.corners()
                 )
                 if reason and all(self._refusal(prior, {name: value, **other}) for other in others):
-                    raise ValueError(
+                    raise UserError(
                         f"the space tries {json.dumps(value)} for '{name}', which cannot be trained: {reason}"
                     )
 

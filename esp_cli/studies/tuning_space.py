@@ -15,6 +15,7 @@ from esp_cli.files.suggesting import did_you_mean
 from esp_cli.files.tables import flat, read_table
 from esp_cli.prior.config import of_no_use_to
 from esp_cli.training.config import validated
+from esp_envs.errors import UserError
 
 
 class Dimension(Strict):
@@ -36,7 +37,7 @@ class Dimension(Strict):
     @classmethod
     def _is_number(cls, value: object) -> object:
         if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-            raise ValueError("it has to be a number")
+            raise UserError("it has to be a number")
         return value
 
     @model_validator(mode="after")
@@ -44,11 +45,11 @@ class Dimension(Strict):
         ends = (self.low, self.high)
         if self.choices is not None:
             if not self.choices or ends != (None, None) or self.log:
-                raise ValueError("write a list of values, or low and high")
+                raise UserError("write a list of values, or low and high")
         elif self.low is None or self.high is None or not self.low < self.high:
-            raise ValueError("write low and high, the smaller one first")
+            raise UserError("write low and high, the smaller one first")
         elif self.log and self.low <= 0:
-            raise ValueError("log needs a low above 0")
+            raise UserError("log needs a low above 0")
         return self
 
     @property
@@ -136,10 +137,10 @@ def default_space(algorithm: str) -> Space:
     """Return the space of an algorithm; settings of the prior concern runs with the prior alone.
 
     Raises:
-        ValueError: there is none.
+        UserError: there is none.
     """
     if algorithm not in SPACES:
-        raise ValueError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
+        raise UserError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
     return {**SPACES[algorithm], **_PRIOR}
 
 
@@ -149,7 +150,7 @@ def read_space(path: Path) -> Space:
     A list stands for choices: {"network.hidden": [[64, 64], [128, 128]]}.
 
     Raises:
-        ValueError: it is damaged, or says nothing.
+        UserError: it is damaged, or says nothing.
     """
     fields: dict[str, dict[str, object]] = {}
     found = dict(flat(read_table(path)))
@@ -157,15 +158,15 @@ def read_space(path: Path) -> Space:
         name, _, last = dotted.rpartition(".")
         if last not in Dimension.model_fields and found.keys() & {f"{name}.low", f"{name}.high"}:
             hint = did_you_mean(last, Dimension.model_fields) or "; write low, high and log"
-            raise ValueError(f"{path} says '{last}' of the range '{name}'{hint}")
+            raise UserError(f"{path} says '{last}' of the range '{name}'{hint}")
         if last in Dimension.model_fields and name:
             fields.setdefault(name, {})[last] = value
         elif isinstance(value, list):
             fields[dotted] = {"choices": tuple(value)}
         else:
-            raise ValueError(f"{path} gives '{dotted}' one value; write a list, or low and high, or use --set for it")
+            raise UserError(f"{path} gives '{dotted}' one value; write a list, or low and high, or use --set for it")
     if not fields:
-        raise ValueError(f"{path} names no setting; write what to try, as 'mappo.num_epochs': [5, 10]")
+        raise UserError(f"{path} names no setting; write what to try, as 'mappo.num_epochs': [5, 10]")
     return {name: validated(Dimension, values, name) for name, values in fields.items()}
 
 

@@ -10,7 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import esp_envs
-from esp_cli import __version__
+from esp_cli.defaults import __version__
+from esp_envs.errors import UserError
 
 _LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
 
@@ -30,14 +31,14 @@ def refuse_difference(node: str, theirs: Mapping[str, str]) -> None:
         theirs: versions of the node.
 
     Raises:
-        ValueError: they differ; the message names all that do.
+        UserError: they differ; the message names all that do.
     """
     ours = versions()
     unlike = [name for name in ours if theirs.get(name) != ours[name]]
     if unlike:
         there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)
         here = ", ".join(ours[name] for name in unlike)
-        raise ValueError(f"the node {node} has {there}, but this machine has {here}; install the same versions on both")
+        raise UserError(f"the node {node} has {there}, but this machine has {here}; install the same versions on both")
 
 
 def _version(name: str) -> str:

@@ -22,6 +22,7 @@ from esp_cli.studies.versions import versions
 from esp_cli.training.checkpoint_names import FILE_NAME, checkpoints_in, place_of
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, FINAL, LOCK, LOG, METRICS, POLICY
 from esp_cli.training.locking import acquire, is_held
+from esp_envs.errors import UserError
 
 CHUNK_BYTES = 8 * 2**20
 """Of one part of a large file."""
@@ -34,7 +35,7 @@ WHOLE_FILES = (CONFIG, POLICY, FINAL)
 _PREFIX, _LOCK = "esp-cell-", "worker.lock"
 
 
-class LeaseLostError(ValueError):
+class LeaseLostError(UserError):
     """Another driver has taken a worker over."""
 
 
@@ -198,7 +199,7 @@ class CellWorker:
 
     def _path(self, name: str) -> Path:
         if name not in (*WHOLE_FILES, METRICS) and not FILE_NAME.fullmatch(name):
-            raise ValueError(f"a run folder has no file '{name}'")
+            raise UserError(f"a run folder has no file '{name}'")
         return place_of(self._run, name)
 
     def _files(self) -> dict[str, tuple[int, int]]:

@@ -11,6 +11,7 @@ from esp_cli.symmetry.elements import Element, item_places
 from esp_cli.symmetry.groups import MOST_ITEMS, Group
 from esp_cli.symmetry.parse import Factors, is_item_name, parse_elements
 from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_sources
+from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
 DISCOVERED = "discovered:"
@@ -32,7 +33,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
         instead: what to do where the task carries no planar group; by default to use orders of agents or no prior.
 
     Raises:
-        ValueError: some action's image is no action, the element is outside the task's declared symmetry, or agents
+        UserError: some action's image is no action, the element is outside the task's declared symmetry, or agents
             or items are to change places and a layout does not say which numbers follow them.
     """
     moved = elements.generators() if isinstance(elements, Group) else tuple(elements)
@@ -45,7 +46,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
         advice = f"use a group within {plane[-1]}" if plane else instead or f"use {carried[0]}"
         if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
-    raise ValueError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
+    raise UserError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
 
 
 def carried_groups(spaces: Spaces) -> tuple[str, ...]:
@@ -72,7 +73,7 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
             wherever actions and layouts carry it, and such orders beside it.
 
     Raises:
-        ValueError: its symmetry means nothing.
+        UserError: its symmetry means nothing.
     """
     declared = _factors(_usable(spaces), spaces)
     listed = [name for name in declared[:1] if name != "so2"]
@@ -89,7 +90,7 @@ def admit_declared(spaces: Spaces) -> None:
     """Refuse the symmetry that a task declares, or declares nearly, where its actions or layouts cannot carry it.
 
     Raises:
-        ValueError: they cannot, or it means nothing.
+        UserError: they cannot, or it means nothing.
     """
     for text in filter(None, (spaces.symmetry, spaces.nearly)):
         for name in _factors(text, spaces):
@@ -230,7 +231,7 @@ def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
     """
     found = text.removeprefix(DISCOVERED)
     if not found and text:
-        raise ValueError("nothing was discovered that transforms could name; choose some, or no prior")
+        raise UserError("nothing was discovered that transforms could name; choose some, or no prior")
     elements = parse_elements(found, spaces.num_agents)
     admit(found, elements, spaces if found == text else unrestricted(spaces))
     return elements

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from esp_envs.errors import UserError
 from esp_envs.spec import Field, Items
 
 Floats = NDArray[np.float64]
@@ -75,18 +76,18 @@ class Element(ABC):
         """Return how each run of d numbers of a field transforms, d dividing the field's width: [d, d], orthogonal.
 
         Raises:
-            ValueError: the field cannot be transformed.
+            UserError: the field cannot be transformed.
         """
 
     def gather(self, field: Field) -> tuple[Indices, Floats]:
         """Return `block` as a signed permutation: new number k is sign[k] times old number source[k], [d] each.
 
         Raises:
-            ValueError: a new number mixes old ones, as a vector's do under other turns than quarters.
+            UserError: a new number mixes old ones, as a vector's do under other turns than quarters.
         """
         block = self.block(field)
         if not np.array_equal(np.abs(block).sum(-1), np.ones(len(block))) or not np.isin(block, (-1, 0, 1)).all():
-            raise ValueError(f"a picture turns by quarters alone, but '{field.name}' is to turn by another angle")
+            raise UserError(f"a picture turns by quarters alone, but '{field.name}' is to turn by another angle")
         return np.abs(block).argmax(-1), block.sum(-1)
 
 
@@ -107,7 +108,7 @@ def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
     """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
 
     Raises:
-        ValueError: the field has another number of items, is a picture, or its items follow the agents.
+        UserError: the field has another number of items, is a picture, or its items follow the agents.
     """
     name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
     orders = [dict(element.items).get(name) for element in elements]
@@ -115,9 +116,9 @@ def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
     if not moved:
         return None
     if field.items is not Items.FIXED or field.pixels is not None:
-        raise ValueError(f"the items of field '{name}' cannot be exchanged: they are the agents', or pictures")
+        raise UserError(f"the items of field '{name}' cannot be exchanged: they are the agents', or pictures")
     if any(len(order) != field.count for order in moved):
-        raise ValueError(f"field '{name}' has {field.count} items, not {len(moved[0])}")
+        raise UserError(f"field '{name}' has {field.count} items, not {len(moved[0])}")
     stay = tuple(range(field.count))
     return np.array([order or stay for order in orders], dtype=np.int64)
 
@@ -126,10 +127,10 @@ def compose_permutations(g: tuple[int, ...] | None, h: tuple[int, ...] | None) -
     """Return the permutation that applies h first, then g; None moves nothing.
 
     Raises:
-        ValueError: the two are of different length.
+        UserError: the two are of different length.
     """
     if g is None or h is None:
         return g or h
     if len(g) != len(h):
-        raise ValueError(f"orders of {len(g)} and of {len(h)} things cannot be composed; give both one length")
+        raise UserError(f"orders of {len(g)} and of {len(h)} things cannot be composed; give both one length")
     return tuple(g[i] for i in h)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.plane import PlaneElement, mirror
+from esp_envs.errors import UserError
 
 LISTED_LIMIT = 1024
 """Largest number of elements that is listed; larger groups (all orders of 7 agents: 5040) are sampled instead."""
@@ -59,7 +60,7 @@ class FiniteGroup(Group):
         """Build the smallest group that holds the generators.
 
         Raises:
-            ValueError: it has more than `LISTED_LIMIT` elements.
+            UserError: it has more than `LISTED_LIMIT` elements.
         """
         gens = tuple(generators)
         identity = gens[0] @ gens[0].inverse()
@@ -69,7 +70,7 @@ class FiniteGroup(Group):
             frontier = [p for p in {g @ h for g in gens for h in frontier} if p not in found]
             found.update(frontier)
             if len(found) > LISTED_LIMIT:
-                raise ValueError(f"{name} has more than {LISTED_LIMIT} elements; use a smaller group or so2, o2")
+                raise UserError(f"{name} has more than {LISTED_LIMIT} elements; use a smaller group or so2, o2")
         return cls(name, found)
 
     @property
@@ -197,10 +198,10 @@ def agent_permutations(num_agents: int) -> Group:
     """Return S_N: listed up to `LISTED_LIMIT` orders, sampled beyond.
 
     Raises:
-        ValueError: fewer than two agents.
+        UserError: fewer than two agents.
     """
     if num_agents < 2:
-        raise ValueError("agents can only change places where there are two or more; choose a planar group")
+        raise UserError("agents can only change places where there are two or more; choose a planar group")
     if math.factorial(num_agents) > LISTED_LIMIT:
         return AgentPermutations(num_agents)
     return FiniteGroup("agents", (PlaneElement(permutation=p) for p in permutations(range(num_agents))))
@@ -210,10 +211,10 @@ def item_orders(field: str, count: int) -> FiniteGroup:
     """Return all orders of a field's items.
 
     Raises:
-        ValueError: fewer than 2 items, or more than `MOST_ITEMS`.
+        UserError: fewer than 2 items, or more than `MOST_ITEMS`.
     """
     if not 2 <= count <= MOST_ITEMS:
-        raise ValueError(f"{count} {field} have no group of orders; 2 to {MOST_ITEMS} like items of a field have one")
+        raise UserError(f"{count} {field} have no group of orders; 2 to {MOST_ITEMS} like items of a field have one")
     return FiniteGroup(f"{field}-{count}", (PlaneElement(items=((field, p),)) for p in permutations(range(count))))
 
 

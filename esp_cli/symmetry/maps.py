@@ -132,7 +132,7 @@ def rows_map(
     """Return L_g on an agent's row, or on all agents' rows end to end where agents move.
 
     Raises:
-        ValueError: the layout cannot be transformed.
+        UserError: the layout cannot be transformed.
     """
     if _holds_pictures(layout):
         return gather(*rows_permutation(layout, elements, num_agents), device)
@@ -148,7 +148,7 @@ def state_map(
     """Return L_g on the global state.
 
     Raises:
-        ValueError: the state cannot be transformed.
+        UserError: the state cannot be transformed.
     """
     if _holds_pictures(spaces.state):
         return gather(*state_permutation(spaces, elements), device)

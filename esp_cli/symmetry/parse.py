@@ -24,6 +24,7 @@ from esp_cli.symmetry.groups import (
     swap_and_round,
 )
 from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
+from esp_envs.errors import UserError
 
 _NAMED = {
     "identity": PlaneElement(),
@@ -54,17 +55,17 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
         (continuous, or larger than `LISTED_LIMIT`).
 
     Raises:
-        ValueError: an unknown name, nothing besides the identity, or a sampled group that does not stand alone.
+        UserError: an unknown name, nothing besides the identity, or a sampled group that does not stand alone.
     """
     items = [_item(part.strip(), text, num_agents) for part in text.split(",")]
     listed = [item for item in items if isinstance(item, tuple)]
     if len(listed) < len(items):
         if len(items) == 1 and isinstance(items[0], Group):
             return items[0]
-        raise ValueError(f"transforms '{text}' list a group that is sampled; let so2, o2 or a large group stand alone")
+        raise UserError(f"transforms '{text}' list a group that is sampled; let so2, o2 or a large group stand alone")
     unique = tuple(dict.fromkeys(e for item in listed for e in item if not e.is_identity))
     if not unique:
-        raise ValueError(f"transforms '{text}' hold only the identity; name one that moves something")
+        raise UserError(f"transforms '{text}' hold only the identity; name one that moves something")
     return unique
 
 
@@ -72,15 +73,15 @@ def parse_group(text: str, num_agents: int) -> Group:
     """Read one group name or a product of a planar group, `agents` and orders of items: a task's declared symmetry.
 
     Raises:
-        ValueError: unknown, or no group.
+        UserError: unknown, or no group.
     """
     factors = [_factor(part.strip(), text, num_agents) for part in text.split("*")]
     groups = [f for f in factors if isinstance(f, Group)]
     if len(groups) != len(factors):
-        raise ValueError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
+        raise UserError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
     ranked = {_rank(group): group for group in groups}
     if len(ranked) < len(groups) or (len(groups) > 1 and next(reversed(ranked)) == _PLANE):
-        raise ValueError(
+        raise UserError(
             f"'{text}' is not a direct product; write a planar group, agents and fields, each once, as d4*agents"
         )
     return groups[0] if len(groups) == 1 else direct_product(*(ranked[rank] for rank in sorted(ranked)))
@@ -105,7 +106,7 @@ class Factors:
         """Read a task's symmetry.
 
         Raises:
-            ValueError: it has one order of items, and not all.
+            UserError: it has one order of items, and not all.
         """
         plane, items = [], dict[str, int]()
         words = [part.strip() for part in symmetry.split("*")]
@@ -117,7 +118,7 @@ class Factors:
                 items[match[1]] = int(match[2][1:])
             else:
                 count = match[2].count("-")
-                raise ValueError(f"'{word}' is one order of items; declare all of them, as in {match[1]}-{count}")
+                raise UserError(f"'{word}' is one order of items; declare all of them, as in {match[1]}-{count}")
         return cls("*".join(plane), "agents" in map(str.lower, words), items)
 
     @property
@@ -158,13 +159,13 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     lists = []
     for factor in factors:
         if isinstance(factor, Group) and not isinstance(factor, FiniteGroup):
-            raise ValueError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
+            raise UserError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
         lists.append(factor.elements if isinstance(factor, FiniteGroup) else (factor,))
     if len({type(element) for elements in lists for element in elements}) > 1:
-        raise ValueError(f"'{part}' multiplies transforms of several kinds; list them with commas, or choose one kind")
+        raise UserError(f"'{part}' multiplies transforms of several kinds; list them with commas, or choose one kind")
     size = reduce(lambda a, b: a * b, (len(x) for x in lists))
     if size > LISTED_LIMIT:
-        raise ValueError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
+        raise UserError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
     return reduce(lambda a, b: tuple(g @ h for g in a for h in b), lists)
 
 
@@ -176,7 +177,7 @@ def _factor(word: str, text: str, num_agents: int) -> Element | Group:
     if (orders := _read_items(word)) is not None:
         return orders
     where = f" in '{text}'" if word != text else ""
-    raise ValueError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+    raise UserError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
 
 
 def _read_plane(word: str, _: int) -> Element | Group | None:
@@ -220,17 +221,17 @@ def _order(word: str, count: int) -> tuple[int, ...]:
     """Read the place that each of some things moves to: "agents-1-0-2".
 
     Raises:
-        ValueError: it is no order of so many.
+        UserError: it is no order of so many.
     """
     name, *numbers = word.split("-")
     places = tuple(map(int, numbers))
     if sorted(places) != list(range(count)):
         example = order_name(name, swap_and_round(count)[1])
-        raise ValueError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
+        raise UserError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
     return places
 
 
 def _polygon(letter: str, n: int) -> FiniteGroup:
     if not 1 <= n <= _MAX_FOLD:
-        raise ValueError(f"group '{letter}{n}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
+        raise UserError(f"group '{letter}{n}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
     return cyclic(n) if letter == "c" else dihedral(n)

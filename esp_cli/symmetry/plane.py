@@ -19,6 +19,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from esp_cli.symmetry.elements import Element, Floats, Indices, Orders, compose_permutations, order_name
+from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
 
 _PIXEL_TOLERANCE = 1e-6
@@ -82,7 +83,7 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
         [rows * columns], the index of the old pixel that shows in each new one.
 
     Raises:
-        ValueError: some pixel would come to lie between others, or outside.
+        UserError: some pixel would come to lie between others, or outside.
     """
     rows, columns = pixels
     row, column = np.divmod(np.arange(rows * columns), columns)
@@ -91,7 +92,7 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
     old = np.stack([(rows - 1) / 2 - origin[:, 1], origin[:, 0] + (columns - 1) / 2], -1)
     whole = np.rint(old)
     if np.abs(whole - old).max() >= _PIXEL_TOLERANCE or (whole < 0).any() or (whole >= [rows, columns]).any():
-        raise ValueError(f"the pixels of a picture of {rows} x {columns} do not come to lie on pixels")
+        raise UserError(f"the pixels of a picture of {rows} x {columns} do not come to lie on pixels")
     return (whole[:, 0] * columns + whole[:, 1]).astype(np.int64)
 
 
@@ -108,14 +109,14 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
         [n], the index of the old ray that shows in each new one.
 
     Raises:
-        ValueError: some ray would come to lie between others.
+        UserError: some ray would come to lie between others.
     """
     angle = 2 * np.pi * np.arange(rays) / rays
     origin = np.stack([np.cos(angle), np.sin(angle)], -1) @ planar  # the inverse is the transpose
     old = np.arctan2(origin[:, 1], origin[:, 0]) * rays / (2 * np.pi)
     whole = np.rint(old)
     if np.abs(whole - old).max() >= _PIXEL_TOLERANCE:
-        raise ValueError(f"the rays of a ring of {rays} do not come to lie on rays; it turns by 360 / {rays} degrees")
+        raise UserError(f"the rays of a ring of {rays} do not come to lie on rays; it turns by 360 / {rays} degrees")
     return whole.astype(np.int64) % rays
 
 
@@ -190,7 +191,7 @@ class PlaneElement(Element):
         """Compose: `g @ h` applies h first, then g.
 
         Raises:
-            ValueError: the two permute different numbers of agents or items.
+            UserError: the two permute different numbers of agents or items.
         """
         # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
         turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
@@ -210,16 +211,14 @@ class PlaneElement(Element):
         """Return how one item of a field transforms: [item width, item width].
 
         Raises:
-            ValueError: pixels or rays do not come to lie on others, or the kind is unknown in the plane.
+            UserError: pixels or rays do not come to lie on others, or the kind is unknown in the plane.
         """
         if field.pixels is not None:
             return np.eye(field.item_width)[picture_sources(field.pixels, self.matrix)]
         if field.rays:
             return np.eye(field.rays)[ring_sources(field.rays, self.matrix)]
         if field.kind not in KIND_MATRICES:
-            raise ValueError(
-                f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns"
-            )
+            raise UserError(f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns")
         return KIND_MATRICES[field.kind](self.matrix)
 
     def gather(self, field: Field) -> tuple[Indices, Floats]:
@@ -233,11 +232,11 @@ def _moves(places: tuple[int, ...]) -> bool:
     """Return whether a permutation moves something.
 
     Raises:
-        ValueError: it is none.
+        UserError: it is none.
     """
     stay = tuple(range(len(places)))
     if tuple(sorted(places)) != stay:
-        raise ValueError(f"{places} is not a permutation; write each number from 0 to {len(places) - 1} once")
+        raise UserError(f"{places} is not a permutation; write each number from 0 to {len(places) - 1} once")
     return places != stay
 
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from esp_cli.symmetry.elements import Element, Floats, Indices, item_places, places_of
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, others_of
 
 _MATCH_TOLERANCE = 1e-6
@@ -95,7 +96,7 @@ def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: in
         source and sign, [G, D] each, or [G, N * D] where agents move.
 
     Raises:
-        ValueError: an item mixes its numbers, as a vector does under other turns than quarters.
+        UserError: an item mixes its numbers, as a vector does under other turns than quarters.
     """
     within, sign = layout_permutation(layout, elements)
     places = places_of(elements, num_agents)
@@ -134,7 +135,7 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
     items.
 
     Raises:
-        ValueError: agents move, and a field's items cannot follow them.
+        UserError: agents move, and a field's items cannot follow them.
     """
     places = places_of(elements, spaces.num_agents)
     if places is None:
@@ -162,7 +163,7 @@ def state_sources(layout: Layout, places: Indices) -> Indices:
         places: [G, N], places[g, i] = sigma_g(i).
 
     Raises:
-        ValueError: a field's items cannot follow the agents.
+        UserError: a field's items cannot follow the agents.
     """
     came_from = np.argsort(places, axis=1)
     group, num_agents = places.shape
@@ -173,7 +174,7 @@ def state_sources(layout: Layout, places: Indices) -> Indices:
             _require_count(field, num_agents)
             slots = came_from
         elif field.items is Items.OTHERS:
-            raise ValueError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
+            raise UserError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
         sources.append(start + _numbers(slots, field.item_width))
         start += field.width
     return np.concatenate(sources, axis=1)
@@ -189,7 +190,7 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
         [G, A].
 
     Raises:
-        ValueError: some action's image is no action.
+        UserError: some action's image is no action.
     """
     points = np.array(action.points, dtype=np.float64)
     images = np.einsum(
@@ -203,7 +204,7 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
     missed = np.argwhere(distance.min(axis=-1) > _MATCH_TOLERANCE)
     if len(missed):
         g, j = missed[0]
-        raise ValueError(f"action '{action.names[j]}' {elements[g].participle} is no action")
+        raise UserError(f"action '{action.names[j]}' {elements[g].participle} is no action")
     return nearest
 
 
@@ -245,4 +246,4 @@ def _numbers(slots: Indices, width: int) -> Indices:
 def _require_count(field: Field, expected: int) -> None:
     if field.count != expected:
         what = "other agents" if field.items is Items.OTHERS else "agents"
-        raise ValueError(f"field '{field.name}' has {field.count} items for {expected} {what}; give it one for each")
+        raise UserError(f"field '{field.name}' has {field.count} items for {expected} {what}; give it one for each")

@@ -10,6 +10,7 @@ from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
 from esp_cli.symmetry.transforms import Transform, build_transform
+from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
 _STACK_LIMIT = 512
@@ -84,10 +85,10 @@ class TransformSet:
         """Return every element in order, each the same for all seeds.
 
         Raises:
-            ValueError: the group is sampled.
+            UserError: the group is sampled.
         """
         if not self.is_finite:
-            raise ValueError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
+            raise UserError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
         if self._stack is not None:
             return [self._single(i) for i in range(self.size)]
         return [self._build([e]) for e in self._elements]
@@ -115,7 +116,7 @@ def transform_set(
         dtype: of the matrices.
 
     Raises:
-        ValueError: the text means nothing, or the task cannot carry what it means.
+        UserError: the text means nothing, or the task cannot carry what it means.
     """
     return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
 

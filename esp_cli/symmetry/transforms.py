@@ -20,6 +20,7 @@ from torch import Tensor
 from esp_cli.symmetry.elements import Element, places_of
 from esp_cli.symmetry.maps import Gather, Map, gather, rows_map, state_map
 from esp_cli.symmetry.representation import action_map
+from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 
@@ -141,25 +142,25 @@ class Transform:
         """Apply a map of rows of `width` numbers; where agents move, a row holds all N agents' numbers.
 
         Raises:
-            ValueError: the rows have another width, the agent axis another size, or the first axis other seeds.
+            UserError: the rows have another width, the agent axis another size, or the first axis other seeds.
         """
         if self.agents is not None and agent_axis is not None:
             num_agents = self.agents.width
             if x.dim() < -agent_axis or x.shape[agent_axis] != num_agents:
-                raise ValueError(
+                raise UserError(
                     f"agents change places: axis {agent_axis} of {list(x.shape)} must hold {num_agents} agents"
                 )
             expected = width // num_agents if agent_axis == -2 else width
         else:
             expected = width
         if x.shape[-1] != expected:
-            raise ValueError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
+            raise UserError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
         return move(x.reshape(self._seeds_of(x), -1, width)).reshape(x.shape)
 
     def _seeds_of(self, x: Tensor) -> int:
         """Return the size of the first axis to compute with: one element for all seeds makes seeds part of a batch."""
         if self.num_seeds not in (1, x.shape[0]):
-            raise ValueError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
+            raise UserError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
         return self.num_seeds
 
 
@@ -169,14 +170,14 @@ def build_transform(
     """Stack the representations of some elements, one per seed, on a task's spaces.
 
     Raises:
-        ValueError: no element, or the task's actions or layouts cannot carry one.
+        UserError: no element, or the task's actions or layouts cannot carry one.
     """
     if not elements:
-        raise ValueError("a transform needs one element per seed, got none")
+        raise UserError("a transform needs one element per seed, got none")
     chosen, num_agents = tuple(elements), spaces.num_agents
     seen = spaces.observation.slices()
     if missing := [name for element in chosen for name, _ in element.items if name not in seen]:
-        raise ValueError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {', '.join(seen)}")
+        raise UserError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {', '.join(seen)}")
     places = places_of(chosen, num_agents)
     index: Tensor | None = None
     if isinstance(spaces.action, Discrete):

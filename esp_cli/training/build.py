@@ -13,6 +13,7 @@ from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.compass import Compass
+from esp_envs.errors import UserError
 from esp_envs.registry import make
 from esp_envs.spec import TaskSpec
 
@@ -41,7 +42,7 @@ def build_learner(config: RunConfig) -> Learner:
     """Build the learner of a run, with its worlds, from the configuration alone.
 
     Raises:
-        ValueError: parts of the configuration do not go together, or it needs more memory than the machine has.
+        UserError: parts of the configuration do not go together, or it needs more memory than the machine has.
     """
     cls = ALGORITHMS[config.algorithm]
     settings = cls.config_class(**config.algorithm_settings)
@@ -63,15 +64,15 @@ def _set_gate(learner: Learner, config: RunConfig) -> None:
     """Give a learner the gate that its prior asks for; it is the same for all seeds, and for whatever seeds there are.
 
     Raises:
-        ValueError: the gate does not go with the rest of the configuration.
+        UserError: the gate does not go with the rest of the configuration.
     """
     prior = config.prior.effective()
     if prior.trust != "gate" or learner.prior.transforms is None:
         return
     if config.network.recurrent:
-        raise ValueError("prior.trust=gate copies single steps, which a recurrent network cannot take; use mlp")
+        raise UserError("prior.trust=gate copies single steps, which a recurrent network cannot take; use mlp")
     if learner.replays and prior.replay == "stored":
-        raise ValueError("prior.trust=gate copies single steps, and a replay stores episodes; use prior.replay=sampled")
+        raise UserError("prior.trust=gate copies single steps, and a replay stores episodes; use prior.replay=sampled")
     certain = {name for name, weight in prior.weights.items() if weight == 1}
     if certain != set(prior.weights):
         worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)

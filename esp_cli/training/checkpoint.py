@@ -27,6 +27,7 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentError, parse_object, shortened
 from esp_cli.files.failures import attempting
 from esp_cli.files.writing import replace_file
+from esp_envs.errors import UserError
 from esp_envs.policy_format import METADATA_KEY, digest
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
@@ -43,7 +44,7 @@ _DTYPES = {
 }
 
 
-class CheckpointError(ValueError):
+class CheckpointError(UserError):
     """A checkpoint or policy file cannot be written or read; the text is one sentence for the user."""
 
 

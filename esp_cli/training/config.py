@@ -20,6 +20,7 @@ from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import default_transforms
+from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make, task_class
 from esp_envs.spec import TaskSpec
 
@@ -62,7 +63,7 @@ class RunConfig(Strict):
     @classmethod
     def _once(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
         if len(set(seeds)) < len(seeds):
-            raise ValueError("a seed stands there twice")
+            raise UserError("a seed stands there twice")
         return seeds
 
     def of_one_seed(self) -> RunConfig:
@@ -154,16 +155,16 @@ def resolve_config(
             "prior.kind", "evaluation.episodes". Text is read as JSON where that is possible.
 
     Raises:
-        ValueError: an unknown name or a value out of range, in one sentence.
+        UserError: an unknown name or a value out of range, in one sentence.
     """
     sections = _preset_sections(task, algorithm, preset)
     for dotted, value in (overrides or {}).items():
         section, dot, key = dotted.rpartition(".")
         if not dot or section not in sections:
-            raise ValueError(_no_section(dotted, task, algorithm))
+            raise UserError(_no_section(dotted, task, algorithm))
         sections[section][key] = read = _read(value)
         if isinstance(read, float) and not math.isfinite(read):
-            raise ValueError(f"bad value {read} for '{dotted}': it has to be a finite number")
+            raise UserError(f"bad value {read} for '{dotted}': it has to be a finite number")
 
     network_name = sections["network"].get("name", "mlp")
     network = network_class(network_name)
@@ -199,7 +200,7 @@ def resolve_config(
 def _refuse_loss_without_terms(algorithm: str, prior: PriorConfig) -> None:
     """Refuse a consistency loss of the policy alone for a learner that has no policy to compare."""
     if prior.terms == "policy" and prior.coefficient > 0 and not ALGORITHMS[algorithm].has_policy_term:
-        raise ValueError(
+        raise UserError(
             f"prior.terms=policy leaves {algorithm} without a consistency loss, since it learns values and has no "
             "policy to compare; use prior.terms=value, or both"
         )
@@ -224,7 +225,7 @@ def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[s
     """Return the settings, by section, that a preset and the task change.
 
     Raises:
-        ValueError: there is no such algorithm, or it has no such preset.
+        UserError: there is no such algorithm, or it has no such preset.
     """
     learner = ALGORITHMS[algorithm]
     layers = preset_layers(task, algorithm, preset)
@@ -242,7 +243,7 @@ def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str
     """Fill in the defaults of a task's settings.
 
     Raises:
-        ValueError: an unknown task or setting, or a value out of range, in one sentence.
+        UserError: an unknown task or setting, or a value out of range, in one sentence.
     """
     return validated(task_class(task).Settings, settings, "task").model_dump()
 
@@ -251,7 +252,7 @@ def completed(config: RunConfig) -> RunConfig:
     """Return a stored configuration with the defaults of the settings that its task and learner gained since.
 
     Raises:
-        ValueError: its task or algorithm is unknown.
+        UserError: its task or algorithm is unknown.
     """
     models = {
         "task_settings": task_class(config.task).Settings,
@@ -288,24 +289,24 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
     """Build `model`, turning pydantic's report into one sentence.
 
     Raises:
-        ValueError: an unknown name, or a value of another kind, out of range or not finite.
+        UserError: an unknown name, or a value of another kind, out of range or not finite.
     """
     try:
         built = model(**values)
     except ValidationError as error:
-        raise ValueError(one_sentence(error, model, section, owner)) from None
+        raise UserError(one_sentence(error, model, section, owner)) from None
     for name, value in values.items():
         taken = list(_numbers(getattr(built, name)))
         if any(not abs(number) < 2**63 for number in taken if not isinstance(number, float)):
-            raise ValueError(f"bad value {shortened(str(value))} for '{section}.{name}': it has more than 64 bits")
+            raise UserError(f"bad value {shortened(str(value))} for '{section}.{name}': it has more than 64 bits")
         if not all(abs(number) <= _LARGEST for number in taken):  # false for what is no number
-            raise ValueError(
+            raise UserError(
                 f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number of at most "
                 f"{_LARGEST:g}"
             )
         # pydantic takes true for 1
         if _count_flags(_numbers(value)) > _count_flags(taken):
-            raise ValueError(f"bad value {json.dumps(value)} for '{section}.{name}': it has to be a number")
+            raise UserError(f"bad value {json.dumps(value)} for '{section}.{name}': it has to be a number")
     return built
 
 

@@ -6,11 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ValidationError
+
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.defaults import __version__
+from esp_cli.files.documents import one_sentence, validate
 from esp_cli.files.suggesting import did_you_mean
 from esp_cli.files.tables import flat, read_table
-from esp_cli.training.config import SECTIONS, RunConfig
-from esp_cli.training.loading import parse_config
+from esp_cli.training.config import SECTIONS, RunConfig, completed
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
+from esp_envs.errors import UserError
+from esp_envs.registry import task_class
 
 CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from")
 """What a file may choose beside settings."""
@@ -45,7 +51,7 @@ def read_config_file(path: Path) -> ConfigFile:
     beside choices such as {"task": "navigation", "steps": "500k"}.
 
     Raises:
-        ValueError: it is missing or damaged, or names a choice that does not exist.
+        UserError: it is missing or damaged, or names a choice that does not exist.
     """
     if path.is_dir():
         return _of_run(path, parse_config(RunFolder.open(path).config, path))
@@ -60,11 +66,11 @@ def read_config_file(path: Path) -> ConfigFile:
             # TOML cannot hold the name of the task and a table of its settings under one key
             setting = name.replace("task_settings.", "task.", 1)
             if setting in settings:
-                raise ValueError(f"{path} sets '{setting}' twice; leave one of them out")
+                raise UserError(f"{path} sets '{setting}' twice; leave one of them out")
             settings[setting] = value
         else:
             hint = did_you_mean(name, CHOICES) or f"; write one of {', '.join(CHOICES)}, or a setting as SECTION.NAME"
-            raise ValueError(f"{path} sets '{name}', which is not a choice of a run{hint}")
+            raise UserError(f"{path} sets '{name}', which is not a choice of a run{hint}")
     return ConfigFile(path, choices, settings)
 
 
@@ -77,3 +83,37 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
     sections = {config.algorithm: "algorithm_settings"} | SECTIONS
     settings = {f"{section}.{name}": value for section, key in sections.items() for name, value in stored[key].items()}
     return ConfigFile(path, choices, settings, config)
+
+
+def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
+    """Read a stored configuration.
+
+    Args:
+        data: as JSON gave it.
+        source: the run folder or file, for the message.
+        writer: version of esp that stored it, where that is known.
+
+    Raises:
+        UserError: it is damaged or of another version.
+    """
+    try:
+        config = validate(RunConfig, data)
+    except ValidationError as error:
+        # Another version may have had another name for a setting; of one version that is damage.
+        other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
+        raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
+    try:
+        learner = ALGORITHMS[config.algorithm]
+    except ValueError as error:
+        raise UserError(f"{source}: {error}") from None
+    _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
+    _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)
+    return completed(config)
+
+
+def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:
+    """Refuse stored settings that a task or an algorithm does not have."""
+    try:
+        validate(model, settings)
+    except ValidationError as error:
+        raise UserError(f"{source}: {one_sentence(error, model, section)}") from None

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import open_own
+from esp_envs.errors import UserError
 
 
-class LockError(ValueError):
+class LockError(UserError):
     """Another process holds the lock, or it cannot be taken; the text is one sentence for the user."""
 
 

@@ -10,6 +10,7 @@ import torch
 from esp_cli.algorithms.learner import LearnerConfig
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.training.config import RunConfig
+from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 _FLOAT_BYTES = 4
@@ -30,13 +31,13 @@ def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: T
         spec: of its task.
 
     Raises:
-        ValueError: it does not fit; the message names the setting that needs most of it.
+        UserError: it does not fit; the message names the setting that needs most of it.
     """
     needed = least_bytes(config, settings, spec)
     available = machine_bytes(config.device)
     if sum(needed.values()) > available:
         name = max(needed, key=lambda key: needed[key])
-        raise ValueError(
+        raise UserError(
             f"this run needs at least {_gigabytes(sum(needed.values()))} of memory, {_gigabytes(needed[name])} of it "
             f"for '{name}' with {len(config.seeds)} seeds, but {config.device} has {_gigabytes(available)}; choose a "
             f"smaller {name}, or fewer seeds"

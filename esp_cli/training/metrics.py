@@ -24,7 +24,8 @@ from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
 from esp_cli.files.opening import open_own
 from esp_cli.files.writing import mend_last_line, replace_file
-from esp_cli.trackers import Sink
+from esp_cli.training.trackers import Sink
+from esp_envs.errors import UserError
 
 Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
@@ -34,7 +35,7 @@ _TAIL_BYTES = 2**18
 """Longer than most rows."""
 
 
-class MetricsError(ValueError):
+class MetricsError(UserError):
     """A metrics file cannot be written or read; the text is one sentence for the user."""
 
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from esp_cli import __version__
-from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
-from esp_cli.training.config import RunConfig
-from esp_envs.policy_format import POLICY_FORMAT, POLICY_VERSION
+from esp_cli.defaults import __version__
+from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from esp_cli.training.config import InitialPolicy, RunConfig
+from esp_envs.policy_format import POLICY_FORMAT, POLICY_VERSION, digest
 from esp_envs.spec import TaskSpec
 
 
@@ -45,3 +46,15 @@ def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Seque
         "config": config.model_dump(mode="json"),
         "esp_version": __version__,
     }
+
+
+def read_initial(path: Path, recorded: InitialPolicy) -> dict[str, Tensor]:
+    """Read the weights that a run starts from.
+
+    Raises:
+        CheckpointError: they are missing, damaged, or not those that its configuration records.
+    """
+    tensors, _ = read_policy(path)
+    if digest(tensors, {}) != recorded.sha256:
+        raise CheckpointError(f"{path} does not hold the policy that the run started from; train anew")
+    return tensors

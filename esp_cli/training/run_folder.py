@@ -42,10 +42,11 @@ from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, ME
 from esp_cli.training.locking import LockError, acquire, release
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
+from esp_envs.errors import UserError
 from esp_envs.policy_format import POLICY_FORMAT
 
 
-class RunFolderError(ValueError):
+class RunFolderError(UserError):
     """A run folder cannot be made, opened or locked; the text is one sentence for the user."""
 
 

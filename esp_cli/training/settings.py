@@ -13,6 +13,7 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.settings_index import Section, Setting
 from esp_cli.training.config import EvaluationConfig
+from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, task_class
 
 _UNITS = {
@@ -47,7 +48,7 @@ def task_section(name: str) -> Section:
     """Return the settings of one task, which may be of the caller.
 
     Raises:
-        ValueError: there is no such task.
+        UserError: there is no such task.
     """
     return Section(name, "task", _settings("task", task_class(name).Settings))
 
@@ -56,7 +57,7 @@ def own_section(name: str) -> Section:
     """Import a task, an algorithm or a network of the caller, named as "module:Class", and return its settings.
 
     Raises:
-        ValueError: the module cannot be imported, or holds none of these by that name.
+        UserError: the module cannot be imported, or holds none of these by that name.
     """
     refusals = []
     for registry in (TASKS, ALGORITHMS, NETWORKS):
@@ -71,7 +72,7 @@ def own_section(name: str) -> Section:
             return Section(name, "network", _settings("network", NETWORKS[name]))
         return task_section(name)
     strange = f"'{name}' is no task, algorithm or network; check its base class"
-    raise ValueError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
+    raise UserError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
 
 
 def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:

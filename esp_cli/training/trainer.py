@@ -16,22 +16,22 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from esp_cli.files.faults import reach
-from esp_cli.trackers import TrackedRun, open_trackers, require
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
-from esp_cli.training.initial import read_initial
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
 from esp_cli.training.play import PolicyController, play
-from esp_cli.training.policy_file import describe_policy
+from esp_cli.training.policy_file import describe_policy, read_initial
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
+from esp_cli.training.trackers import TrackedRun, open_trackers, require
+from esp_envs.errors import UserError
 
 
 def checkpoint_seconds() -> float:
     """Return what ESP_CHECKPOINT_SECONDS says, or its default.
 
     Raises:
-        ValueError: it is not a number of seconds.
+        UserError: it is not a number of seconds.
     """
     text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
     try:
@@ -39,7 +39,7 @@ def checkpoint_seconds() -> float:
     except ValueError:
         seconds = math.nan
     if not 0 <= seconds < math.inf:
-        raise ValueError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
+        raise UserError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
     return seconds
 
 
@@ -91,7 +91,7 @@ class Trainer:
         track: names of trackers that get the metrics too.
 
     Raises:
-        ValueError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
+        UserError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
             installed.
     """
 
@@ -149,7 +149,7 @@ class Trainer:
             Whether the run is complete.
 
         Raises:
-            ValueError: every seed stopped on a number that is not finite.
+            UserError: every seed stopped on a number that is not finite.
         """
         self._require_a_seed_that_goes_on()
         started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
@@ -177,7 +177,7 @@ class Trainer:
 
     def _require_a_seed_that_goes_on(self) -> None:
         if self.all_stopped:
-            raise ValueError(
+            raise UserError(
                 "every seed stopped on a number that is not finite; ask 'esp check task' whether the task has one, "
                 "or try a smaller learning rate"
             )
@@ -262,7 +262,7 @@ class Trainer:
         """Continue from the newest good checkpoint; without one, start from the beginning."""
         found = self.folder.latest_checkpoint(self.notes.append)
         if found is None and self.folder.policy_path.is_file():
-            raise ValueError(
+            raise UserError(
                 f"{self.folder.path} is trained and has no checkpoint to go on from; train anew under another --out"
             )
         if found is not None:
@@ -271,14 +271,14 @@ class Trainer:
             try:
                 stands = Standing.model_validate(meta)
             except ValidationError:
-                raise ValueError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
+                raise UserError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
             self.iteration, self.elapsed_s = stands.iteration, stands.elapsed_s
             self.stopped_seeds = stands.stopped_seeds
             if self.step != stands.step or not set(self.stopped_seeds) <= set(range(len(self.config.seeds))):
-                raise ValueError(f"the checkpoint in {self.folder.path} is of another run; train anew")
+                raise UserError(f"the checkpoint in {self.folder.path} is of another run; train anew")
             version = self.learner.spec.version
             if stands.task_version != version:
-                raise ValueError(
+                raise UserError(
                     f"{self.folder.path} was trained on {self.config.task} version {stands.task_version}, but this is "
                     f"version {version}; use the esp that it was begun with, or train anew"
                 )
@@ -298,7 +298,7 @@ class Trainer:
                 # a replay has grown, and checks its shapes itself
                 fits = a.dtype == b.dtype and (a.shape == b.shape or name.startswith("replay."))
             if not fits:
-                raise ValueError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")
+                raise UserError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")
 
     def _policy_meta(self) -> dict[str, Any]:
         """Describe the policy file so that it can be used without the run folder."""

@@ -12,8 +12,8 @@ from esp_cli import load_policy, train
 from esp_cli.checking import check_symmetry
 from esp_cli.networks.exploration import EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import Categorical, masked
+from esp_cli.policies import loading
 from esp_cli.symmetry import transform_set
-from esp_cli.training import loading
 from esp_envs import Discrete, Kind, make, register
 from esp_envs.base import random_choice
 from esp_envs.conformance import Subject, check

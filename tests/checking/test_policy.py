@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking import candidates, check_policy, check_symmetry
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.symmetry import FiniteGroup, parse_elements
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.loading import TrainedPolicy
 from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.registry import make
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.evaluation.network_cost import flops_per_action
+from esp_cli.reporting.network_cost import flops_per_action
 from esp_cli.studies.catalogue import Request, plan
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import reported

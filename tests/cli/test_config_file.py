@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli.training.config import RunConfig
-from esp_cli.training.loading import parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RUN_FORMAT
 from tests.cli.running import printed, refused, written
 

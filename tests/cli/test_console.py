@@ -16,7 +16,7 @@ from pydantic import BaseModel
 
 from esp_cli import console
 from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.formatting import file_name, format_exactly
+from esp_cli.files.formatting import file_name, format_exactly
 
 
 class Model(BaseModel):

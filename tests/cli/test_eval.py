@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from esp_cli.app import app
-from esp_cli.deploy import bundled
+from esp_cli.policies import bundled
 from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}

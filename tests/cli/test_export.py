@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.deploy import check
-from esp_cli.deploy.manifest import MANIFEST, bundled_folder, read_bundled
+from esp_cli.export import check
+from esp_cli.policies.manifest import MANIFEST, bundled_folder, read_bundled
 from tests.cli.running import DAMAGE, esp, refused
 
 
@@ -49,7 +49,7 @@ def test_a_policy_goes_into_a_folder_and_is_used_from_there(
     result = esp("export", finished, "-f", "policy", "-o", folder, "--episodes", 4)
     (entry,) = read_bundled(folder)
     assert f"{entry.name}: seed {entry.seed} of 2" in result.stderr
-    monkeypatch.setattr("esp_cli.deploy.manifest.bundled_folder", lambda: folder)
+    monkeypatch.setattr("esp_cli.policies.manifest.bundled_folder", lambda: folder)
     judged = json.loads(esp("eval", "navigation", "--episodes", 4, "--json", "-").stdout)
     assert judged["greedy"]["mean"] == pytest.approx(entry.score.mean)
     assert entry.name in esp("policies", "navigation").stdout

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from esp_cli.training.checkpoint import load_checkpoint
-from esp_cli.training.config_file import read_config_file
-from esp_cli.training.loading import parse_config
+from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.policy_format import POLICY_FORMAT
 from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, train_tiny, written

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from esp_cli.evaluation.statistics import mean_and_sem
-from esp_cli.formatting import format_mean
+from esp_cli.files.formatting import format_mean
+from esp_cli.policies.statistics import mean_and_sem
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
 from esp_cli.studies.tuning import TUNING_FORMAT, TuningFolder
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint

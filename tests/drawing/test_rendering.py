@@ -14,8 +14,8 @@ from esp_cli.drawing.films import write_gif, write_mp4
 from esp_cli.drawing.recording import Episode, framed, record, record_both
 from esp_cli.drawing.rendering import HOLD_SECONDS, open_painter, shots, stride, write_film
 from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
-from esp_cli.training.loading import TrainedPolicy
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
 from esp_envs import Body, Scene

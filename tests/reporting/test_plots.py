@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from esp_cli.evaluation.curve_statistics import curve_band
+from esp_cli.policies.curve_statistics import curve_band
 from esp_cli.reporting import plots
 from esp_cli.reporting.plots import PALETTE, Curve, Group, dots, learning_curves
 

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from esp_cli.evaluation.statistics import average_improvement, leader
+from esp_cli.policies.statistics import average_improvement, leader
 from esp_cli.reporting.collect import collect
 from esp_cli.reporting.results import Passing, join, read_results
 from esp_cli.reporting.summary import aggregates, summarise_cell

@@ -19,7 +19,7 @@ pytest.importorskip("ray", reason="needs Ray, of the extra cluster")
 import ray
 from ray.cluster_utils import Cluster
 
-from esp_cli.library.run import Run
+from esp_cli.run import Run
 from esp_cli.studies import engine_ray, versions
 from esp_cli.studies.engine import Engine
 from esp_cli.studies.engine_local import LocalEngine

@@ -20,8 +20,9 @@ from typer.testing import CliRunner
 from esp_cli.app import app
 from esp_cli.checking import collect
 from esp_cli.checking.logs import read_transitions
-from esp_cli.deploy.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.files.documents import DocumentFormat, parse_object
+from esp_cli.policies.loading import load_policy
+from esp_cli.policies.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.reporting.pages import filled
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.tables import all_tables
@@ -29,7 +30,7 @@ from esp_cli.studies.catalogue import plan
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.loading import load_policy, parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import MetricsError, column, read_last_row, read_metrics
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
 from esp_cli.training.trainer import Trainer

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from esp_cli.policies.loading import load_policy
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import RunConfig
-from esp_cli.training.loading import load_policy, parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer
 from esp_envs.policy_format import POLICY_FORMAT

@@ -12,10 +12,11 @@ import pytest
 import torch
 
 from esp_cli import app
+from esp_cli.policies.loading import load_policy
 from esp_cli.training import trainer as training
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.loading import load_policy, parse_config
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.play import play
 from esp_cli.training.run_folder import RunFolder

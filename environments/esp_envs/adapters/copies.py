@@ -23,6 +23,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from esp_envs.errors import UserError
+
 _RESET, _STEP, _LEAVE = b"reset", b"step", b"leave"
 TERMINATED, TRUNCATED = 1, 2
 """What `Board.ended` says of a copy whose episode ended in this step."""
@@ -165,11 +167,11 @@ class WorkerCopies:
         """Read one answer of every worker.
 
         Raises:
-            ValueError: an environment raised, or a worker died.
+            UserError: an environment raised, or a worker died.
         """
         failures = [failure for pipe, worker in self._workers if (failure := _answer(pipe, worker))]
         if failures:
-            raise ValueError(failures[0])
+            raise UserError(failures[0])
 
 
 def can_fork() -> bool:
@@ -222,7 +224,7 @@ def _failure_of(command: Callable[[], None]) -> str:
     try:
         command()
     except Exception as failure:
-        return str(failure) if isinstance(failure, ValueError) else f"{type(failure).__name__}: {failure}"
+        return str(failure) if isinstance(failure, UserError) else f"{type(failure).__name__}: {failure}"
     return ""
 
 

@@ -35,6 +35,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
+from esp_envs.errors import UserError
 from esp_envs.machine import available_cores
 from esp_envs.spec import Discrete, TaskSpec, joint_layout
 
@@ -103,7 +104,7 @@ class ParallelTask(CopyHooks, Environment):
         """Advance every copy by one step.
 
         Raises:
-            ValueError: the action has another shape, an environment raises, a worker dies, or agents end apart.
+            UserError: the action has another shape, an environment raises, a worker dies, or agents end apart.
         """
         require_shape("joint action", action, self.action_shape)
         board = self._started().board
@@ -139,10 +140,10 @@ class ParallelTask(CopyHooks, Environment):
         """Restore what `state_dict` returned, by repeating the present episode of each copy.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size, or a copy does not repeat itself.
+            UserError: the tensors belong to an environment of another size, or a copy does not repeat itself.
         """
         if tensors["taken"].shape != self._taken.shape or len(tensors["generators"]) != self.num_seeds:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         self._base, self._begun = tensors["base"].cpu().clone(), tensors["begun"].cpu() - 1
         restore_generators(self.generators, tensors["generators"])
         self._taken = tensors["taken"].cpu().clone()
@@ -154,7 +155,7 @@ class ParallelTask(CopyHooks, Environment):
         for t in range(int(until.max())):
             self._advance(until > t, self._taken[t])
         if not torch.equal(self._per_world(self._started().board.obs).cpu(), tensors["seen"].cpu()):
-            raise ValueError(
+            raise UserError(
                 f"a copy of {self.spec.name} does not repeat its episode from the same seed and actions, so the run "
                 "cannot go on bit for bit; let 'reset(seed)' decide all that chance does in the environment"
             )

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import Observation
+from esp_envs.errors import UserError
 from esp_envs.extras import install
 from esp_envs.spec import Field, Items, Kind, Layout
 
@@ -30,12 +31,12 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
     """Return what makes one simulator.
 
     Raises:
-        ValueError: VMAS is missing, or the scenario does not take the arguments.
+        UserError: VMAS is missing, or the scenario does not take the arguments.
     """
     try:
         import vmas  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise ValueError(f"a VMAS task needs a package that is missing ({error.name}): {install('vmas')}") from error
+        raise UserError(f"a VMAS task needs a package that is missing ({error.name}): {install('vmas')}") from error
 
     def make() -> Any:
         try:
@@ -44,11 +45,11 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
                 return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
         except UserWarning as unknown:
             told = str(unknown).partition(" passed")[0].removeprefix("Scenario kwargs: ")
-            raise ValueError(
+            raise UserError(
                 f"the VMAS scenario '{scenario}' has no arguments {told}; leave them out of what 'arguments' returns"
             ) from unknown
         except (AssertionError, TypeError) as error:
-            raise ValueError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {error}") from error
+            raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {error}") from error
 
     return make
 
@@ -158,7 +159,7 @@ class Entities:
         landmarks = sim.world.landmarks
         goals = [i for i, entity in enumerate(landmarks) if own_goals and entity.name.startswith(own_goals)]
         if goals and len(goals) != len(sim.agents):
-            raise ValueError(
+            raise UserError(
                 f"{len(goals)} landmarks are named '{own_goals}...' for {len(sim.agents)} agents; one belongs to each"
             )
         rest = [i for i in range(len(landmarks)) if i not in goals]

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board
+from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Layout
 
 Array = NDArray[Any]
@@ -54,12 +55,12 @@ class CopyHooks(ABC):
         """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info.
 
         Raises:
-            ValueError: neither has one.
+            UserError: neither has one.
         """
         for place in (observation, info):
             if _has(place, "action_mask"):
                 return np.asarray(place["action_mask"])
-        raise ValueError(f"{agent} gets no 'action_mask', neither in its observation nor in its info")
+        raise UserError(f"{agent} gets no 'action_mask', neither in its observation nor in its info")
 
     def opponent(self, agent: str, observation: Any, generator: np.random.Generator) -> Any:
         """Return the action of an agent that does not learn, as its environment takes it.
@@ -69,7 +70,7 @@ class CopyHooks(ABC):
             observation: what the environment gave it.
             generator: of this copy, seeded with each episode.
         """
-        raise ValueError(f"{type(self).__name__} does not say how {agent} acts; define 'opponent' or set 'learners'")
+        raise UserError(f"{type(self).__name__} does not say how {agent} acts; define 'opponent' or set 'learners'")
 
     def measure(self, env: Any, infos: Mapping[str, Mapping[str, Any]]) -> Mapping[str, float]:
         """Return the metrics of the step just made: the mean over the agents whose infos hold them."""
@@ -88,7 +89,7 @@ class Copy:
         agents = list(self.env.possible_agents)
         self.learners = [name for name in agents if name.startswith(task.learners)]
         if not self.learners:
-            raise ValueError(f"no agent's name begins with '{task.learners}'; the agents are {', '.join(agents)}")
+            raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {', '.join(agents)}")
         self.rest = [name for name in agents if name not in self.learners]
         spaces = [self.env.action_space(name) for name in self.learners]
         self._boxes = [_bounds(space) for space in spaces]
@@ -98,31 +99,31 @@ class Copy:
         """Refuse spaces that differ from the layouts, by looking at the first observation.
 
         Raises:
-            ValueError: names the agent, its numbers and those of the layout.
+            UserError: names the agent, its numbers and those of the layout.
         """
         task = self._task
         first, infos = self.env.reset(seed=0)
         for name in self.learners:
             if name not in first:
-                raise ValueError(f"{name} gets no observation from 'reset', and agents that join later cannot learn")
+                raise UserError(f"{name} gets no observation from 'reset', and agents that join later cannot learn")
             width = task.reading(name, first[name]).size
             if width != task.observation.width:
-                raise ValueError(f"{name} sees {width} numbers, but the layout has {task.observation.width}")
+                raise UserError(f"{name} sees {width} numbers, but the layout has {task.observation.width}")
             if task.masks and isinstance(task.action, Discrete):
                 size = task.allowed(name, first[name], infos.get(name, {})).size
                 if size != task.action.count:
-                    raise ValueError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
+                    raise UserError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
             space = self.env.action_space(name)
             if isinstance(task.action, Discrete):
                 if getattr(space, "n", None) != task.action.count or space.shape:
-                    raise ValueError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
+                    raise UserError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
             elif _bounds(space) is None or space.shape != (task.action.width,):
-                raise ValueError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
+                raise UserError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
         if task.state is not None and not hasattr(self.env, "state"):
-            raise ValueError("the task says what the state is, but its environment has no 'state' method")
+            raise UserError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and np.size(self.env.state()) != task.state.width:
             got = np.size(self.env.state())
-            raise ValueError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
+            raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
 
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""
@@ -193,7 +194,7 @@ class CopyStepper:
         ended = {name: terminated.get(name, True) for name in acting}  # an agent that is not mentioned has left
         over = [name for name in acting if ended[name] or truncated.get(name, False)]
         if over and len(over) < len(acting) and not task.agents_end:
-            raise ValueError(
+            raise UserError(
                 f"{over[0]} of {type(task).__name__} ends before the others; set 'agents_end = True' in the class"
             )
         # the horizon cuts agents that go on up to it, even if another ends in the same step; `alive` says which one
@@ -215,7 +216,7 @@ class CopyStepper:
             return TERMINATED
         if over and not self.board.cut[k]:
             way = "set 'terminates = True' in the class" if terminated else "give both the same number of steps"
-            raise ValueError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
+            raise UserError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
         return TRUNCATED if self.board.cut[k] else 0
 
     def _write(self, k: int, obs: Array, state: Array, mask: Array, alive: Array) -> None:
@@ -239,7 +240,7 @@ class CopyStepper:
         except Exception as error:
             line = (str(error).strip().splitlines() or [""])[-1]
             place = f"copy {k} of {type(self._task).__name__} raises in '{what}'"
-            raise ValueError(f"{place}: {type(error).__name__}: {line}") from error
+            raise UserError(f"{place}: {type(error).__name__}: {line}") from error
 
 
 def _has(place: Any, name: str) -> bool:

@@ -30,6 +30,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
+from esp_envs.errors import UserError
 from esp_envs.scene import Body, Scene
 from esp_envs.spec import Continuous, Field, Kind, Layout, TaskSpec, layout
 
@@ -113,7 +114,7 @@ class VmasTask(Environment):
         self._starts: list[dict[int, simulation.Start]] = [{} for _ in self.generators]
         width = self.reading(torch.stack(self._sims[0].reset(), 1)).shape[-1]
         if width != self.spec.observation.width:
-            raise ValueError(
+            raise UserError(
                 f"the scenario shows {width} numbers to an agent, but the layout has {self.spec.observation.width}"
             )
 
@@ -131,7 +132,7 @@ class VmasTask(Environment):
         """Advance every world by one step.
 
         Raises:
-            ValueError: the action has another shape than [S, E, N, 2].
+            UserError: the action has another shape than [S, E, N, 2].
         """
         require_shape("joint action", action, self.action_shape)
         force = self.spec.action.admissible(action) * self._range.unsqueeze(-1)
@@ -164,7 +165,7 @@ class VmasTask(Environment):
         """Put every world into a global state at the start of an episode.
 
         Raises:
-            ValueError: the state has another shape than [S, E, state width].
+            UserError: the state has another shape than [S, E, state width].
         """
         require_shape("state", state, self.state_shape)
         self._time.zero_()
@@ -191,10 +192,10 @@ class VmasTask(Environment):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size.
+            UserError: the tensors belong to an environment of another size.
         """
         if tensors["time"].shape != self._time.shape or len(tensors["generators"]) != self.num_seeds:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         self._base = tensors["base"].cpu().clone()
         self._begun, self._time = (tensors[name].cpu().clone() for name in ("begun", "time"))
         self._starts = [{} for _ in self.generators]

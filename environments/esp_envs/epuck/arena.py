@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from esp_envs.epuck.robot import BODY_RADIUS_M, Array
+from esp_envs.errors import UserError
 
 POST_CLEARANCE_M = 0.013
 """Air between a wall and the body of a robot on its post."""
@@ -32,21 +33,21 @@ class Arena:
 
     def __post_init__(self) -> None:
         if self.reach_m <= 0:
-            raise ValueError(f"a robot does not fit into an arena of {self.side_m:g} m; make it larger")
+            raise UserError(f"a robot does not fit into an arena of {self.side_m:g} m; make it larger")
         gap = 4 * self.reach_m * 2 / max(self.num_robots, 1) - 2 * BODY_RADIUS_M
         if self.num_robots > 1 and gap < 0.1:
-            raise ValueError(
+            raise UserError(
                 f"{self.num_robots} robots do not fit around an arena of {self.side_m:g} m with 10 cm between them; "
                 "make it larger"
             )
         ring = PILLAR_RING * self.side_m / 2
         if self.num_pillars and ring + self.pillar_radius_m > self.reach_m - 3 * BODY_RADIUS_M:
-            raise ValueError(
+            raise UserError(
                 f"pillars of radius {self.pillar_radius_m:g} m reach the posts in an arena of {self.side_m:g} m; "
                 "make them thinner"
             )
         if self.num_pillars > 1 and 2 * ring * np.sin(np.pi / self.num_pillars) < 2 * self.pillar_radius_m:
-            raise ValueError(f"{self.num_pillars} pillars of radius {self.pillar_radius_m:g} m overlap; use fewer")
+            raise UserError(f"{self.num_pillars} pillars of radius {self.pillar_radius_m:g} m overlap; use fewer")
 
     @property
     def reach_m(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.physics import Physics
+from esp_envs.errors import UserError
 from esp_envs.installed import load
 
 ENGINES = {
@@ -18,14 +19,14 @@ def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: flo
     """Make W worlds in the engine `name`.
 
     Raises:
-        ValueError: no such engine, or its library is not installed.
+        UserError: no such engine, or its library is not installed.
     """
     if name not in ENGINES:
-        raise ValueError(f"unknown physics '{name}'; there are {', '.join(ENGINES)}")
+        raise UserError(f"unknown physics '{name}'; there are {', '.join(ENGINES)}")
     forget_missing_backend()
     try:
         engine: type[Physics] = load(ENGINES[name])
     except ImportError as error:
         package = (error.name or name.partition("-")[0]).partition(".")[0]
-        raise ValueError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
+        raise UserError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
     return engine(arena, num_worlds, control_period_s, num_threads)

@@ -20,6 +20,7 @@ from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within
+from esp_envs.errors import UserError
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
 
@@ -261,12 +262,12 @@ class Formation(LockstepTask):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size or another physics.
+            UserError: the tensors belong to an environment of another size or another physics.
         """
         physics = {k.removeprefix("physics."): v.numpy() for k, v in tensors.items() if k.startswith("physics.")}
         own = self.state_dict()
         if {k: v.shape for k, v in tensors.items()} != {k: v.shape for k, v in own.items()}:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         for name in _REMEMBERED:
             setattr(self, f"_{name}", tensors[name].numpy().copy())
         self.physics.load_state_dict(physics)

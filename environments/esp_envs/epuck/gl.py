@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from esp_envs.errors import UserError
+
 _LIBRARIES = {
     "osmesa": ("OSMesa", ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")),
     "egl": ("EGL", ("libEGL.so.1", "libEGL.so")),
@@ -24,7 +26,7 @@ _MISSING = "not installed"
 _ADVICE = "to draw in software, install OSMesa: apt-get install libosmesa6 (Fedora: dnf install mesa-libOSMesa)"
 
 
-class NoGraphicsError(ValueError):
+class NoGraphicsError(UserError):
     """No library on this machine can draw without a display."""
 
 

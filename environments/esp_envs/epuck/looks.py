@@ -9,6 +9,7 @@ from PIL import ImageColor
 
 from esp_envs.drawing import BACKGROUND, FRAME, GRID
 from esp_envs.epuck.robot import AXLE_M, BODY_HEIGHT_M, BODY_RADIUS_M, WHEEL_RADIUS_M
+from esp_envs.errors import UserError
 from esp_envs.scene import GRID_SPACING, Body, Scene
 
 WALL_HEIGHT_M = 0.03
@@ -40,11 +41,11 @@ def model_of(scene: Scene, width: int, height: int, field_of_view: float) -> muj
         field_of_view: of the camera from bottom to top, rad.
 
     Raises:
-        ValueError: the window is empty, or a body has an unknown model or none.
+        UserError: the window is empty, or a body has an unknown model or none.
     """
     x_min, x_max, y_min, y_max = scene.window
     if x_max <= x_min or y_max <= y_min:
-        raise ValueError(f"cannot draw the window {scene.window}; use a real window")
+        raise UserError(f"cannot draw the window {scene.window}; use a real window")
     spec = mujoco.MjSpec()
     view = spec.visual
     view.global_.offwidth, view.global_.offheight = width, height
@@ -64,7 +65,7 @@ def model_of(scene: Scene, width: int, height: int, field_of_view: float) -> muj
     _add_arena(spec.worldbody, scene.window)
     for body in scene.bodies:
         if body.model not in _BUILDERS:
-            raise ValueError(f"no body of the model {body.model!r} is known in space; use {', '.join(_BUILDERS)}")
+            raise UserError(f"no body of the model {body.model!r} is known in space; use {', '.join(_BUILDERS)}")
         _BUILDERS[body.model](spec.worldbody.add_body(mocap=True), body)
     return spec.compile()
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.robot import Array
+from esp_envs.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -77,11 +78,11 @@ def num_substeps(control_period_s: float, timestep_s: float) -> int:
     """Return how many time steps make up a control period.
 
     Raises:
-        ValueError: the period is not a multiple of the time step.
+        UserError: the period is not a multiple of the time step.
     """
     count = round(control_period_s / timestep_s)
     if count < 1 or not np.isclose(count * timestep_s, control_period_s, rtol=1e-9):
-        raise ValueError(
+        raise UserError(
             f"a control period of {control_period_s:g} s is not a multiple of {timestep_s:g} s; choose a multiple"
         )
     return count

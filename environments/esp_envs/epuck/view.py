@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from esp_envs.drawing import TRAIL_WIDTH, fade, trails
 from esp_envs.epuck import gl
 from esp_envs.epuck.looks import GLOW, TRAIL_LAYER_M, WALL_HEIGHT_M, WALL_WIDTH_M, model_of
+from esp_envs.errors import UserError
 from esp_envs.scene import Scene
 
 _ASPECT = 3 / 4
@@ -98,11 +99,11 @@ def space_painter(size: int) -> Iterator[SpacePainter]:
         size: width of a picture, pixels; the height is three quarters of it.
 
     Raises:
-        ValueError: the size is below 16 pixels.
+        UserError: the size is below 16 pixels.
         NoGraphicsError: no library on this machine can draw.
     """
     if size < 16:
-        raise ValueError(f"cannot draw on {size} pixels; use 16 or more")
+        raise UserError(f"cannot draw on {size} pixels; use 16 or more")
     height = round(size * _ASPECT)
     with gl.context(size, height) as context:
         painter = SpacePainter(size, height, context)
@@ -140,7 +141,7 @@ class SpacePainter:
             [H, W, 3] uint8, red, green and blue; the first row is the top.
 
         Raises:
-            ValueError: the window is empty, or a body has an unknown model or none.
+            UserError: the window is empty, or a body has an unknown model or none.
         """
         self._make_current()
         looks = scene.window, [(body.model, body.radius, body.color) for body in scene.bodies]

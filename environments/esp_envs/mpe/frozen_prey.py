@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from esp_envs.errors import UserError
 from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION, digest
 
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
@@ -25,7 +26,7 @@ class FrozenPrey:
     """Greedy moves of a learned prey.
 
     Raises:
-        ValueError: the file is missing, damaged, of something else, or does not fit the task.
+        UserError: the file is missing, damaged, of something else, or does not fit the task.
     """
 
     def __init__(self, path: str, seed: int, num_inputs: int, num_actions: int, device: torch.device) -> None:
@@ -34,7 +35,7 @@ class FrozenPrey:
         self.layers = [(w.to(device), b.to(device)) for w, b in _layers(tensors, seed, path)]
         widths = [self.layers[0][0].shape[0], self.layers[-1][0].shape[1]]
         if widths != [num_inputs, num_actions]:
-            raise ValueError(
+            raise UserError(
                 f"the prey policy {path} maps {widths[0]} observations to {widths[1]} actions, this task's prey has "
                 f"{num_inputs} and {num_actions}; train a prey with the same predators, obstacles and discrete actions"
             )
@@ -59,27 +60,27 @@ class FrozenPrey:
 def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
     """Return the JSON header and the actor's tensors of a policy file."""
     if not Path(path).is_file():
-        raise ValueError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
+        raise UserError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
     if Path(path).stat().st_size > _MOST_BYTES:
-        raise ValueError(f"{path} has more than {_MOST_BYTES >> 20} MiB, so it is no prey policy; export a prey")
+        raise UserError(f"{path} has more than {_MOST_BYTES >> 20} MiB, so it is no prey policy; export a prey")
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no iterator
         header = json.loads(metadata.get(METADATA_KEY, "null"))
     except (SafetensorError, OSError, ValueError, RecursionError, RuntimeError) as error:
-        raise ValueError(
+        raise UserError(
             f"the prey policy {path} is not an intact safetensors file ({_short(error)}); export it again"
         ) from error
     if not isinstance(header, dict):
-        raise ValueError(f"the file {path} has no 'esp' entry, so it is not a policy of this project; export a prey")
+        raise UserError(f"the file {path} has no 'esp' entry, so it is not a policy of this project; export a prey")
     description = {key: value for key, value in header.items() if key != "sha256"}
     try:
         intact = header.get("sha256") == digest(tensors, description)
     except (ValueError, TypeError, RecursionError):  # what no digest was ever made of
         intact = False
     if not intact:
-        raise ValueError(f"the prey policy {path} does not match its checksum; export it again")
+        raise UserError(f"the prey policy {path} does not match its checksum; export it again")
     return header, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
 
 
@@ -89,38 +90,38 @@ def _checked(header: dict[str, object], path: str) -> str:
     for key, value in wanted.items():
         if header.get(key) != value:
             found = _short(repr(header.get(key)))
-            raise ValueError(f"the prey policy {path} has {key} {found}, but a prey needs {value!r}")
+            raise UserError(f"the prey policy {path} has {key} {found}, but a prey needs {value!r}")
     activation = header.get("activation")
     if not isinstance(activation, str) or activation not in _ACTIVATIONS:
         found = _short(repr(activation))
-        raise ValueError(f"the prey policy {path} has activation {found}; known are {', '.join(_ACTIVATIONS)}")
+        raise UserError(f"the prey policy {path} has activation {found}; known are {', '.join(_ACTIVATIONS)}")
     return activation
 
 
 def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tensor, Tensor]]:
     """Return (weight [in, out], bias [1, out]) of one seed, layer by layer, after checking that they chain."""
     if other := sorted(name for name in tensors if not name.startswith("actor.layers.")):
-        raise ValueError(
+        raise UserError(
             f"the prey policy {path} has '{_short(other[0])}', but a prey needs a plain mlp; train one without "
             "network.layer_norm, network.symmetrise and network.separate_parts"
         )
     names = [(f"actor.layers.{k}.weight", f"actor.layers.{k}.bias") for k in range(len(tensors) // 2)]
     if not names or {name for pair in names for name in pair} != set(tensors):
-        raise ValueError(f"the prey policy {path} lacks a weight or bias of its actor's layers; export it again")
+        raise UserError(f"the prey policy {path} lacks a weight or bias of its actor's layers; export it again")
     layers: list[tuple[Tensor, Tensor]] = []
     for weight_name, bias_name in names:
         weight, bias = tensors[weight_name], tensors[bias_name]
         fits = weight.ndim == 3 and bias.shape == (weight.shape[0], 1, weight.shape[2])
         if not fits or (layers and layers[-1][0].shape[1] != weight.shape[1]):
-            raise ValueError(
+            raise UserError(
                 f"the prey policy {path} has layers that do not fit together ({weight_name} {tuple(weight.shape)}, "
                 f"{bias_name} {tuple(bias.shape)}); export it again"
             )
         if not 0 <= seed < len(weight):
-            raise ValueError(f"the prey policy {path} holds {len(weight)} seeds; there is no prey_policy_seed {seed}")
+            raise UserError(f"the prey policy {path} holds {len(weight)} seeds; there is no prey_policy_seed {seed}")
         layers.append((weight[seed].float(), bias[seed].float()))
     if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
-        raise ValueError(f"the prey policy {path} holds numbers that are not finite; export it again")
+        raise UserError(f"the prey policy {path} holds numbers that are not finite; export it again")
     return layers
 
 

@@ -9,6 +9,7 @@ from pydantic import Field as Setting
 from pydantic import field_validator, model_validator
 
 from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.errors import UserError
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
@@ -54,11 +55,11 @@ class PredatorPreySettings(ParticleSettings):
     @model_validator(mode="after")
     def _policy_goes_with_its_file(self) -> PredatorPreySettings:
         if self.control == "prey" and (self.prey != "random" or self.learned_prey):
-            raise ValueError("with control 'prey' the prey is the learner; leave prey and learned_prey out")
+            raise UserError("with control 'prey' the prey is the learner; leave prey and learned_prey out")
         if self.prey == "policy" and self.learned_prey:
-            raise ValueError("prey 'policy' follows its file at every step; leave learned_prey out")
+            raise UserError("prey 'policy' follows its file at every step; leave learned_prey out")
         if (self.prey == "policy" or self.learned_prey > 0) != (self.prey_policy is not None):
-            raise ValueError(
+            raise UserError(
                 "the file prey_policy and prey 'policy', or a learned_prey above 0, go together; give both or neither"
             )
         return self

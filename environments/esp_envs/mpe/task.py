@@ -16,6 +16,7 @@ from torch import Tensor
 
 from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
 from esp_envs.breaking import Breaking
+from esp_envs.errors import UserError
 from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
@@ -173,11 +174,11 @@ class ParticleTask(LockstepTask):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size.
+            UserError: the tensors belong to an environment of another size.
         """
         physics, states = tensors["physics"], tensors["generators"]
         if physics.shape != self.worlds.rows().shape or len(states) != self.num_seeds:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         self.worlds.rows().copy_(physics)
         self._time = int(tensors["time"])
         if self.settings.gust_std:

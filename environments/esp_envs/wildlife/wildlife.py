@@ -17,6 +17,7 @@ from esp_envs.base import (
     require_shape,
     restore_generators,
 )
+from esp_envs.errors import UserError
 from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, others_of
 from esp_envs.wildlife.pictures import all_pictures, cell_index
@@ -106,7 +107,7 @@ class Wildlife(Environment):
         """Advance every world by one step.
 
         Raises:
-            ValueError: the action has another shape than [S, E, N].
+            UserError: the action has another shape than [S, E, N].
         """
         settings, agents = self.settings, self.settings.num_agents
         require_shape("joint action", action, self.action_shape)
@@ -167,10 +168,10 @@ class Wildlife(Environment):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: the tensors belong to an environment of another size.
+            UserError: the tensors belong to an environment of another size.
         """
         if tensors["plan"].shape != self.plan.shape or len(tensors["generators"]) != self.num_seeds:
-            raise ValueError(OTHER_SIZE)
+            raise UserError(OTHER_SIZE)
         self._cells = tensors["cells"].to(self.device).long()
         self._time = tensors["time"].to(self.device).clone()
         self._clock = int(tensors["clock"])

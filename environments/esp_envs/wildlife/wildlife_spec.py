@@ -9,6 +9,7 @@ from pydantic import model_validator
 
 from esp_envs.base import TaskSettings
 from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.errors import UserError
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
 from esp_envs.wildlife.pictures import PIXELS
 
@@ -44,12 +45,12 @@ class WildlifeSettings(TaskSettings):
     @model_validator(mode="after")
     def _fits(self) -> WildlifeSettings:
         if self.width % 2 == 0 or self.height % 2 == 0:
-            raise ValueError(
+            raise UserError(
                 f"a grid of {self.width} x {self.height} cells has no cell in its middle; use odd numbers, so that a "
                 "drone can be in the middle of its picture"
             )
         if self.num_agents >= self.width * self.height:
-            raise ValueError(f"{self.num_agents} drones and a poacher do not fit on {self.width * self.height} cells")
+            raise UserError(f"{self.num_agents} drones and a poacher do not fit on {self.width * self.height} cells")
         return self
 
 

@@ -1,1 +1,0 @@
-"""How good a policy is: the final evaluation beside reference policies, and statistics over seeds."""

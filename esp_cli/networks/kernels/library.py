@@ -1,0 +1,101 @@
+"""Kernels, compiled for the processor at hand and loaded."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from esp_envs.errors import UserError
+
+if TYPE_CHECKING:  # a kernel may be begun before torch is imported
+    from torch import Tensor
+
+_OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
+
+PADDING = 16
+"""PAD of vectors.h."""
+
+
+def padded(width: int) -> int:
+    """Return a width filled up to a multiple of PADDING."""
+    return -(-width // PADDING) * PADDING
+
+
+def fields(kind: type, *names: str) -> list[tuple[str, type]]:
+    """Return fields of a structure that are all of one kind."""
+    return [(name, kind) for name in names]
+
+
+def computes(compiled: bool, x: Tensor) -> bool:
+    """Return whether kernels compute what begins with x, where they are chosen: on the CPU."""
+    return compiled and x.device.type == "cpu"
+
+
+@cache
+def library(name: str) -> ctypes.CDLL:
+    """Load a kernel, which takes up to a second to compile where nothing began it before.
+
+    Raises:
+        UserError: there is no C++ compiler, it fails, or what it made cannot be loaded.
+    """
+    try:
+        with begin(name).result() as folder:
+            return ctypes.CDLL(str(Path(folder) / name))  # after torch, whose OpenMP it takes
+    except (ValueError, OSError) as error:
+        begin.cache_clear()  # so that it may be tried again
+        if isinstance(error, ValueError):
+            raise
+        raise UserError(
+            f"the kernels of network.compiled cannot be loaded ({error}); set TMPDIR to a folder that programs "
+            "may run from, or leave it off"
+        ) from None
+
+
+@cache
+def begin(name: str) -> Future[tempfile.TemporaryDirectory[str]]:
+    """Begin to compile a kernel, beside whatever else there is to do, in a temporary folder."""
+    workers = ThreadPoolExecutor(1)
+    compiling = workers.submit(_compile, name)
+    workers.shutdown(wait=False)
+    return compiling
+
+
+def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
+    try:
+        named = shlex.split(os.environ.get("CXX", ""))
+    except ValueError as error:
+        raise UserError(f"the environment variable CXX is no command ({error}); name a C++ compiler in it") from None
+    compiler = named or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
+    if shutil.which(compiler[0]) is None:
+        raise UserError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
+    folder = tempfile.TemporaryDirectory()
+    built, log = Path(folder.name) / name, Path(folder.name) / "log"
+    command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(built)]
+    with log.open("wb") as said:  # not a pipe, which a process forked meanwhile would hold open
+        failed = subprocess.run(command, check=False, stderr=said).returncode
+    if failed:
+        lines = log.read_text(errors="replace").strip().splitlines() or ["it says nothing"]
+        line = next((line for line in lines if "error" in line), lines[-1])
+        raise UserError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
+    return folder
+
+
+os.register_at_fork(after_in_child=begin.cache_clear)  # a forked process has no thread that would end what was begun
+
+
+def call(kernel: str, function: str, *arguments: ctypes.Structure | ctypes.Array[Any] | Tensor | None) -> None:
+    """Call a function of a kernel with addresses: of structures, of tensors' first numbers, or of nothing."""
+    structures = (ctypes.Structure, ctypes.Array)
+    addresses = [
+        ctypes.byref(x) if isinstance(x, structures) else ctypes.c_void_p(None if x is None else x.data_ptr())
+        for x in arguments
+    ]
+    getattr(library(kernel), function)(*addresses)

@@ -1,0 +1,1 @@
+"""Trained policies: load them, play them, and say how good they are."""

@@ -1,0 +1,120 @@
+"""Adding a trained policy to the bundled ones: the best seed of a run, evaluated on worlds that did not select it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import torch
+
+from esp_cli.defaults import __version__
+from esp_cli.policies.evaluation import play_batches
+from esp_cli.policies.loading import TrainedPolicy, single_seed
+from esp_cli.policies.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
+from esp_cli.policies.spread import spread_over_episodes
+from esp_cli.training.folder_names import CONFIG
+from esp_cli.training.locking import taking_turns
+from esp_cli.training.play import Episodes, PolicyController
+from esp_cli.training.policy_file import describe_policy, write_policy
+from esp_envs.errors import UserError
+
+
+def best_seed(trained: TrainedPolicy, episodes: int) -> int:
+    """Return the seed with the largest mean greedy return over episodes that no evaluation uses."""
+    if len(trained.config.seeds) == 1:
+        return trained.config.seeds[0]
+    returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns.mean(1)
+    if len(trained.stopped) < len(returns):
+        returns[list(trained.stopped)] = -torch.inf
+    return trained.config.seeds[int(returns.argmax())]
+
+
+def score_of(episodes: Episodes) -> Score:
+    """Return mean, standard error and 95 % interval over the episodes of one seed."""
+    returns = episodes.returns[0].double().numpy()
+    spread = spread_over_episodes(returns)
+    if spread.sem is None or spread.ci95 is None:
+        raise UserError("these episodes all brought the same return, or there is only one; a score needs more of them")
+    return Score(mean=float(returns.mean()), sem=spread.sem, ci95=spread.ci95, episodes=returns.size)
+
+
+def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:
+    """Play the episodes of one seed's policy that `esp eval` plays too."""
+    return play_batches(alone, PolicyController(alone.policy), "greedy", episodes)
+
+
+def bundle(
+    trained: TrainedPolicy,
+    folder: Path,
+    episodes: int,
+    seed: int | None = None,
+    name: str | None = None,
+    force: bool = False,
+) -> Entry:
+    """Write one seed's policy and list it in the manifest.
+
+    Args:
+        trained: a run.
+        folder: of the manifest; made where it is missing.
+        episodes: to choose the seed by, and as many others to score it by.
+        seed: which one; by default the best.
+        name: of the policy; by default from task, algorithm and prior.
+        force: replace a policy of the same name.
+
+    Returns:
+        Its line in the manifest.
+
+    Raises:
+        UserError: an unknown seed, an invalid name or one that is taken, the folder of a run, a damaged manifest, or a
+            file that cannot be written.
+    """
+    config = trained.config
+    name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
+    if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
+        raise UserError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
+    _others(folder, name, force)  # before the episodes are played; they take minutes
+    alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
+    played = play_greedily(alone, episodes)
+    score = score_of(played)
+    folder.mkdir(parents=True, exist_ok=True)
+    with taking_turns(folder):
+        others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
+        file = folder / f"{name}.safetensors"
+        description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
+        write_policy(file, alone.policy.state_dict(), description)
+        entry = Entry(
+            name=name,
+            file=file.name,
+            sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+            task=config.task,
+            task_version=alone.spec.version,
+            convention=alone.spec.convention,
+            algorithm=config.algorithm,
+            prior=config.prior.kind,
+            seed=alone.config.seeds[0],
+            chosen_from=len(config.seeds),
+            step=alone.step,
+            score=score,
+            metrics={key: float(value.mean()) for key, value in played.metrics.items()},
+            command=config.command(),
+            esp_version=__version__,
+            config=config.model_dump(mode="json"),
+        )
+        write_bundled(folder, (*others, entry))
+    return entry
+
+
+def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:
+    """Return what a folder lists besides a policy that is to be written into it.
+
+    Raises:
+        UserError: it is the folder of a run, has a policy or another file of that name, or its manifest is damaged.
+    """
+    if os.path.lexists(folder / CONFIG):
+        raise UserError(f"{folder} is the folder of a run, whose own policies have such names; choose another --out")
+    there = read_bundled(folder)
+    if not force and (any(entry.name == name for entry in there) or os.path.lexists(folder / f"{name}.safetensors")):
+        raise UserError(f"{folder} has {name} already; choose another --name, or replace it with --force")
+    return tuple(entry for entry in there if entry.name != name)

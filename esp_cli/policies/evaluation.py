@@ -1,0 +1,151 @@
+"""The final evaluation of a trained policy: greedy and stochastic returns, beside reference policies of the task."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict
+from torch import Tensor
+
+from esp_cli.defaults import Mode, __version__
+from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.policies.spread import EpisodeSpread, spread_over_episodes
+from esp_cli.policies.statistics import SeedSummary, summarise
+from esp_cli.training.build import build_environment
+from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
+from esp_cli.training.streams import generators
+from esp_envs.errors import UserError
+
+MAX_WORLDS = 4096
+"""Worlds played at once, over all seeds; more episodes are played one batch after the other."""
+_STREAM = "judgement"
+"""Names the worlds. The word decides the numbers of every final evaluation, so it stays as it is."""
+Metrics = dict[str, float | None]
+
+
+class FinalEvaluation(BaseModel):
+    """What a trained policy reaches on episodes of their own; files of older versions have fewer fields.
+
+    Attributes:
+        esp_version: of the program that played.
+        task: its name.
+        task_version: of its rules.
+        convention: of its returns.
+        task_settings: under which it was played.
+        source: where the policy was found.
+        step: environment steps per seed behind the policy.
+        seeds: of the run.
+        episodes: per seed, of each policy.
+        greedy: returns of the policy.
+        stochastic: returns of the policy with drawn actions.
+        anchors: mean return of the reference policies: "random", "heuristic", and other heuristics by name.
+        heuristics: names of the task's heuristics; the first is the one called "heuristic".
+        metrics: the task's measures of the greedy policy.
+        metrics_per_seed: the same by seed.
+        anchor_metrics: the same of each reference policy.
+        over_episodes: error of the mean over episodes, of each reference policy, and of "greedy" and "stochastic" where
+            the run has one seed.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    esp_version: str | None = None
+    task: str
+    task_version: int
+    convention: str
+    task_settings: dict[str, Any] = {}
+    source: str = ""
+    step: int
+    seeds: tuple[int, ...]
+    episodes: int
+    greedy: SeedSummary
+    stochastic: SeedSummary
+    anchors: dict[str, float]
+    heuristics: tuple[str, ...] = ()
+    metrics: Metrics
+    metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
+    anchor_metrics: dict[str, Metrics] = {}
+    over_episodes: dict[str, EpisodeSpread] = {}
+
+    def returns(self, mode: Mode) -> SeedSummary:
+        """Return the returns of the policy that acts in this way."""
+        return self.greedy if mode == "greedy" else self.stochastic
+
+
+def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
+    """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy.
+
+    A seed that stopped in training has an early policy. Its numbers are NaN, as in the metrics of its run.
+
+    Raises:
+        UserError: there is less than one episode.
+    """
+    if episodes < 1:
+        raise UserError(f"episodes is {episodes}; play at least one")
+    seeds = trained.config.seeds
+    greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
+    drawn = PolicyController(trained.policy, generators(seeds, _STREAM, "noise"))
+    stochastic = play_batches(trained, drawn, "stochastic", episodes)
+    for played in (greedy, stochastic):
+        for numbers in (played.returns, *played.metrics.values()):
+            numbers[list(trained.stopped)] = float("nan")
+    names = build_environment(trained.config, 1, _STREAM, "shape").heuristics
+    anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
+    for index, name in enumerate(names):
+        key = "heuristic" if index == 0 else name
+        anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
+    spread = dict(anchors)
+    if len(seeds) == 1 and not trained.stopped:
+        spread |= {"greedy": greedy, "stochastic": stochastic}
+    return FinalEvaluation(
+        esp_version=__version__,
+        task=trained.config.task,
+        task_version=trained.spec.version,
+        convention=trained.spec.convention,
+        task_settings=trained.config.task_settings,
+        source=str(trained.source),
+        step=trained.step,
+        seeds=seeds,
+        episodes=episodes,
+        greedy=summarise_returns(greedy.returns),
+        stochastic=summarise_returns(stochastic.returns),
+        anchors={name: float(played.returns.mean()) for name, played in anchors.items()},
+        heuristics=names,
+        metrics=_means(greedy),
+        metrics_per_seed={name: summarise_returns(value).per_seed for name, value in greedy.metrics.items()},
+        anchor_metrics={name: _means(played) for name, played in anchors.items()},
+        over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
+    )
+
+
+def summarise_returns(returns: Tensor) -> SeedSummary:
+    """Summarise returns [S, episodes] by the mean of each seed."""
+    return summarise(returns.mean(1).double().cpu().numpy())
+
+
+def _means(episodes: Episodes) -> Metrics:
+    """Return the mean of each metric over the episodes that count."""
+    known = {name: value[value.isfinite()] for name, value in episodes.metrics.items()}
+    return {name: float(value.mean()) for name, value in known.items() if value.numel()}
+
+
+def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
+    """Play episodes in batches whose worlds depend on the seeds, the stream and the batch alone.
+
+    Args:
+        trained: the policy, and so the task.
+        controller: who acts.
+        stream: names the worlds.
+        episodes: per seed.
+    """
+    parts = []
+    batch = max(1, min(episodes, MAX_WORLDS // len(trained.config.seeds)))
+    for begin in range(0, episodes, batch):
+        env = build_environment(trained.config, min(batch, episodes - begin), _STREAM, stream, begin)
+        parts.append(play(env, controller))
+    return Episodes(
+        torch.cat([p.returns for p in parts], 1),
+        torch.cat([p.lengths for p in parts], 1),
+        {name: torch.cat([p.metrics[name] for p in parts], 1) for name in parts[0].metrics},
+    )

@@ -1,0 +1,181 @@
+"""Loading a trained policy from a run folder or a policy file; loading never runs code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shlex import quote
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from esp_cli.algorithms.learner import below
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.defaults import __version__
+from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.policy import Policy
+from esp_cli.training.build import spec_of
+from esp_cli.training.config import RunConfig, resolve_task_settings
+from esp_cli.training.config_file import parse_config
+from esp_cli.training.policy_file import read_policy
+from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.streams import generators
+from esp_envs.errors import UserError
+from esp_envs.spec import TaskSpec
+
+
+@dataclass(frozen=True)
+class TrainedPolicy:
+    """A policy and what it was trained for.
+
+    Attributes:
+        config: of the run; its device is the CPU where there is no GPU.
+        policy: S policies, in evaluation mode.
+        spec: of the task it was trained on.
+        step: environment steps per seed behind it.
+        source: the run folder or file.
+        notes: sentences for the user (a damaged checkpoint was passed over).
+        stopped: places of the seeds that stopped on a number that is not finite; their policies are early ones.
+    """
+
+    config: RunConfig
+    policy: Policy
+    spec: TaskSpec
+    step: int
+    source: Path
+    notes: tuple[str, ...] = ()
+    stopped: tuple[int, ...] = ()
+
+
+def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
+    """Load the policy of a run folder (its newest checkpoint, else its policy file) or of a policy file.
+
+    Args:
+        path: of the folder or file.
+        sha256: that a manifest states of the file.
+
+    Raises:
+        UserError: nothing there, not one of ours, damaged, or of another version of the task.
+    """
+    if sha256 is not None or path.is_file():
+        tensors, meta = read_policy(path, sha256)
+        writer = meta.get("esp_version", __version__)
+        return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
+    folder = RunFolder.open(path)
+    notes: list[str] = []
+    found = folder.latest_checkpoint(notes.append)
+    if found is None and folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
+        return _build(path, parse_config(folder.config, path), *read_policy(folder.policy_path))
+    if found is None:
+        raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
+    tensors, meta = found
+    return _build(path, parse_config(folder.config, path), below(tensors, "policy"), meta, tuple(notes))
+
+
+def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:
+    """Return the policy for its task under other settings: another physics, more noise, another reward.
+
+    Args:
+        trained: the policy as it was trained.
+        settings: task settings that differ from those of its training.
+
+    Raises:
+        UserError: an unknown setting, or one under which the policy does not see or do the same things.
+    """
+    if not settings:
+        return trained
+    changed = resolve_task_settings(trained.config.task, {**trained.config.task_settings, **settings})
+    config = trained.config.model_copy(update={"task_settings": changed})
+    spec = spec_of(config)
+    for part in ("num_agents", "observation", "action", "masks"):
+        if getattr(spec, part) != getattr(trained.spec, part):
+            names = ", ".join(f"task.{name}" for name in settings)
+            raise UserError(
+                f"{trained.source} was trained with other {part.replace('num_', '')} than the task has with {names} "
+                "changed; change only what a policy neither sees nor does"
+            )
+    return replace(trained, config=config, spec=spec)
+
+
+def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
+    """Return one seed's policy, on the CPU and with products in float32, for export.
+
+    Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
+
+    Raises:
+        UserError: the run does not have this seed.
+    """
+    seeds = trained.config.seeds
+    if seed not in seeds:
+        raise UserError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
+    network = _at_default(trained.config.network, "precision", "compiled")
+    config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
+    policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
+    index = seeds.index(seed)
+    policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in trained.policy.state_dict().items()})
+    return replace(trained, config=config, policy=policy, stopped=(0,) if index in trained.stopped else ())
+
+
+def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
+    """Return a network's settings with some of them, where it has them, as they are by default."""
+    fields = type(network).model_fields
+    return network.model_copy(update={name: fields[name].default for name in names if name in fields})
+
+
+def _build(
+    path: Path, config: RunConfig, tensors: dict[str, Tensor], meta: Mapping[str, Any], notes: tuple[str, ...] = ()
+) -> TrainedPolicy:
+    if config.device == "cuda" and not torch.cuda.is_available():
+        config = config.model_copy(update={"device": "cpu"})
+    step = meta.get("step")
+    if type(step) is not int or step < 0:
+        raise UserError(f"{path} is damaged: it does not say after how many steps it was written")
+    misfit = f"{path}: the weights do not fit the configuration beside them"
+    # Checked before worlds are made for every seed: a damaged configuration may ask for more than the memory holds.
+    if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
+        raise UserError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
+    spec = spec_of(config)
+    version = meta.get("task_version", spec.version)
+    if version != spec.version:
+        raise UserError(
+            f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
+            "which observations, actions or rewards differ; use the esp that it was trained with, or train again"
+        )
+    # Checked before networks are made, for the same reason.
+    needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
+    if needed > sum(tensor.numel() for tensor in tensors.values()):
+        raise UserError(f"{misfit} (hidden widths {config.network.hidden})")
+    build = ALGORITHMS[config.algorithm].build_policy
+    network = _at_default(config.network, "compiled")  # whoever uses a policy needs no compiler
+    policy = build(spec, network, generators(config.seeds, "shape")).to(config.device).eval()
+    _fill(policy, tensors, path, misfit)
+    stopped = _stopped(meta, len(config.seeds))
+    if stopped:
+        seeds = ", ".join(str(config.seeds[k]) for k in stopped)
+        notes = (*notes, f"{path}: training of seed {seeds} stopped early on a number that is not finite")
+    return TrainedPolicy(config, policy, spec, step, path, notes, stopped)
+
+
+def _stopped(meta: Mapping[str, Any], seeds: int) -> tuple[int, ...]:
+    """Return the places of stopped seeds: a checkpoint names them, a policy file has no return of theirs."""
+    named, returns = meta.get("stopped_seeds"), meta.get("greedy_returns")
+    if isinstance(named, Mapping):
+        return tuple(k for k in range(seeds) if str(k) in named)
+    return tuple(k for k, value in enumerate(returns[:seeds]) if value is None) if isinstance(returns, list) else ()
+
+
+def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -> None:
+    """Put weights into a policy that was built for them."""
+    for name, own in policy.state_dict().items():
+        # torch would convert them silently
+        if name in tensors and tensors[name].dtype != own.dtype:
+            raise UserError(f"{misfit} ({name} is {tensors[name].dtype}, where {own.dtype} is needed)")
+    try:
+        policy.load_state_dict(tensors)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise UserError(f"{misfit} ({reason})") from None
+    if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
+        raise UserError(f"{path} holds weights that are not finite; use another copy of it, or train again")

@@ -1,0 +1,281 @@
+"""Statistics over seeds: means with intervals, comparisons of two groups of seeds.
+
+A sample is one number per seed, never one per episode: episodes of one seed share its policy and say nothing about how
+another seed would turn out. Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so
+that the same numbers give the same interval; with few seeds they are a little too narrow (of ten seeds drawn from a
+normal distribution, 90 % of the intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or
+resamples that all agree.
+
+Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
+(interquartile mean, stratified bootstrap, probability of improvement).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy  # its part "stats" takes a second to import, and does so where it is first used
+from numpy.typing import ArrayLike, NDArray
+
+from esp_envs.errors import UserError
+
+CONFIDENCE = 0.95
+RESAMPLES = 10_000
+_GENERATOR_SEED = 0
+
+Floats = NDArray[np.float64]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number and how far it can be trusted.
+
+    Attributes:
+        value: the number on the seeds at hand.
+        ci95: its 95 % bootstrap interval over seeds, or None where the bootstrap cannot tell.
+    """
+
+    value: float
+    ci95: Interval | None
+
+
+@dataclass(frozen=True)
+class SeedSummary:
+    """One number per seed, and what they say together; the numbers of seeds that stopped are left out.
+
+    Attributes:
+        mean: over seeds; None where every seed stopped.
+        sem: standard error of the mean; None for one seed.
+        ci95: 95 % bootstrap interval of the mean, or None where the bootstrap cannot tell.
+        per_seed: the numbers [S]; None where a seed stopped.
+    """
+
+    mean: float | None
+    sem: float | None
+    ci95: Interval | None
+    per_seed: tuple[float | None, ...]
+
+
+def summarise(values: ArrayLike) -> SeedSummary:
+    """Summarise one number per seed [S], NaN where a seed stopped."""
+    numbers = np.asarray(values, dtype=np.float64)
+    good = numbers[np.isfinite(numbers)]
+    per_seed = tuple(float(x) if np.isfinite(x) else None for x in numbers)
+    mean, sem = mean_and_sem(good) if good.size else (None, None)
+    return SeedSummary(mean, sem, bootstrap_interval(good) if good.size else None, per_seed)
+
+
+def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
+    """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        UserError: no value, or one that is not finite.
+    """
+    sample = _sample(values)
+    return float(sample.mean()), float(scipy.stats.sem(sample)) if sample.size > 1 else None
+
+
+def bootstrap_interval(values: ArrayLike) -> Interval | None:
+    """Return the 95 % bootstrap interval of the mean over seeds, or None where the bootstrap cannot tell.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        UserError: no value, or one that is not finite.
+    """
+    return _interval((_sample(values),), np.mean)
+
+
+def interquartile_mean(values: ArrayLike) -> Estimate:
+    """Return the mean of the middle half: a quarter of the seeds, rounded down, is left out at either end.
+
+    Args:
+        values: one finite number per seed [S].
+
+    Raises:
+        UserError: no value, or one that is not finite.
+    """
+    sample = _sample(values)
+    return Estimate(float(_iqm(sample)), _interval((sample,), _iqm))
+
+
+def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"] = "iqm") -> Estimate:
+    """Return one number over several tasks, with a bootstrap that is stratified: seeds are redrawn within each task.
+
+    Args:
+        scores: by task, one finite number per seed [S]; normalise() makes tasks comparable.
+        statistic: of all seeds of all tasks together.
+
+    Raises:
+        UserError: no task, no value, or one that is not finite.
+    """
+    if not scores:
+        raise UserError("there is no task to aggregate over")
+    samples = tuple(_sample(values, f"of {task}") for task, values in scores.items())
+    inner = _iqm if statistic == "iqm" else np.mean
+
+    def pooled(*drawn: Floats, axis: int = -1) -> Any:
+        return inner(np.concatenate(drawn, axis=axis), axis=axis)
+
+    return Estimate(float(pooled(*samples)), _interval(samples, pooled))
+
+
+def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
+    """Return mean(x) - mean(y) with its interval.
+
+    Args:
+        x: one finite number per seed [S].
+        y: likewise [S'], of the group that x is compared with.
+        paired: seed k of x and seed k of y belong together (S = S'), as where they share their worlds.
+
+    Raises:
+        UserError: no value, one that is not finite, or paired groups that differ in size.
+    """
+    first, second = _pair(x, y, paired)
+    value = float(first.mean() - second.mean())
+    if paired:
+        return Estimate(value, _interval((first - second,), np.mean))
+    return Estimate(value, _interval((first, second), lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis)))
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
+    """Return the probability that a seed of x beats a seed of y, P(X > Y) + P(X = Y) / 2.
+
+    Unpaired, all S * S' pairs count: the Mann-Whitney U of x over S * S'. Paired, seed k meets seed k only.
+
+    Args:
+        x: one finite number per seed [S]; higher is better.
+        y: likewise [S'].
+        paired: as in difference().
+
+    Raises:
+        UserError: no value, one that is not finite, or paired groups that differ in size.
+    """
+    first, second = _pair(x, y, paired)
+    if paired:
+        wins = _wins(first, second)
+        return Estimate(float(wins.mean()), _interval((wins,), np.mean))
+    u = scipy.stats.mannwhitneyu(first, second).statistic
+    return Estimate(float(u) / (first.size * second.size), _interval((first, second), _share_of_wins))
+
+
+def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Estimate:
+    """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap.
+
+    Args:
+        pairs: by task, one finite number per seed [S] of each of the two; the same S everywhere, so that tasks count
+            alike.
+
+    Raises:
+        UserError: no task, no value, one that is not finite, or groups that differ in size.
+    """
+    wins = {task: _wins(*_pair(x, y, True)) for task, (x, y) in pairs.items()}
+    if len({group.size for group in wins.values()}) > 1:
+        raise UserError("the tasks have to have the same number of seeds, so that they count alike")
+    return aggregate(wins, "mean")
+
+
+def leader(
+    ours: tuple[float, float | None, int], others: tuple[float, float | None, int]
+) -> Literal["first", "second", "neither"] | None:
+    """Return which of two published means is higher, by Welch's t-test at 5 %; None where an error is missing.
+
+    Args:
+        ours: mean, standard error of the mean, and number of seeds.
+        others: likewise.
+    """
+    (mean, sem, count), (other_mean, other_sem, other_count) = ours, others
+    if sem is None or other_sem is None or min(count, other_count) < 2:
+        return None
+    deviation, other_deviation = sem * np.sqrt(count), other_sem * np.sqrt(other_count)
+    if deviation == other_deviation == 0:
+        return None
+    test = scipy.stats.ttest_ind_from_stats(
+        mean, deviation, count, other_mean, other_deviation, other_count, equal_var=False
+    )
+    if test.pvalue >= 1 - CONFIDENCE:
+        return "neither"
+    return "first" if mean > other_mean else "second"
+
+
+def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
+    """Return (value - random) / (heuristic - random): 0 is the random policy, 1 the heuristic one.
+
+    Args:
+        values: returns of any shape.
+        random: return of the random policy under the same convention.
+        heuristic: return of the heuristic policy.
+
+    Raises:
+        UserError: the heuristic policy is not better than the random one, or an anchor is not finite.
+    """
+    if not np.isfinite([random, heuristic]).all() or random >= heuristic:
+        raise UserError(
+            f"the anchors random = {random} and heuristic = {heuristic} give no scale; the heuristic has to be better"
+        )
+    return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
+
+
+def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Interval | None:
+    """Return the percentile bootstrap interval of a statistic of independent samples, or None where it cannot tell."""
+    if any(sample.size < 2 for sample in samples):
+        return None
+    interval = bootstrap(samples, statistic)
+    low, high = float(interval.low), float(interval.high)
+    return (low, high) if low < high else None
+
+
+def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamples: int = RESAMPLES) -> Any:
+    """Return scipy's percentile interval of a statistic of independent samples, with this module's generator."""
+    return scipy.stats.bootstrap(
+        samples,
+        statistic,
+        n_resamples=resamples,
+        batch=500,
+        vectorized=True,
+        axis=-1,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(_GENERATOR_SEED),
+    ).confidence_interval
+
+
+def _iqm(values: Floats, axis: int = -1) -> Any:
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
+
+
+def _wins(x: Floats, y: Floats) -> Floats:
+    """Return 1 where x beats y, 1/2 where they tie, 0 elsewhere."""
+    return (x > y) + 0.5 * (x == y)
+
+
+def _share_of_wins(x: Floats, y: Floats, axis: int = -1) -> Any:
+    """Return the mean over all pairs; the samples' axis has to be the last."""
+    del axis
+    return _wins(x[..., :, None], y[..., None, :]).mean(axis=(-2, -1))
+
+
+def _sample(values: ArrayLike, where: str = "") -> Floats:
+    sample = np.asarray(values, dtype=np.float64)
+    label = f"the values {where}".strip()
+    if sample.ndim != 1 or sample.size == 0:
+        raise UserError(f"{label} have to be one number per seed, not of shape {list(sample.shape)}")
+    bad = np.flatnonzero(~np.isfinite(sample)).tolist()
+    if bad:
+        raise UserError(f"{label} are not finite at index {bad}; leave those seeds out and say so beside the result")
+    return sample
+
+
+def _pair(x: ArrayLike, y: ArrayLike, paired: bool) -> tuple[Floats, Floats]:
+    first, second = _sample(x), _sample(y)
+    if paired and first.size != second.size:
+        raise UserError(f"paired groups have to have the same seeds, not {first.size} and {second.size} of them")
+    return first, second

@@ -1,0 +1,261 @@
+"""Runs for other programs: train, read the metrics, evaluate, draw, and let the policy act.
+
+from esp_cli import train
+
+run = train("navigation", "mappo", steps=100_000, seeds=(0, 1), out="runs/cn")
+print(run.metrics["eval/return_greedy"][-1], run.evaluate(64).greedy.mean)
+run.render("cn.gif")
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.checking.measured import prepared
+from esp_cli.defaults import EPISODES, STEPS
+from esp_cli.files.formatting import file_name
+from esp_cli.machine import resolve_device
+from esp_cli.networks.contract import NetworkConfig
+from esp_cli.policies.bundled import open_policy
+from esp_cli.policies.evaluation import FinalEvaluation
+from esp_cli.policies.evaluation import evaluate as evaluate_policy
+from esp_cli.policies.initial import describe, matching_weights
+from esp_cli.policies.loaded import LoadedPolicy, register_own
+from esp_cli.policies.loading import TrainedPolicy, load_policy, transfer
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.config_file import parse_config
+from esp_cli.training.metrics import read_metrics
+from esp_cli.training.metrics_table import Metrics
+from esp_cli.training.run_folder import RunFolder, RunFolderError
+from esp_cli.training.trackers import require
+from esp_cli.training.trainer import Listener, Progress, Trainer
+from esp_envs.base import Environment
+from esp_envs.errors import UserError
+from esp_envs.registry import register
+
+if TYPE_CHECKING:
+    from esp_cli.drawing.draw import Drawing
+    from esp_cli.drawing.rendering import View
+
+
+class Run:
+    """A run in its folder: S seeds of one task, algorithm, network and prior.
+
+    Args:
+        path: of the run folder.
+        task: the task that the run is of, as "module:Class" or as the class, where it is not installed.
+        algo: its algorithm, likewise.
+        network: the settings class of its network, likewise.
+
+    Attributes:
+        path: of the run folder.
+        config: that decides its numbers.
+
+    Raises:
+        UserError: there is no run, or its configuration is damaged or of another version.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        task: str | type[Environment] | None = None,
+        algo: str | type[Learner] | None = None,
+        network: str | type[NetworkConfig] | None = None,
+    ) -> None:
+        register_own(task, algo, network)
+        self.folder = RunFolder.open(Path(path))
+        self.path = self.folder.path
+        self.config: RunConfig = parse_config(self.folder.config, self.path)
+
+    @property
+    def metrics(self) -> Metrics:
+        """What was logged so far: arrays [U, S] by name, one row per update and one column per seed."""
+        return Metrics(read_metrics(self.folder.metrics_path), self.config.seeds)
+
+    @property
+    def policy(self) -> LoadedPolicy:
+        """The newest policy of the first seed, numpy in and out; `load_policy(run.path, seed=k)` gives another's."""
+        return LoadedPolicy(load_policy(self.path))
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether training reached its last step."""
+        return self.folder.policy_path.is_file()
+
+    @contextmanager
+    def trainer(self, track: Sequence[str] = ()) -> Iterator[Trainer]:
+        """Hold the folder against other processes, and yield what trains it from its newest checkpoint on.
+
+        Args:
+            track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
+
+        Raises:
+            UserError: another process trains it, or its device or a tracker is not there.
+        """
+        resolve_device(self.config.device)
+        with self.folder.lock():
+            yield Trainer(self.config, self.folder, track)
+
+    def train(self, listener: Listener | None = None, track: Sequence[str] = ()) -> bool:
+        """Train on from the newest checkpoint, bit for bit as without a break.
+
+        Args:
+            listener: told of progress after every update; False asks for a clean stop.
+            track: as of `trainer`.
+
+        Returns:
+            Whether the run is complete.
+
+        Raises:
+            UserError: another process trains it, or no seed has finite numbers any more.
+        """
+        with self.trainer(track) as trainer:
+            return (trainer.is_complete and self.is_complete) or trainer.run(listener or _go_on)
+
+    def evaluate(self, episodes: int = EPISODES, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
+        """Play episodes with the newest policies, and with the reference policies of the task.
+
+        Args:
+            episodes: per seed, greedy and stochastic each.
+            settings: of the task, without the prefix "task.", where they differ from those of training.
+
+        Raises:
+            UserError: there is no checkpoint yet, or a setting does not fit the policy.
+        """
+        return evaluate_policy(self._trained(settings), episodes)
+
+    def render(
+        self,
+        out: str | os.PathLike[str],
+        *,
+        seed: int | None = None,
+        episodes: int | None = None,
+        view: View = "auto",
+        size: int = 480,
+        speed: float = 1.0,
+        greedy: bool = True,
+        settings: Mapping[str, object] | None = None,
+    ) -> Drawing:
+        """Draw episodes of one seed's policy as a film (.gif, .mp4), or a picture of one episode (.png).
+
+        Args:
+            out: the file.
+            seed: whose policy acts; by default the first.
+            episodes: of a film; by default they last about 8 s.
+            view: "top" from above, "3d" in space, "auto" the latter where the task has it.
+            size: of the longer side, pixels.
+            speed: times real time.
+            greedy: whether it takes its most probable actions, or draws them.
+            settings: as of `evaluate`.
+
+        Raises:
+            UserError: another ending, no checkpoint yet, no such seed or view.
+        """
+        from esp_cli.drawing.draw import draw  # noqa: PLC0415 - training needs no plotting
+
+        trained = self._trained(settings)
+        return draw(trained, Path(out), seed=seed, episodes=episodes, view=view, size=size, speed=speed, greedy=greedy)
+
+    def _trained(self, settings: Mapping[str, object] | None) -> TrainedPolicy:
+        return transfer(load_policy(self.path), settings or {})
+
+
+def plan(
+    task: str,
+    algo: str,
+    *,
+    steps: int,
+    seeds: Sequence[int],
+    preset: str,
+    settings: Mapping[str, object] | None,
+    device: str,
+    init_from: str | os.PathLike[str] | None,
+) -> tuple[RunConfig, dict[str, Tensor] | None]:
+    """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
+
+    Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: what
+    the caller brings along is registered already.
+    """
+    if isinstance(seeds, int):
+        raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
+    config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
+    learner = build_learner(config)
+    if init_from is None:
+        return config, None
+    weights = matching_weights(learner.policy, open_policy(Path(init_from)))
+    return config.model_copy(update={"init_from": describe(os.fspath(init_from), weights)}), weights
+
+
+def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:
+    """Make the folder of a new run, by default a new one in runs/."""
+    name = (
+        f"{file_name(config.task)}-{file_name(config.algorithm)}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
+    )
+    numbered = (Path("runs") / f"{name}-{k}" for k in itertools.count(2))
+    free = (path for path in itertools.chain([Path("runs") / name], numbered) if not path.exists())
+    path = next(free) if out is None else Path(out)
+    try:
+        return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
+    except RunFolderError:
+        if out is not None or not path.exists():
+            raise
+        return begin(config, weights, None)  # another program took the name meanwhile
+
+
+def train(
+    task: str | type[Environment] = "navigation",
+    algo: str | type[Learner] = "mappo",
+    *,
+    steps: int = STEPS,
+    seeds: Sequence[int] = (0,),
+    preset: str = "default",
+    settings: Mapping[str, object] | None = None,
+    device: str = "cpu",
+    out: str | os.PathLike[str] | None = None,
+    init_from: str | os.PathLike[str] | None = None,
+    listener: Listener | None = None,
+    track: Sequence[str] = (),
+) -> Run:
+    """Train S seeds at once, as `esp train` does, and return the run.
+
+    Args:
+        task: name of a task, "module:Class", or the class of one.
+        algo: "mappo", "maddpg" or "qmix", "module:Class", or the class of one.
+        steps: environment steps per seed.
+        seeds: the run's seeds.
+        preset: "default", "fast" or "paper".
+        settings: dotted names to values, as `--set` takes them: {"prior.kind": "none", "task.num_agents": 4}.
+        device: "cpu", "cuda", or "auto" for the latter where there is one.
+        out: the run folder; by default a new one in runs/.
+        init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
+        listener: told of progress after every update; where it returns False the run stops, and `Run.train` goes on.
+        track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
+
+    Raises:
+        UserError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
+    """
+    named = (settings or {}).get("network.name")
+    register_own(None, None, named if isinstance(named, str) else None)
+    name, algorithm = register(task), ALGORITHMS.register(algo)
+    config, weights = plan(
+        name, algorithm, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
+    )
+    require(track)
+    run = begin(config, weights, out)
+    run.train(listener, track)
+    return run
+
+
+def _go_on(_: Progress) -> bool:
+    return True

@@ -1,0 +1,257 @@
+"""What surrounds an exported policy on an e-puck: observations from poses, safety stops, Webots' and ROS 2's files."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import re
+import runpy
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from tests.deploy.policies import drawn_policy
+
+from esp_cli.export import check, epuck
+from esp_cli.export.epuck_c import epuck_sources
+from esp_cli.export.export import export
+from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
+from esp_envs.epuck.arena import Arena
+
+needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+SETTINGS = {
+    "offset": {},
+    "goal in its unit": {"goal_sight_m": 0.3},
+    "nearness, three neighbours": {"sight": "nearness", "neighbours": 3, "num_agents": 5},
+    "no pillars, noise": {"num_obstacles": 0, "num_agents": 4, "sensor_noise_m": 0.1, "heading_noise_rad": 0.1},
+    "a robot alone": {"num_obstacles": 0, "num_agents": 1},
+}
+
+
+def policy_with(monkeypatch: pytest.MonkeyPatch, kind: str = "wheels", **settings: object):
+    from tests.deploy import policies
+
+    task, algorithm, overrides = policies.KINDS[kind]
+    changed = overrides | {f"task.{name}": value for name, value in settings.items()}
+    monkeypatch.setitem(policies.KINDS, kind, (task, algorithm, changed))
+    return drawn_policy(kind)
+
+
+@needs_cc
+@pytest.mark.parametrize("case", SETTINGS)
+def test_c_and_python_see_from_poses_what_the_task_shows(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = policy_with(monkeypatch, **SETTINGS[case])
+    assert epuck.STATES == 10_000
+    states = epuck.STATES if case == "offset" else 2_000
+    scenes = epuck.take_scenes(alone, states)
+    assert len(scenes.poses) == len(scenes.seen) == states
+    assert len(np.unique(scenes.poses[:, 0, 0])) > 0.99 * states, "states differ"
+    monkeypatch.setattr(epuck, "take_scenes", lambda alone: scenes)
+    results = export(alone, ["c", "numpy", "onnx"], tmp_path).formats
+    seen = {result.name: result.seen for result in results}
+    assert 0 < seen["c"] < epuck.TOLERANCE
+    assert 0 < seen["numpy"] < epuck.TOLERANCE
+    assert seen["onnx"] is None
+    assert (tmp_path / "esp_epuck.py").is_file()
+    assert "Observations built from poses were compared" in (tmp_path / "README.md").read_text()
+
+
+def test_an_observation_that_is_built_wrongly_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = policy_with(monkeypatch, sight="nearness")
+    scenes = epuck.take_scenes(alone, 300)
+    description = described(alone)
+    assert epuck.compare_scenes(scenes, epuck.python_observer(description)) < 1e-6
+    for part, wrong in (("fading_m", 0.201), ("body_radius_m", 0.038)):
+        spoilt = description | {"robot": description["robot"] | {part: wrong}}
+        with pytest.raises(RuntimeError, match="differs from the task's"):
+            epuck.compare_scenes(scenes, epuck.python_observer(spoilt))
+    swapped = description | {"observation": description["observation"][::-1]}
+    with pytest.raises(RuntimeError, match="differs from the task's"):
+        epuck.compare_scenes(scenes, epuck.python_observer(swapped))
+    unseen = replace(scenes, seen=np.full_like(scenes.seen, np.nan))
+    with pytest.raises(RuntimeError, match="differs from the task's by nan"):
+        epuck.compare_scenes(unseen, epuck.python_observer(description))
+
+
+def described(alone) -> dict:
+    """Return what the exports of a policy are written from."""
+    from esp_cli.export.card import describe
+    from esp_cli.export.translate import program_of
+
+    program = program_of(alone.policy)
+    return describe(alone, program, check.take_sample(alone, program, 16))
+
+
+def test_what_poses_do_not_tell_is_refused() -> None:
+    description = described(drawn_policy("wheels"))
+    description["observation"] = [*description["observation"], {"field": "camera", "index": "8..9"}]
+    with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
+        epuck_sources(description)
+    with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
+        Pilot(description, lambda obs: obs)
+
+
+TEAM = np.array([[-0.5, 0.1, 0.3], [0.4, -0.2, 2.0], [0.0, 0.6, -1.0]], np.float32)
+GOALS, PILLARS = -TEAM[:, :2], np.array([[0.2, 0.2]], np.float32)
+
+
+def spoilt(array: np.ndarray, place: tuple[int, int], value: float) -> np.ndarray:
+    changed = array.copy()
+    changed[place] = value
+    return changed
+
+
+UNSAFE = {
+    "a pose is not a number": {"poses": spoilt(TEAM, (2, 0), np.nan)},
+    "a heading is infinite": {"poses": spoilt(TEAM, (1, 2), np.inf)},
+    "the goal is not a number": {"goals": spoilt(GOALS, (0, 1), np.nan)},
+    "a pillar is not a number": {"pillars": spoilt(PILLARS, (0, 0), np.nan)},
+    "the poses are old": {"age_s": PATIENCE_S + 0.01},
+    "the age is not a number": {"age_s": float("nan")},
+    "the poses come from the future": {"age_s": -PATIENCE_S - 0.01},
+}
+
+
+@pytest.mark.parametrize("case", UNSAFE)
+def test_a_team_stands_still_where_it_is_not_safe_to_drive(case: str) -> None:
+    alone = drawn_policy("wheels")
+    pilot = Pilot(described(alone), lambda obs: obs[..., :2])
+    safe = {"poses": TEAM, "goals": GOALS, "pillars": PILLARS, "age_s": PATIENCE_S}
+    assert np.abs(pilot.wheels(**safe)).min() > 0
+    assert not pilot.wheels(**safe | UNSAFE[case]).any()
+
+
+def test_a_team_stands_still_where_its_policy_says_no_number() -> None:
+    pilot = Pilot(described(drawn_policy("wheels")), lambda obs: np.full((3, 2), np.nan))
+    assert not pilot.wheels(TEAM, GOALS, PILLARS).any()
+
+
+@pytest.fixture(scope="module", params=["wheels", "wheel pairs"])
+def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """Return an exported policy as a compiled library, and its controller in Python."""
+    if check.compiler() is None:
+        pytest.skip("needs a C compiler")
+    folder, take = tmp_path_factory.mktemp("c"), epuck.take_scenes
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(epuck, "take_scenes", lambda alone: take(alone, 20))
+        export(drawn_policy(request.param), ["c", "numpy"], folder)
+    spec = importlib.util.spec_from_file_location("exported_for_c", folder / "policy.py")
+    policy = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(policy)
+    return check.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
+
+
+def driven(code: ctypes.CDLL, own: int, poses=TEAM, goals=GOALS, pillars=PILLARS, age_s=0.1, robots=3):
+    """Return what esp_epuck_drive returns, and both wheels."""
+    wheels = np.full(2, 7.0, np.float32)
+    arrays = [np.ascontiguousarray(a, np.float32) for a in (poses, goals[own], pillars)]
+    places, goal, standing, out = (a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (*arrays, wheels))
+    given = (places, robots, own, goal, standing, len(pillars), ctypes.c_float(age_s), out)
+    return code.esp_epuck_drive(*given), wheels.tolist()
+
+
+@pytest.mark.parametrize("own", [0, 1, 2])
+def test_the_c_controller_drives_as_the_python_controller_does(compiled, own: int) -> None:
+    code, pilot = compiled
+    answer, wheels = driven(code, own)
+    assert answer == 1
+    assert wheels == pytest.approx(pilot.wheels(TEAM, GOALS, PILLARS)[own].tolist(), abs=1e-4)
+    assert np.abs(wheels).max() > 0.01
+
+
+@pytest.mark.parametrize("case", UNSAFE)
+def test_a_robot_driven_by_c_stands_still_where_it_is_not_safe_to_drive(compiled, case: str) -> None:
+    assert driven(compiled[0], 0, **UNSAFE[case]) == (0, [0.0, 0.0])
+
+
+def test_a_robot_driven_by_c_needs_the_bodies_that_it_sees(compiled) -> None:
+    assert driven(compiled[0], 0, robots=1) == (0, [0.0, 0.0])
+    assert driven(compiled[0], 0, pillars=PILLARS[:0]) == (0, [0.0, 0.0]), "it sees the offset of a pillar"
+    assert driven(compiled[0], 0)[0] == 1
+
+
+def exported(folder: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    take = epuck.take_scenes
+    monkeypatch.setattr(epuck, "take_scenes", lambda alone: take(alone, 20))
+    export(drawn_policy("wheels"), [form], folder)
+    return folder
+
+
+def test_the_webots_world_has_the_team_where_the_task_starts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (exported(tmp_path, "webots", monkeypatch) / "worlds" / "formation.wbt").read_text()
+    assert text.startswith("#VRML_SIM R2023b utf8\n")
+    for opening, closing in ("{}", "[]"):
+        assert text.count(opening) == text.count(closing) > 0
+    arena = Arena(2.0, 8, 2, 0.05)
+    found = re.findall(r"DEF (ROBOT|PILLAR)(\d+) [\w-]+ {\n  translation (\S+) (\S+) ", text)
+    for name, places in (("ROBOT", arena.posts()), ("PILLAR", arena.pillars())):
+        own = {int(k): (float(x), float(y)) for kind, k, x, y in found if kind == name}
+        assert list(own) == list(range(len(places)))
+        assert np.allclose(list(own.values()), places, atol=1e-4)
+    assert text.count("supervisor TRUE") == 8
+    (controller,) = set(re.findall(r'controller "(\w+)"', text))
+    assert (tmp_path / "controllers" / controller / f"{controller}.py").is_file()
+    assert 100 % int(re.search(r"basicTimeStep (\d+)", text)[1]) == 0
+
+
+def test_the_ros_2_package_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = exported(tmp_path, "ros2", monkeypatch)
+    manifest = ElementTree.parse(folder / "package.xml").getroot()
+    name = manifest.findtext("name")
+    assert (manifest.tag, manifest.get("format"), name) == ("package", "3", "esp_formation")
+    assert all(manifest.findtext(part) for part in ("version", "description", "maintainer", "license"))
+    assert manifest.findtext("export/build_type") == "ament_python"
+    needed = {part.text for part in manifest.findall("exec_depend")}
+    node = (folder / name / "esp_epuck_ros2.py").read_text()
+    imported = set(re.findall(r"^from (\w+)\.msg|^import (rclpy)", node, re.MULTILINE))
+    assert {first or second for first, second in imported} <= needed
+    assert (folder / "resource" / name).is_file()
+    asked: dict = {}
+    setuptools = ModuleType("setuptools")
+    setuptools.setup = lambda **given: asked.update(given)
+    monkeypatch.setitem(sys.modules, "setuptools", setuptools)
+    runpy.run_path(str(folder / "setup.py"))
+    assert asked["packages"] == [name]
+    assert all((folder / file).is_file() for _, files in asked["data_files"] for file in files)
+    (script,) = asked["entry_points"]["console_scripts"]
+    assert script == f"drive = {name}.esp_epuck_ros2:main"
+    assert f"script_dir=$base/lib/{name}" in (folder / "setup.cfg").read_text()
+
+
+def test_the_launch_file_starts_the_node_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = exported(tmp_path, "ros2", monkeypatch) / "launch" / "formation.launch.py"
+
+    def recorded(name: str):
+        return lambda *args, **kwargs: (name, args, kwargs)
+
+    for module, names in {
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument"],
+        "launch.substitutions": ["LaunchConfiguration"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+    }.items():
+        fake = ModuleType(module)
+        for name in names:
+            setattr(fake, name, recorded(name))
+        monkeypatch.setitem(sys.modules, module, fake)
+    space = runpy.run_path(str(file))
+    _, ((argument, node),), _ = space["generate_launch_description"]()
+    assert argument[:2] == ("DeclareLaunchArgument", ("poses",))
+    assert (node[2]["package"], node[2]["executable"]) == ("esp_formation", "drive")
+    assert node[2]["remappings"] == [("poses", ("LaunchConfiguration", ("poses",), {}))]
+    assert np.allclose(node[2]["parameters"][0]["pillars"], Arena(2.0, 8, 2, 0.05).pillars().ravel(), atol=1e-4)
+
+
+def test_what_remembers_goes_out_without_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = policy_with(monkeypatch, "point, recurrent")
+    assert "esp_epuck.c" not in export(alone, ["numpy"], tmp_path).formats[0].files
+    assert not (tmp_path / "esp_epuck.py").exists()

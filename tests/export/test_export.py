@@ -1,0 +1,263 @@
+"""Every export does what the policy does, on thousands of observations; one that does not is found."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.deploy.policies import KINDS, drawn_policy
+
+from esp_cli.commands import export as command
+from esp_cli.export import check, onnx_file
+from esp_cli.export.c_source import c_source
+from esp_cli.export.check import compare, take_sample
+from esp_cli.export.export import export
+from esp_cli.export.formats import FORMATS
+from esp_cli.export.layers import Affine, Recurrent
+from esp_cli.export.runtime.numpy_policy import NumpyPolicy
+from esp_cli.export.translate import program_of
+from esp_cli.training.build import build_environment
+
+pytestmark = pytest.mark.usefixtures("few_scenes")
+FAST = ("numpy", "c", "onnx")
+needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+
+
+@needs_cc
+@pytest.mark.parametrize("kind", KINDS)
+def test_exports_agree_with_the_policy(kind: str, tmp_path: Path) -> None:
+    results = export(drawn_policy(kind), FAST, tmp_path / "out").formats
+    assert [result.name for result in results] == list(FAST)
+    for result in results:
+        assert result.agreement is not None
+        assert result.agreement.observations == (10_002 if kind.startswith("team") else 10_000)
+        assert result.agreement.max_difference < 5e-5
+        assert (result.agreement.other_actions or 0) <= 2
+        assert (result.agreement.other_actions is None) == (kind in ("vector", "wheels", "point", "point, recurrent"))
+        assert all((tmp_path / "out" / file).stat().st_size for file in result.files)
+
+
+@pytest.mark.parametrize("kind", ["wheels", "values, recurrent", "team"])
+def test_torch_archives_agree_with_the_policy(kind: str, tmp_path: Path) -> None:
+    (result,) = export(drawn_policy(kind), ["torch"], tmp_path).formats
+    assert result.agreement is not None
+    assert result.agreement.observations >= 10_000
+    assert result.agreement.max_difference < 5e-5
+
+
+def test_both_halves_of_the_sample_are_there() -> None:
+    alone = drawn_policy("choice, recurrent")
+    program = program_of(alone.policy)
+    sample = take_sample(alone, program, 400)
+    assert sample.obs.shape == (400, program.num_inputs)
+    assert not sample.memory[: alone.spec.num_agents].any(), "an episode begins with empty memory"
+    assert sample.memory[100:200].any()
+    # of random observations one in three lies beyond 1, of those of the task hardly any of the first steps
+    assert (np.abs(sample.obs[200:]) > 1).mean() == pytest.approx(0.317, abs=0.03)
+    assert len(np.unique(sample.action)) > 1
+
+
+@pytest.mark.parametrize("kind", ["choice", "wheels"])
+def test_a_wrong_weight_is_found(kind: str) -> None:
+    alone = drawn_policy(kind)
+    program = program_of(alone.policy)
+    sample = take_sample(alone, program, 500)
+
+    def runner(spoilt: float) -> check.Runner:
+        weights = np.frombuffer(program.weights, "<f4").copy()
+        weights[5] += spoilt
+        policy = NumpyPolicy(json.loads(json.dumps(program.describe())), weights.tobytes())
+
+        def run(obs, memory, mask=None):
+            action, after = policy.step(obs, memory)
+            return action, policy.outputs(obs, memory)[0], after
+
+        return run
+
+    assert compare(sample, runner(0.0)).max_difference < 1e-5
+    with pytest.raises(RuntimeError, match="differs from the policy"):
+        compare(sample, runner(0.05))
+
+
+def test_another_choice_that_is_no_tie_is_found() -> None:
+    alone = drawn_policy("choice")
+    sample = take_sample(alone, program_of(alone.policy), 100)
+    others = (sample.action + 1) % 5
+    with pytest.raises(RuntimeError, match="differs from the policy"):
+        compare(sample, lambda obs, memory, mask: (others, sample.outputs, sample.after))
+
+
+@pytest.mark.parametrize(("kind", "spoilt"), [("choice, recurrent", "memory"), ("wheels", "action")])
+def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: str) -> None:
+    alone = drawn_policy(kind)
+    sample = take_sample(alone, program_of(alone.policy), 100)
+    right, wrong = {"action": sample.action, "memory": sample.after}, 0.01
+
+    def runner(said: dict[str, np.ndarray]) -> check.Runner:
+        return lambda obs, memory, mask: (said["action"], sample.outputs, said["memory"])
+
+    assert compare(sample, runner(right)).max_difference == 0
+    with pytest.raises(RuntimeError, match=r"differs from the policy by 0\.01"):
+        compare(sample, runner(right | {spoilt: right[spoilt] + wrong}))
+
+
+def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
+    program = program_of(drawn_policy("wheels", hidden=(3,)).policy)
+    first, _, last = program.layers
+    assert isinstance(first, Affine)
+    assert isinstance(last, Affine)
+    assert (first.weight.shape, last.weight.shape) == ((8, 3), (3, 2))
+    assert program.num_parameters == 8 * 3 + 3 + 3 * 2 + 2 == 35
+    assert program.flops == 2 * 24 + 3 + 2 * 6 + 5 * 2
+    assert (program.head, program.groups, program.memory_width) == ("squash", (1, 1), 0)
+    written = c_source(program, "")
+    assert written.flash_bytes == 4 * 35
+    assert written.ram_bytes == 4 * (8 + 8), "two rows as wide as the widest layer"
+
+
+def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
+    program = program_of(drawn_policy("exploring choice, recurrent", hidden=(6, 4)).policy)
+    (unit,) = [layer for layer in program.layers if isinstance(layer, Recurrent)]
+    assert unit.input.weight.shape == (4, 12)
+    assert unit.recurrent.weight.shape == (4, 12)
+    assert (program.hidden, program.previous, program.memory_width) == (4, 5, 9)
+    assert program.num_inputs == 14
+    assert program.head == "choose"
+    assert program_of(drawn_policy("vector").policy).groups == (2,)
+
+
+def load(file: Path):
+    """Import an exported Python file."""
+    spec = importlib.util.spec_from_file_location("exported", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", ["choice, recurrent", "point, recurrent", "values, recurrent"])
+def test_a_recurrent_export_goes_through_an_episode_like_the_policy(kind: str, tmp_path: Path) -> None:
+    alone = drawn_policy(kind)
+    export(alone, ["numpy"], tmp_path)
+    module = load(tmp_path / "policy.py")
+    env = build_environment(alone.config, 2, "test")
+    observation = env.reset()
+    memory = alone.policy.initial_memory(2, observation.obs)
+    carried = module.initial_memory(1, 2, alone.spec.num_agents)
+    for _ in range(alone.spec.horizon):
+        action, memory = alone.policy.act(observation.obs, memory)
+        exported, carried = module.step(observation.obs.numpy(), carried)
+        assert np.allclose(exported, action.numpy(), atol=1e-4)
+        observation = env.step(action).next
+
+
+def test_the_python_file_runs_alone_and_checks_itself(tmp_path: Path) -> None:
+    export(drawn_policy("values, recurrent"), ["numpy"], tmp_path)
+    code = (
+        "import sys, runpy\n"
+        "try:\n    runpy.run_path('policy.py', run_name='__main__')\n"
+        "except SystemExit as done:\n    assert done.code == 0, done.code\n"
+        "assert not {'torch', 'esp_cli', 'esp_envs'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False, env={}
+    )
+    assert done.returncode == 0, done.stderr
+    assert "expected" in done.stdout
+
+
+def test_the_python_file_refuses_what_does_not_fit(tmp_path: Path) -> None:
+    export(drawn_policy("choice, recurrent"), ["numpy"], tmp_path)
+    module = load(tmp_path / "policy.py")
+    with pytest.raises(ValueError, match="this policy remembers"):
+        module.act(np.zeros((3, 14)))
+    with pytest.raises(ValueError, match=r"the observation has shape \(3, 4\)"):
+        module.step(np.zeros((3, 4)), module.initial_memory(3))
+    with pytest.raises(ValueError, match=r"the memory has shape \(2, 10\)"):
+        module.step(np.zeros((3, 14)), module.initial_memory(2))
+
+
+@needs_cc
+def test_the_worked_example_in_c_fails_where_the_weights_are_others(tmp_path: Path) -> None:
+    export(drawn_policy("wheels"), ["c"], tmp_path)
+    assert check.example_runs(tmp_path)
+    source = (tmp_path / "policy.c").read_text()
+    begin = source.index("= {\n", source.index("static const float w4_1")) + 4
+    (tmp_path / "policy.c").write_text(source[:begin] + "    0.5f," + source[source.index(",", begin) + 1 :])
+    assert not check.example_runs(tmp_path)
+
+
+def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
+    alone = drawn_policy("wheel pairs")
+    export(alone, [name for name in FORMATS if name != "torch"], tmp_path)
+    said = json.loads((tmp_path / "policy.json").read_text())
+    fields = [(row["index"], row["field"], row["unit"]) for row in said["observation"]]
+    assert fields == [
+        ("0..1", "heading", "direction"),
+        ("2..3", "obstacle", "m"),
+        ("4..5", "goal", "m"),
+        ("6..7", "robots", "m"),
+    ]
+    assert len(said["action"]["options"]) == 121
+    assert said["action"]["options"][120] == {"index": 120, "name": "1/1", "means": [1.0, 1.0]}
+    assert said["task"]["control_period_s"] == 0.1
+    example = said["example"]
+    assert len(example["observation"]) == 8
+    assert example["action"] == int(np.argmax(example["outputs"]))
+    page = (tmp_path / "README.md").read_text()
+    for part in ("| 2..3 | obstacle | vector x 1 | m |", "STM32F407", "never on hardware", "Worked example", "10000"):
+        assert part in page
+    import onnx
+
+    model = onnx.load(tmp_path / "policy.onnx")
+    stored = {item.key: item.value for item in model.metadata_props}
+    assert json.loads(stored["esp"])["example"] == example
+    assert "heading: vector x 1 (direction)" in (tmp_path / "policy.h").read_text()
+
+
+def test_an_onnx_export_without_its_libraries_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ValueError, match=r"needs the package onnx: pip install 'onnx>=1\.17'"):
+        onnx_file.library("onnx")
+
+
+def test_what_is_in_the_way_is_not_written_over(tmp_path: Path) -> None:
+    alone = drawn_policy("wheels")
+    (tmp_path / "policy.py").write_text("mine")
+    with pytest.raises(ValueError, match=r"has policy\.py already"):
+        export(alone, ["numpy"], tmp_path)
+    assert (tmp_path / "policy.py").read_text() == "mine"
+    export(alone, ["numpy"], tmp_path, force=True)
+    assert "NumpyPolicy" in (tmp_path / "policy.py").read_text()
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="is a file; name a folder"):
+        export(alone, ["numpy"], tmp_path / "file")
+
+
+@pytest.mark.parametrize("kind", ["choice", "choice, recurrent"])
+def test_robots_take_policies_of_formation_alone(kind: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="drive e-pucks, but this policy is for navigation"):
+        export(drawn_policy(kind), ["webots"], tmp_path)
+
+
+def test_the_command_lists_every_format() -> None:
+    assert (*FORMATS, "policy") == command.FORMATS
+
+
+def test_a_policy_that_the_rounding_of_its_observations_moves_is_no_bug_of_the_export() -> None:
+    sample = take_sample(alone := drawn_policy("choice"), program_of(alone.policy), 100)
+    seen = sample.obs.copy()
+
+    def steep(obs: np.ndarray, memory: np.ndarray, mask: np.ndarray | None) -> tuple:
+        return sample.action, sample.outputs + 1 + 1e6 * (obs - seen)[:, :1], sample.after
+
+    with pytest.raises(ValueError, match="differ by the rounding of float32, so no export can agree"):
+        compare(sample, steep)
+    with pytest.raises(RuntimeError, match="this is a bug"):
+        compare(sample, lambda obs, memory, mask: (sample.action, sample.outputs + 1, sample.after))

@@ -1,0 +1,423 @@
+"""The controllers for e-pucks drive simulated ones: a mocked robot interface stands in front of MuJoCo."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tests.deploy.policies import UNSEEN, drawn_policy
+
+from esp_cli.export.export import export
+from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.training.build import build_environment
+from esp_envs.epuck.engines import make_physics
+from esp_envs.epuck.physics import Bodies
+from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
+
+STEPS = 40
+EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
+WEBOTS = Path("controllers") / "esp_epuck_webots"
+pytestmark = pytest.mark.usefixtures("few_scenes")
+
+
+class Team:
+    """Robots and pillars in MuJoCo, as they stood in an environment, to be driven by wheel speeds."""
+
+    def __init__(self, alone: TrainedPolicy) -> None:
+        self.env = build_environment(alone.config, 1, "test")
+        self.start = self.env.reset()
+        settings = self.env.settings
+        robots = (1, settings.num_agents)
+        pose = np.concatenate([self.env._position, self.env._heading[..., None]], -1)
+        self.pillars = self.env._pillars
+        self.physics = make_physics(settings.physics, settings.arena, 1, settings.control_period_s)
+        ones = np.ones(robots)
+        self.physics.place(Bodies(pose, np.zeros_like(pose), self.pillars, ones, ones))
+        self.goals = self.env._goals[0]
+
+    @property
+    def poses(self) -> np.ndarray:
+        return self.physics.pose[0]
+
+    def drive(self, wheels: object) -> None:
+        self.physics.advance(np.asarray(wheels, float)[None])
+
+
+def imported(folder: Path, name: str, monkeypatch: pytest.MonkeyPatch, **fakes: ModuleType) -> ModuleType:
+    """Import an exported file as its robot's machine would, with other modules beside it."""
+    for other, module in fakes.items():
+        monkeypatch.setitem(sys.modules, other, module)
+    for other in [known for known in sys.modules if known.split(".")[0] in EXPORTED]:
+        monkeypatch.delitem(sys.modules, other)
+    monkeypatch.syspath_prepend(folder)
+    return importlib.import_module(name)
+
+
+def fake(**members: object) -> ModuleType:
+    module = ModuleType("fake")
+    for name, member in members.items():
+        setattr(module, name, member)
+    return module
+
+
+@torch.no_grad()
+def trained_paths(alone: TrainedPolicy, team: Team) -> np.ndarray:
+    """Return where the policy itself drives in the environment from the team's start: [STEPS + 1, N, 3]."""
+    env, observation = team.env, team.start
+    memory = alone.policy.initial_memory(1, observation.obs)
+    paths = [env.physics.pose[0]]
+    for _ in range(STEPS):
+        action, memory = alone.policy.act(observation.obs, memory)
+        observation = env.step(action).next
+        paths.append(env.physics.pose[0])
+    return np.stack(paths)
+
+
+SETTINGS = {
+    "offset": ("wheels", {}),
+    "nearness, three neighbours": ("wheels", {"sight": "nearness", "neighbours": 3, "num_agents": 5}),
+    "wheel pairs": ("wheel pairs", {}),
+    "no pillars": ("wheels", {"num_obstacles": 0, "num_agents": 4}),
+}
+
+
+def policy_for(case: str, monkeypatch: pytest.MonkeyPatch) -> TrainedPolicy:
+    from tests.deploy import policies
+
+    kind, settings = SETTINGS[case]
+    task, algorithm, overrides = policies.KINDS[kind]
+    changed = overrides | {f"task.{name}": value for name, value in settings.items()}
+    monkeypatch.setitem(policies.KINDS, kind, (task, algorithm, changed))
+    return drawn_policy(kind)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("case", SETTINGS)
+def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = policy_for(case, monkeypatch)
+    export(alone, ["webots"], tmp_path)
+    module = imported(tmp_path / WEBOTS, "esp_epuck", monkeypatch)
+    policy = importlib.import_module("policy")
+    pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(alone)
+    for _ in range(5):
+        seen = pilot.observations(team.poses, team.goals, team.pillars[0])
+        assert np.allclose(seen, team.env._seen().obs[0, 0].numpy(), atol=1e-6)
+        wheels = pilot.wheels(team.poses, team.goals, team.pillars[0])
+        action = alone.policy.act(team.env._seen().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
+        expected = team.env._wheel_speeds(action)[0]
+        assert np.allclose(wheels, expected, atol=1e-4)
+        assert np.abs(wheels).max() <= MAX_WHEEL_SPEED + 1e-6
+        assert np.allclose(pilot.twist(wheels), np.stack(drive(wheels), -1))
+        team.drive(wheels)
+        team.env.step(action)
+
+
+def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(drawn_policy("wheels"), ["ros2"], tmp_path)
+    module = imported(tmp_path / "esp_formation", "esp_epuck", monkeypatch)
+    policy = importlib.import_module("policy")
+    pilot = module.Pilot(policy.DESCRIPTION, policy.act)
+    poses, goals = np.zeros((2, 3)), np.zeros((2, 2))
+    with pytest.raises(ValueError, match="needs one; name its position"):
+        pilot.observations(poses, goals)
+    with pytest.raises(ValueError, match=r"should be \[N, 3\] and \[N, 2\]"):
+        pilot.observations(poses, goals[:1])
+    with pytest.raises(ValueError, match="sees 1 others, but there are 1 robots"):
+        pilot.observations(poses[:1], goals[:1], [(0.5, 0.5)])
+
+
+@pytest.mark.parametrize("setting", UNSEEN)
+def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path, setting: str) -> None:
+    alone = drawn_policy(setting)
+    for kind in ("ros2", "webots"):
+        with pytest.raises(ValueError, match=r"without heading_offset_rad and blind_sector_rad; train without them"):
+            export(alone, [kind], tmp_path)
+    export(alone, ["numpy"], tmp_path)
+    assert "from poses" not in (tmp_path / "README.md").read_text()
+
+
+class Node:
+    """Webots' node of a body that stands somewhere."""
+
+    def __init__(self, name: str, pose) -> None:
+        self.name, self.pose = name, pose
+
+    def getDef(self) -> str:  # noqa: N802 - Webots' name
+        return self.name
+
+    def getPosition(self) -> list[float]:  # noqa: N802 - Webots' name
+        return [self.pose()[0], self.pose()[1], 0.0]
+
+    def getOrientation(self) -> list[float]:  # noqa: N802 - Webots' name
+        c, s = math.cos(self.pose()[2]), math.sin(self.pose()[2])
+        return [c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0]
+
+
+class Motor:
+    """Webots' wheel motor; writes into the team's wheel speeds."""
+
+    def __init__(self, wheels: np.ndarray, side: int) -> None:
+        self.wheels, self.side, self.position = wheels, side, 0.0
+
+    def setPosition(self, position: float) -> None:  # noqa: N802 - Webots' name
+        self.position = position
+
+    def setVelocity(self, velocity: float) -> None:  # noqa: N802 - Webots' name
+        assert self.position == math.inf, "a motor turns to a position, unless that is infinite"
+        assert isinstance(velocity, float)
+        self.wheels[self.side] = velocity
+
+    def getMaxVelocity(self) -> float:  # noqa: N802 - Webots' name
+        return MAX_WHEEL_SPEED
+
+
+class Robot:
+    """Webots' Supervisor of one e-puck; `advance` is called where the simulation goes on."""
+
+    def __init__(self, team: Team, own: int, wheels: np.ndarray, advance=None) -> None:
+        self.team, self.own, self.advance = team, own, advance
+        self.motors = [Motor(wheels[own], side) for side in (0, 1)]
+
+    def getBasicTimeStep(self) -> float:  # noqa: N802 - Webots' name
+        return 10.0
+
+    def getSelf(self) -> Node | None:  # noqa: N802 - Webots' name
+        return self.getFromDef(f"ROBOT{self.own}")
+
+    def getFromDef(self, name: str) -> Node | None:  # noqa: N802 - Webots' name
+        kind, index = name.rstrip("0123456789"), int(name.lstrip("ROBTPILA"))
+        if kind == "ROBOT" and index < len(self.team.poses):
+            return Node(name, lambda: self.team.poses[index])
+        if kind == "PILLAR" and index < len(self.team.pillars[0]):
+            return Node(name, lambda: (*self.team.pillars[0, index], 0.0))
+        return None
+
+    def getDevice(self, name: str) -> Motor:  # noqa: N802 - Webots' name
+        return self.motors[["left wheel motor", "right wheel motor"].index(name)]
+
+    def step(self, milliseconds: int) -> int:
+        assert milliseconds == 100
+        return self.advance()
+
+
+@pytest.mark.parametrize("case", ["offset", "wheel pairs", "nearness, three neighbours"])
+def test_the_webots_controller_drives_as_the_policy_does(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = policy_for(case, monkeypatch)
+    export(alone, ["webots"], tmp_path)
+    team = Team(alone)
+    wheels, paths = np.zeros((len(team.poses), 2)), [team.poses]
+
+    def advance() -> int:
+        """Let the other robots act, drive all of them, and end the simulation after some steps."""
+        for driver in others:
+            driver.act()
+        team.drive(wheels)
+        paths.append(team.poses)
+        return 0 if len(paths) <= STEPS else -1
+
+    first = Robot(team, 0, wheels, advance)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
+    pilot = module.Pilot(sys.modules["policy"].DESCRIPTION, sys.modules["policy"].act)
+    # goals are opposite to the posts, from which the start is up to a centimetre away
+    goals = [tuple(goal) for goal in team.goals]
+    others = [module.Driver(Robot(team, k, wheels), pilot, goals[k]) for k in range(1, len(team.poses))]
+    monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *map(str, goals[0])])
+    module.main()
+    assert len(paths) == STEPS + 1
+    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
+    moved = np.abs(paths[-1][:, :2] - paths[0][:, :2]).max()
+    assert moved > 0.05
+    assert gap < 1e-3, "in 4 s and up to half a metre the same way, but for float32"
+
+
+def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    team = SimpleNamespace(poses=np.array([[0.3, 0.2, 1.0], [0.9, -0.5, 2.0]]), pillars=np.zeros((1, 0, 2)))
+    robot = Robot(team, 1, np.zeros((2, 2)), lambda: -1)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    asked = []
+
+    def wheels(poses, goals, pillars) -> np.ndarray:
+        asked.append(goals[1])
+        return np.zeros((2, 2))
+
+    monkeypatch.setattr(module, "Pilot", lambda *_: SimpleNamespace(control_period_s=0.1, wheels=wheels))
+    for arguments in ([], ["0.5", "-0.3"]):
+        monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *arguments])
+        module.main()
+    assert asked == [(-0.9, 0.5), (0.5, -0.3)]
+
+
+def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    team, wheels = SimpleNamespace(poses=np.zeros((1, 3)), pillars=np.zeros((1, 0, 2))), np.zeros((1, 2))
+    robot = Robot(team, 0, wheels)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    monkeypatch.setattr(Motor, "getMaxVelocity", lambda motor: 4.0)
+    pilot = SimpleNamespace(wheels=lambda *_: np.array([[6.28, -5.0]]))
+    module.Driver(robot, pilot).act()
+    assert wheels.tolist() == [[4.0, -4.0]]
+
+
+def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = drawn_policy("wheels")
+    export(alone, ["webots"], tmp_path)
+    team = Team(alone)
+    robot = Robot(team, 0, np.zeros((8, 2)))
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    monkeypatch.setattr(robot, "getBasicTimeStep", lambda: 32.0)
+    with pytest.raises(ValueError, match=r"basicTimeStep is 32\.0 ms; take a divisor of 100 ms"):
+        module.main()
+    monkeypatch.setattr(robot, "getSelf", lambda: Node("EPUCK", lambda: (0, 0, 0)))
+    with pytest.raises(ValueError, match="this robot has the DEF name 'EPUCK'"):
+        module.Driver(robot, None)
+    monkeypatch.undo()
+
+
+class RosNode:
+    """rclpy's Node with a clock that the test sets, and publishers that remember."""
+
+    now_s, parameters = 0.0, {}
+
+    def __init__(self, name: str) -> None:
+        self.name, self.published = name, {}
+
+    def declare_parameter(self, name: str, default: list[float], descriptor: SimpleNamespace) -> SimpleNamespace:
+        assert descriptor.dynamic_typing or default, "rclpy takes an empty list for bytes, and then refuses numbers"
+        return SimpleNamespace(value=self.parameters.get(name, default))
+
+    def create_subscription(self, kind, topic: str, callback, depth: int) -> None:
+        assert (topic, depth) == ("poses", 1)
+        self.callback = callback
+
+    def create_timer(self, period_s: float, callback) -> None:
+        assert period_s == 0.1
+        self.tick = callback
+
+    def create_publisher(self, kind, topic: str, depth: int) -> SimpleNamespace:
+        def publish(message) -> None:
+            self.published[topic] = message
+
+        return SimpleNamespace(publish=publish)
+
+    def get_clock(self) -> SimpleNamespace:
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=int(self.now_s * 1e9)))
+
+    def destroy_node(self) -> None:
+        pass
+
+
+def ros_fakes(spin=None) -> dict[str, ModuleType]:
+    def twist() -> SimpleNamespace:
+        return SimpleNamespace(linear=SimpleNamespace(x=0.0), angular=SimpleNamespace(z=0.0))
+
+    done = fake(init=lambda: None, spin=spin, try_shutdown=lambda: None)
+    return {
+        "rclpy": done,
+        "rclpy.node": fake(Node=RosNode),
+        "geometry_msgs": fake(),
+        "geometry_msgs.msg": fake(PoseArray=SimpleNamespace, Twist=twist),
+        "rcl_interfaces": fake(),
+        "rcl_interfaces.msg": fake(ParameterDescriptor=SimpleNamespace),
+        "std_msgs": fake(),
+        "std_msgs.msg": fake(Float32MultiArray=SimpleNamespace),
+    }
+
+
+def ros_poses(poses: np.ndarray, stamp_s: int = 0) -> SimpleNamespace:
+    def pose(x: float, y: float, heading: float) -> SimpleNamespace:
+        turn = SimpleNamespace(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2))
+        return SimpleNamespace(position=SimpleNamespace(x=x, y=y), orientation=turn)
+
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp_s, nanosec=0))
+    return SimpleNamespace(header=header, poses=[pose(*row) for row in poses.tolist()])
+
+
+def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = drawn_policy("wheels")
+    export(alone, ["ros2"], tmp_path)
+    team, paths = Team(alone), []
+    parameters = {"goals": team.goals.ravel().tolist(), "pillars": team.pillars.ravel().tolist()}
+    monkeypatch.setattr(RosNode, "parameters", parameters)
+
+    def spin(node: RosNode) -> None:
+        """Be camera, clock and robots, then interrupt the node as Ctrl-C does."""
+        node.tick()
+        assert node.published == {}, "nobody moves before it is known where everybody is"
+        for step in range(STEPS + 1):
+            paths.append(team.poses)
+            node.now_s = step * 0.1
+            node.callback(ros_poses(team.poses))
+            node.tick()
+            team.drive([node.published[f"epuck{k}/wheel_speeds"].data for k in range(8)])
+            twist, wheels = node.published["epuck3/cmd_vel"], node.published["epuck3/wheel_speeds"].data
+            speed, spin_rate = drive(np.array(wheels))
+            assert (twist.linear.x, twist.angular.z) == pytest.approx((float(speed), float(spin_rate)))
+        node.now_s += 0.6
+        node.tick()
+        assert all(node.published[f"epuck{k}/wheel_speeds"].data == [0.0, 0.0] for k in range(8)), "nobody drives blind"
+        node.now_s -= 0.6
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        lost = team.poses.copy()
+        lost[3, 1] = math.nan
+        node.callback(ros_poses(lost))
+        node.tick()
+        assert all(node.published[f"epuck{k}/wheel_speeds"].data == [0.0, 0.0] for k in range(8)), "one robot is lost"
+        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        node.now_s += 0.6
+        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data == [0.0, 0.0], "a tracker that repeats itself tells nothing"
+        node.callback(ros_poses(team.poses, stamp_s=2))
+        node.tick()
+        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        nodes.append(node)
+        raise KeyboardInterrupt
+
+    nodes: list[RosNode] = []
+    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
+    module.main()
+    stopped = [nodes[0].published[f"epuck{k}/wheel_speeds"].data for k in range(8)]
+    assert stopped == [[0.0, 0.0]] * 8, "interrupted robots stand still"
+    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
+    assert gap < 1e-3
+
+
+def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(drawn_policy("wheels"), ["ros2"], tmp_path)
+    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes())
+    driver = module.Driver()
+    driver.see(ros_poses(np.array([[math.nan, -0.5, 1.0], [0.1, 0.2, -3.0]])))
+    assert driver.goals == [], "a start that is not finite tells no goal"
+    driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0]])))
+    assert driver.goals == [(-0.9, 0.5), (-0.1, -0.2)]
+    assert driver.poses[1] == pytest.approx((0.1, 0.2, -3.0))
+    monkeypatch.setattr(RosNode, "parameters", {"goals": [1.0, 2.0, 3.0]})
+    with pytest.raises(ValueError, match="the parameter goals lists x and y in turn, but has 3 numbers"):
+        module.Driver()
+
+
+def test_a_ros_node_stops_a_team_of_another_size_than_its_goals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export(drawn_policy("wheels"), ["ros2"], tmp_path)
+    monkeypatch.setattr(RosNode, "parameters", {"goals": [0.5, 0.0, -0.5, 0.0]})
+    driver = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes()).Driver()
+    driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0], [0.0, 0.6, 0.0]])))
+    driver.act()
+    assert [driver.published[f"epuck{k}/wheel_speeds"].data for k in range(3)] == [[0.0, 0.0]] * 3

@@ -1,0 +1,283 @@
+"""Statistics over seeds against numbers worked out by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from esp_cli.policies.curve_statistics import (
+    StepsToThreshold,
+    area_under_curve,
+    curve_band,
+    median_steps,
+    steps_to_threshold,
+)
+from esp_cli.policies.spread import MOST_RESAMPLED, EpisodeSpread, spread_over_episodes
+from esp_cli.policies.statistics import (
+    Estimate,
+    aggregate,
+    bootstrap_interval,
+    difference,
+    interquartile_mean,
+    mean_and_sem,
+    normalise,
+    probability_of_improvement,
+)
+
+TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]
+
+
+def test_mean_and_standard_error_by_hand():
+    # deviations -2 0 2: variance 8 / 2 = 4, s.e.m. 2 / sqrt(3)
+    assert mean_and_sem([1.0, 3.0, 5.0]) == (3.0, pytest.approx(2 / math.sqrt(3)))
+    assert mean_and_sem([4.0]) == (4.0, None)
+    assert mean_and_sem([2.0, 2.0]) == (2.0, 0.0)
+
+
+def test_interval_of_two_seeds_is_the_seeds():
+    # a quarter of the resamples are both low, a quarter both high: more than 2.5 % at either end
+    assert bootstrap_interval([1.0, 3.0]) == (1.0, 3.0)
+
+
+def test_interval_agrees_with_the_normal_one_where_that_holds():
+    sample = stats.norm(loc=5, scale=2).ppf((np.arange(400) + 0.5) / 400)
+    low, high = bootstrap_interval(sample)
+    half = 1.96 * sample.std() / 20
+    assert low == pytest.approx(5 - half, abs=0.02)
+    assert high == pytest.approx(5 + half, abs=0.02)
+
+
+def test_interval_is_the_same_every_time_and_json():
+    interval = bootstrap_interval(TEN)
+    assert interval == bootstrap_interval(TEN)
+    assert interval[0] < np.mean(TEN) < interval[1]
+    assert json.loads(json.dumps(interval)) == list(interval)
+
+
+def test_interval_moves_and_scales_with_the_values():
+    low, high = bootstrap_interval(TEN)
+    assert bootstrap_interval(2 * np.array(TEN) + 7) == (pytest.approx(2 * low + 7), pytest.approx(2 * high + 7))
+
+
+@pytest.mark.parametrize("values", [[3.0], [3.0, 3.0, 3.0], [0.1] * 10])
+def test_where_the_bootstrap_cannot_tell_there_is_no_interval(values, recwarn):
+    assert bootstrap_interval(values) is None
+    assert interquartile_mean(values) == Estimate(pytest.approx(values[0]), None)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("values", [[], [[1.0]], 3.0])
+def test_values_are_one_per_seed(values):
+    with pytest.raises(ValueError, match="one number per seed"):
+        mean_and_sem(values)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_stopped_seed_is_never_dropped_in_silence(bad):
+    for function in (mean_and_sem, bootstrap_interval, interquartile_mean):
+        with pytest.raises(ValueError, match=r"not finite at index \[1\]; leave those seeds out and say so"):
+            function([1.0, bad, 2.0])
+    with pytest.raises(ValueError, match="of pursuit are not finite"):
+        aggregate({"navigation": [1.0, 2.0], "pursuit": [bad]})
+
+
+def test_interquartile_mean_by_hand():
+    # of eight, two go at either end: (3 + 4 + 5 + 6) / 4
+    assert interquartile_mean([1, 2, 3, 4, 5, 6, 7, 1000]).value == 4.5
+    # of ten, 2.5 rounded down
+    assert interquartile_mean(range(10)).value == 4.5
+    # of three, none
+    assert interquartile_mean([0, 0, 3]).value == 1.0
+
+
+def test_interquartile_mean_ignores_an_outlier_as_the_mean_does_not():
+    sample = [*TEN[:9], -1000.0]
+    assert interquartile_mean(sample).value > -125
+    assert mean_and_sem(sample)[0] < -200
+
+
+def test_aggregate_pools_all_seeds_of_all_tasks():
+    scores = {"a": [0.0, 1.0, 2.0, 3.0], "b": [10.0, 11.0, 12.0, 13.0]}
+    # of eight, two go at either end: (2 + 3 + 10 + 11) / 4
+    assert aggregate(scores).value == 6.5
+    assert aggregate(scores, "mean").value == 6.5
+    assert aggregate({"a": [0.0, 4.0], "b": [2.0]}, "mean") == Estimate(2.0, None)
+
+
+def test_the_aggregate_bootstrap_is_stratified():
+    # no seed differs within its task, so that redrawing within tasks changes nothing; pooled redrawing would
+    scores = {"easy": [1.0] * 5, "hard": [0.0] * 5}
+    assert aggregate(scores, "mean") == Estimate(0.5, None)
+    assert bootstrap_interval([*scores["easy"], *scores["hard"]]) == (pytest.approx(0.2), pytest.approx(0.8))
+
+
+def test_aggregate_of_one_task_is_the_statistic_of_that_task():
+    assert aggregate({"a": TEN}, "mean").ci95 == pytest.approx(bootstrap_interval(TEN))
+    assert aggregate({"a": TEN}) == interquartile_mean(TEN)
+    with pytest.raises(ValueError, match="no task"):
+        aggregate({})
+
+
+def test_difference_by_hand():
+    estimate = difference([3.0, 5.0], [1.0, 2.0])
+    assert estimate.value == 2.5
+    # each mean is low, middle or high with 1/4, 1/2, 1/4: the extremes have 1/16 each
+    assert estimate.ci95 == (1.0, 4.0)
+    assert difference([3.0], [1.0, 2.0]) == Estimate(1.5, None)
+    assert difference([3.0, 3.0], [1.0, 1.0]) == Estimate(2.0, None)
+
+
+def test_pairing_removes_what_the_seeds_share():
+    shared = np.array([0.0, 10.0, 20.0, 30.0, 40.0])
+    x, y = shared + np.array([1.0, 2.0, 1.0, 2.0, 1.0]), shared
+    paired, unpaired = difference(x, y, paired=True), difference(x, y)
+    assert paired.value == pytest.approx(1.4)
+    assert unpaired.value == pytest.approx(1.4)
+    assert 1.0 <= paired.ci95[0] < paired.ci95[1] <= 2.0
+    assert unpaired.ci95[0] < -10
+    with pytest.raises(ValueError, match="not 5 and 4 of them"):
+        difference(x, y[:4], paired=True)
+
+
+def test_difference_turns_its_sign_with_its_groups():
+    x, y = TEN, [value - 5 + index for index, value in enumerate(TEN)]
+    assert difference(x, y).value == -difference(y, x).value
+    assert difference(x, x).value == 0.0
+    assert difference(x, x).ci95[0] < 0 < difference(x, x).ci95[1]
+
+
+def test_probability_of_improvement_by_hand():
+    # pairs (1,0) (1,2) (3,0) (3,2): three wins of four
+    assert probability_of_improvement([1.0, 3.0], [0.0, 2.0]).value == 0.75
+    # a tie counts half: (1,1) (1,2) (2,1) (2,2) gives 1/2 + 0 + 1 + 1/2
+    assert probability_of_improvement([1.0, 2.0], [1.0, 2.0]).value == 0.5
+    # seed by seed: a win, a tie, a loss, a win
+    paired = probability_of_improvement([2.0, 1.0, 0.0, 5.0], [1.0, 1.0, 1.0, 1.0], paired=True)
+    assert paired.value == 2.5 / 4
+    # sums of four draws from 1, 1/2, 0, 1: at most 1/2 with 5/256 = 2.0 %, at most 1 with 19/256; four with 16/256
+    assert paired.ci95 == (0.25, 1.0)
+
+
+def test_probability_of_improvement_of_parted_groups_is_one_without_an_interval():
+    assert probability_of_improvement([5.0, 6.0, 7.0], [1.0, 2.0]) == Estimate(1.0, None)
+    assert probability_of_improvement([1.0, 2.0], [5.0, 6.0, 7.0]) == Estimate(0.0, None)
+
+
+def test_probability_of_improvement_agrees_with_counting():
+    rng = np.random.default_rng(1)
+    x, y = rng.integers(0, 5, 7).astype(float), rng.integers(0, 5, 9).astype(float)
+    counted = sum((a > b) + 0.5 * (a == b) for a in x for b in y) / 63
+    estimate = probability_of_improvement(x, y)
+    assert estimate.value == pytest.approx(counted)
+    assert estimate.ci95[0] < counted < estimate.ci95[1]
+
+
+def test_steps_to_threshold_by_hand():
+    steps = [0, 100, 200, 300]
+    values = np.array([[-200.0, -200.0], [-110.0, -160.0], [-120.0, -130.0], [-110.0, -118.0]])
+    # means -200 -135 -125 -114
+    assert steps_to_threshold(steps, values, -125) == StepsToThreshold(200, (100, 300))
+    assert steps_to_threshold(steps, values, -115) == StepsToThreshold(300, (100, None))
+    assert steps_to_threshold(steps, values, -100) == StepsToThreshold(None, (None, None))
+
+
+def test_median_steps_by_hand():
+    ten = [300, 100, 200, 200, 250, 150, 350, 400, 500, 450]
+    # in order 100 150 200 200 250 300 350 400 450 500; P(B <= 1) = 11 / 1024 of ten fair coins, P(B <= 2) = 56 / 1024
+    assert median_steps(ten) == (275, (150, 450))
+    assert median_steps([1, 2, 3, 4, 5, 6]) == (3.5, (1, 6))  # P(B <= 0) = 1 / 64 < 0.025
+    assert median_steps([1, 2, 3, 4, 5]) == (3, None)  # 1 / 32 > 0.025
+    assert median_steps([None, *ten[1:-1], None]) == (300, (150, math.inf))
+    assert median_steps([None, None, 7]) == (math.inf, None)
+
+
+def test_the_interval_of_the_median_holds_it_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    drawn = rng.exponential(1000.0, (2000, 10))  # of median 1000 log 2
+    held = [low <= 1000 * math.log(2) <= high for _, (low, high) in map(median_steps, drawn.tolist())]
+    assert np.mean(held) == pytest.approx(0.979, abs=0.01)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_what_is_not_finite_reaches_nothing(bad):
+    values = np.array([[0.0, 0.0], [2.0, bad], [2.0, bad]])
+    assert steps_to_threshold([1, 2, 3], values, 1.0) == StepsToThreshold(None, (2, None))
+
+
+def test_area_under_curve_by_hand():
+    # trapezoids 100 * 1 + 300 * 2 over 400; a constant has its height
+    values = np.array([[0.0, 7.0], [2.0, 7.0], [2.0, 7.0]])
+    assert area_under_curve([0, 100, 400], values).tolist() == [1.75, 7.0]
+    with pytest.raises(ValueError, match="two evaluations or more"):
+        area_under_curve([0], [[1.0]])
+
+
+@pytest.mark.parametrize(
+    ("steps", "values", "text"),
+    [
+        ([1, 2], [1.0, 2.0], r"steps \[K\] and values \[K, S\]"),
+        ([1, 2], [[1.0]], r"not \[2\] and \[1, 1\]"),
+        ([2, 1], [[1.0], [2.0]], "ascend"),
+        ([1, 1], [[1.0], [2.0]], "ascend"),
+        ([], np.zeros((0, 2)), r"not \[0\]"),
+    ],
+)
+def test_curves_that_are_none_are_one_sentence(steps, values, text):
+    for function in (lambda: steps_to_threshold(steps, values, 0.0), lambda: area_under_curve(steps, values)):
+        with pytest.raises(ValueError, match=text):
+            function()
+
+
+def test_normalise_sets_random_to_zero_and_heuristic_to_one():
+    assert normalise([-220.0, -110.0, -165.0, -55.0], -220.0, -110.0).tolist() == [0.0, 1.0, 0.5, 1.5]
+    for heuristic in (-220.0, math.nan):
+        with pytest.raises(ValueError, match="the heuristic has to be better"):
+            normalise([1.0], -220.0, heuristic)
+
+
+def test_curve_band_is_the_interval_at_each_step():
+    values = np.array([TEN, [2 * value for value in TEN]])
+    mean, low, high = curve_band(values)
+    assert mean.tolist() == [pytest.approx(-122.8), pytest.approx(-245.6)]
+    # the same seeds are drawn at every step
+    assert low[1] == pytest.approx(2 * low[0])
+    assert high[1] == pytest.approx(2 * high[0])
+    assert (low[0], high[0]) == pytest.approx(bootstrap_interval(TEN), abs=0.2)
+
+
+def test_curve_band_of_one_seed_is_the_curve():
+    for edge in curve_band([[1.0], [2.0]]):
+        assert edge.tolist() == [1.0, 2.0]
+
+
+def test_a_stopped_seed_leaves_a_gap(recwarn):
+    for edge in curve_band([[1.0, 2.0], [math.nan, 2.0], [-math.inf, math.inf]]):
+        assert np.isfinite(edge).tolist() == [True, False, False]
+    assert not recwarn.list
+
+
+def test_curve_band_wants_seeds():
+    with pytest.raises(ValueError, match=r"\[K, S\], not of shape \[3\]"):
+        curve_band([1.0, 2.0, 3.0])
+
+
+def test_the_spread_over_episodes_is_that_of_their_mean() -> None:
+    spread = spread_over_episodes([1.0, 3.0, 5.0, 7.0])
+    assert spread.sem == pytest.approx(math.sqrt(20 / 3) / 2)
+    assert spread.ci95 is not None
+    assert spread.ci95[0] < 4 < spread.ci95[1]
+    assert spread_over_episodes([2.0]) == EpisodeSpread(None, None)
+    assert spread_over_episodes([2.0, 2.0]) == EpisodeSpread(0.0, None)
+    assert spread_over_episodes([2.0] * (MOST_RESAMPLED + 1)) == EpisodeSpread(0.0, None)
+
+
+def test_many_episodes_have_the_normal_interval_and_it_is_near_the_bootstraps() -> None:
+    returns = np.random.default_rng(0).normal(-100, 10, MOST_RESAMPLED + 1)
+    many, fewer = spread_over_episodes(returns), spread_over_episodes(returns[:-1])
+    assert many.sem is not None
+    assert many.ci95 == pytest.approx((returns.mean() - 1.959964 * many.sem, returns.mean() + 1.959964 * many.sem))
+    assert fewer.ci95 == pytest.approx(many.ci95, abs=0.1)
