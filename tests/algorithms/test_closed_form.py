@@ -7,7 +7,6 @@ import math
 
 import pytest
 import torch
-from tests.kernels.compiler import needs_compiler
 
 from esp_cli.algorithms import closed_form
 from esp_cli.algorithms.closed_form import Weights, carries, critic_gradient, policy_gradient
@@ -15,6 +14,7 @@ from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
 from tests.algorithms.test_mappo import learner
+from tests.networks.kernels.compiler import needs_compiler
 
 WEIGHTS = Weights(
     clip_epsilon=0.2,

@@ -21,6 +21,7 @@ from esp_cli import __version__
 from esp_cli.app import app
 from esp_cli.commands import COMMANDS
 from esp_cli.commands.options import SeedsOption, StepsOption
+from esp_envs.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 runner = CliRunner()
@@ -32,7 +33,7 @@ class ToySettings(BaseModel):
 
 
 FAILURES: dict[str, BaseException] = {
-    "value": ValueError("task 'x' has no\nsymmetry; choose another"),
+    "value": UserError("task 'x' has no\nsymmetry; choose another"),
     "interrupt": KeyboardInterrupt(),
     "missing": FileNotFoundError(errno.ENOENT, "No such file or directory", "runs/a"),
     "denied": PermissionError(errno.EACCES, "Permission denied", "runs/b"),
@@ -40,6 +41,7 @@ FAILURES: dict[str, BaseException] = {
     "io": OSError(errno.EIO, "Input/output error", "runs/d"),
     "read-only": OSError(errno.EROFS, "Read-only file system", "runs/e"),
     "bug": ZeroDivisionError("division by zero"),
+    "value bug": ValueError("3 is not in list"),
 }
 
 
@@ -119,9 +121,11 @@ def test_an_interrupt_in_the_middle_of_an_import_leaves_at_once(tmp_path: Path) 
     assert (process.returncode, told) == (130, "interrupted\n")
 
 
-def test_a_bug_keeps_its_traceback(commands: None) -> None:
-    result = runner.invoke(app, ["toy", "bug"])
-    assert result.exception is FAILURES["bug"]
+@pytest.mark.parametrize("kind", ["bug", "value bug"])
+def test_a_bug_keeps_its_traceback(commands: None, kind: str) -> None:
+    """A ValueError that no `raise UserError` made is a bug as any other."""
+    result = runner.invoke(app, ["toy", kind])
+    assert result.exception is FAILURES[kind]
 
 
 def test_the_traceback_of_a_sentence_can_be_asked_for(commands: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,13 +14,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from tests.deploy.policies import drawn_policy
 
 from esp_cli.export import check, epuck
 from esp_cli.export.epuck_c import epuck_sources
 from esp_cli.export.export import export
 from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
 from esp_envs.epuck.arena import Arena
+from tests.export.policies import drawn_policy
 
 needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
@@ -33,7 +33,7 @@ SETTINGS = {
 
 
 def policy_with(monkeypatch: pytest.MonkeyPatch, kind: str = "wheels", **settings: object):
-    from tests.deploy import policies
+    from tests.export import policies
 
     task, algorithm, overrides = policies.KINDS[kind]
     changed = overrides | {f"task.{name}": value for name, value in settings.items()}

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.deploy.policies import KINDS, drawn_policy
 
 from esp_cli.commands import export as command
 from esp_cli.export import check, onnx_file
@@ -23,6 +22,7 @@ from esp_cli.export.layers import Affine, Recurrent
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.translate import program_of
 from esp_cli.training.build import build_environment
+from tests.export.policies import KINDS, drawn_policy
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c", "onnx")

@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 
 import pytest
 import torch
-from tests.deploy.policies import drawn_policy, write_policy
 from torch import Tensor
 
 from esp_cli.policies.bundling import bundle
@@ -28,6 +27,7 @@ from esp_cli.policies.loading import load_policy as load_trained
 from esp_cli.policies.manifest import MANIFEST, read_bundled, write_bundled
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_envs.policy_format import POLICY_FORMAT
+from tests.export.policies import drawn_policy, write_policy
 
 T = TypeVar("T")
 

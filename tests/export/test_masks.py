@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from tests.deploy.policies import KINDS, drawn_policy
 
 from esp_cli.export import check, onnx_file
 from esp_cli.export.c_source import c_source
@@ -24,6 +23,7 @@ from esp_cli.export.torch_file import TorchProgram
 from esp_cli.export.translate import program_of
 from esp_envs import register
 from esp_envs.registry import TASKS
+from tests.export.policies import KINDS, drawn_policy
 from tests.fenced import Fenced
 
 needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")

@@ -11,7 +11,6 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from tests.deploy.policies import UNSEEN, drawn_policy
 
 from esp_cli.export.export import export
 from esp_cli.policies.loading import TrainedPolicy
@@ -19,6 +18,7 @@ from esp_cli.training.build import build_environment
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
+from tests.export.policies import UNSEEN, drawn_policy
 
 STEPS = 40
 EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
@@ -88,7 +88,7 @@ SETTINGS = {
 
 
 def policy_for(case: str, monkeypatch: pytest.MonkeyPatch) -> TrainedPolicy:
-    from tests.deploy import policies
+    from tests.export import policies
 
     kind, settings = SETTINGS[case]
     task, algorithm, overrides = policies.KINDS[kind]

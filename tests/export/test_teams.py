@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.deploy.policies import drawn_policy
 
 from esp_cli.export import check
 from esp_cli.export.c_source import c_source
@@ -20,6 +19,7 @@ from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
 from esp_cli.export.translate import program_of
 from esp_cli.policies.loaded import LoadedPolicy
+from tests.export.policies import drawn_policy
 
 WIDTH = 445
 """Of an observation of wildlife monitoring: 21 x 21 pixels, and the way to two others."""

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from tests.deploy.policies import drawn_policy
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
@@ -25,6 +24,7 @@ from esp_cli.policies.manifest import MANIFEST, Entry, bundled_folder, read_bund
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_cli.training.locking import taking_turns
 from esp_cli.training.play import Episodes
+from tests.export.policies import drawn_policy
 
 ENTRIES = read_bundled()
 EPISODES = {"formation": 8}

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.deploy.policies import drawn_policy, write_policy
 
 import esp_cli
 from esp_cli.policies.loaded import LoadedPolicy
 from esp_cli.training.build import build_environment
+from tests.export.policies import drawn_policy, write_policy
 
 
 def test_importing_the_package_imports_no_torch() -> None:

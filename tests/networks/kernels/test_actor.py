@@ -5,11 +5,11 @@ from itertools import product
 
 import pytest
 import torch
-from tests.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw
 from esp_cli.symmetry import transform_set
 from tests.algorithms.test_closed_form import SPACES
+from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 
 def rows(num_seeds, count, num_parts, num_learned):

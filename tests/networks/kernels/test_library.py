@@ -6,7 +6,6 @@ import weakref
 
 import pytest
 import torch
-from tests.kernels.compiler import needs_compiler
 from torch.autograd.function import BackwardCFunction
 from typer.testing import CliRunner
 
@@ -19,6 +18,7 @@ from esp_cli.networks.recurrent import SeedGRU
 from esp_cli.policies.loading import load_policy, single_seed
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
+from tests.networks.kernels.compiler import needs_compiler
 from tests.networks.test_layers import generators
 
 

@@ -4,11 +4,11 @@ import math
 
 import pytest
 import torch
-from tests.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 from esp_cli.networks.kernels.perceptron import CompiledPass
 from esp_cli.networks.layers import SeedMLP
 from tests.networks.gradients import assert_same_gradients
+from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 from tests.networks.test_layers import generators, reference
 
 

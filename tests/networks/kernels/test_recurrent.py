@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from tests.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 from esp_cli.networks.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.recurrent import SeedGRU
 from tests.networks.gradients import assert_same_gradients
+from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 from tests.networks.test_layers import generators
 
 
