@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from esp_cli.files.faults import reach
+from esp_cli.files.opening import open_folder, require_held
 
 TEMPORARY_PREFIX = ".esp-tmp-"
 """Names of half-written files begin so; what a killed process left under such a name may be removed."""
@@ -82,38 +83,47 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
         A function that takes the next part. After an exception the file is as it was before.
 
     Raises:
+        FolderLostError: it is in a held folder that was moved, replaced or deleted.
         OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
     """
     path = Path(path)
-    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
-    try:
-        # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    temporary = f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
+    with _named(path), _folder_of(path) as folder:
         try:
-            with contextlib.suppress(OSError):  # a new file, or one of somebody else
-                if stat.S_ISREG((before := path.lstat()).st_mode):
-                    os.fchmod(descriptor, before.st_mode & 0o777)
-            yield functools.partial(_write_all, descriptor)
-            reach("fsync")
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        reach("rename")
-        temporary.replace(path)
-    except BaseException:
+            # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
+            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666, dir_fd=folder)
+            try:
+                with contextlib.suppress(OSError):  # a new file, or one of somebody else
+                    if stat.S_ISREG((before := os.lstat(path.name, dir_fd=folder)).st_mode):
+                        os.fchmod(descriptor, before.st_mode & 0o777)
+                yield functools.partial(_write_all, descriptor)
+                reach("fsync")
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+            reach("rename")
+            require_held(path)
+            os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary, dir_fd=folder)
+            raise
+        reach("renamed")
+        # some network file systems cannot flush a folder; the rename itself has succeeded by now
         with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
-    reach("renamed")
-    # some network file systems cannot flush a folder; the rename itself has succeeded by now
-    with contextlib.suppress(OSError):
-        _sync_folder(path.parent)
+            _sync_folder(folder)
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file if it is there."""
+    """Remove a file if it is there.
+
+    Raises:
+        FolderLostError: it is in a held folder that was moved, replaced or deleted.
+        OSError: it cannot be removed.
+    """
     reach("unlink")
-    path.unlink(missing_ok=True)
+    with _named(path), contextlib.suppress(FileNotFoundError), _folder_of(path) as folder:
+        os.unlink(path.name, dir_fd=folder)
 
 
 def sync_file(path: Path) -> None:
@@ -134,8 +144,27 @@ def _write_all(descriptor: int, content: bytes) -> None:
             half = 0
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+@contextlib.contextmanager
+def _folder_of(path: Path) -> Iterator[int]:
+    """Yield a descriptor of the folder of a file."""
+    descriptor = open_folder(path.parent)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Let a failure name the file itself, not the temporary one beside it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from None
+
+
+def _sync_folder(folder: int) -> None:
+    descriptor = os.open(".", os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     try:
         os.fsync(descriptor)
     finally:

@@ -16,7 +16,7 @@ from esp_cli.files.writing import remove_file
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.study import Cell, StudyFolder
 from esp_cli.training.folder_names import METRICS
-from esp_cli.training.locking import is_held
+from esp_cli.files.locking import is_held
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 

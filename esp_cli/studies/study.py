@@ -32,7 +32,7 @@ from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
-from esp_cli.training.locking import acquire, release
+from esp_cli.files.locking import acquire, release
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 

@@ -39,7 +39,7 @@ from esp_cli.training.checkpoint import (
 )
 from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
-from esp_cli.training.locking import LockError, acquire, release
+from esp_cli.files.locking import LockError, acquire, release
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 from esp_envs.errors import UserError

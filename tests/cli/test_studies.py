@@ -21,7 +21,7 @@ from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
-from esp_cli.training.locking import acquire
+from esp_cli.files.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
 from tests.forks import fork, said, wait

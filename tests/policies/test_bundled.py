@@ -22,7 +22,7 @@ from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.manifest import MANIFEST, Entry, bundled_folder, read_bundled, standard_name
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
-from esp_cli.training.locking import taking_turns
+from esp_cli.files.locking import taking_turns
 from esp_cli.training.play import Episodes
 from tests.export.policies import drawn_policy
 

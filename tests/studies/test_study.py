@@ -11,7 +11,7 @@ from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.study import StudyError, StudyFolder, read_evaluation
 from esp_cli.studies.tuning import TuningFolder
-from esp_cli.training.locking import LockError, is_held
+from esp_cli.files.locking import LockError, is_held
 from tests.studies.small_studies import small_study, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}

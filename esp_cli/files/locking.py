@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from esp_cli.files.failures import attempting
-from esp_cli.files.opening import open_own
+from esp_cli.files.opening import HeldFolder, held_folders, open_own, require_held
 from esp_envs.errors import UserError
 
 
@@ -20,12 +20,17 @@ class LockError(UserError):
 
 
 def acquire(file: Path) -> int:
-    """Take a lock and write into its file who holds it; `release` of the returned descriptor lets go of it.
+    """Hold the folder of a lock file, and write into the file who holds it.
 
-    The file stays when the lock is let go: removing it would let two processes hold two files of one name.
+    The file stays when the folder is let go: removing it would let two processes hold two files of one name. While the
+    folder is held, whatever `esp_cli.files` writes or removes in it is written or removed in this very folder.
+
+    Returns:
+        The descriptor of the file; `release` of it lets go of the folder.
 
     Raises:
         LockError: another process, or this one, holds it already, or something else than a regular file is there.
+        FolderLostError: the folder was moved, replaced or deleted meanwhile.
         OSError: the file system cannot lock.
     """
     with attempting("lock", file, LockError):
@@ -36,6 +41,7 @@ def acquire(file: Path) -> int:
             # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
             os.pwrite(descriptor, owner.encode(), 0)
             os.ftruncate(descriptor, len(owner.encode()))
+            folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except BlockingIOError:
             holder = _holder(os.pread(descriptor, 4096, 0))
             os.close(descriptor)
@@ -43,6 +49,12 @@ def acquire(file: Path) -> int:
         except OSError:
             os.close(descriptor)
             raise
+    held_folders[descriptor] = HeldFolder(os.path.abspath(file.parent), file.name, folder, descriptor, os.getpid())
+    try:
+        require_held(file)
+    except BaseException:
+        release(descriptor)
+        raise
     return descriptor
 
 
@@ -59,7 +71,8 @@ def taking_turns(folder: Path) -> Iterator[None]:
 
 
 def release(descriptor: int) -> None:
-    """Let go of a lock, also for processes that were forked meanwhile."""
+    """Let go of a folder that `acquire` holds, also for processes that were forked meanwhile."""
+    os.close(held_folders.pop(descriptor).folder_fd)
     fcntl.flock(descriptor, fcntl.LOCK_UN)
     os.close(descriptor)
 
