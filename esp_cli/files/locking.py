@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from esp_cli.files.failures import attempting
-from esp_cli.files.opening import HeldFolder, held_folders, open_own, require_held
+from esp_cli.files.opening import HeldFolder, absolute_path, held_folders, open_own, require_held
 from esp_envs.errors import UserError
 
 
@@ -49,7 +49,7 @@ def acquire(file: Path) -> int:
         except OSError:
             os.close(descriptor)
             raise
-    held_folders[descriptor] = HeldFolder(os.path.abspath(file.parent), file.name, folder, descriptor, os.getpid())
+    held_folders[descriptor] = HeldFolder(absolute_path(file.parent), file.name, folder, descriptor, os.getpid())
     try:
         require_held(file)
     except BaseException:
@@ -60,11 +60,17 @@ def acquire(file: Path) -> int:
 
 @contextmanager
 def taking_turns(folder: Path) -> Iterator[None]:
-    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none."""
+    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none.
+
+    Raises:
+        LockError: the folder was moved, replaced or deleted while this process waited.
+    """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if not (folder.exists() and os.path.samestat(folder.stat(), os.fstat(descriptor))):
+            raise LockError(f"{folder} was moved, replaced or deleted meanwhile; run the command again")
         yield
     finally:
         os.close(descriptor)

@@ -47,9 +47,10 @@ class HeldFolder:
         Raises:
             FolderLostError: another one is there, or none.
         """
-        pairs = ((self.path, self.folder_fd), (os.path.join(self.path, self.lock), self.lock_fd))
+        folder = Path(self.path)
+        pairs = ((folder, self.folder_fd), (folder / self.lock, self.lock_fd))
         try:
-            same = all(os.path.samestat(os.stat(path), os.fstat(descriptor)) for path, descriptor in pairs)
+            same = all(os.path.samestat(path.stat(), os.fstat(descriptor)) for path, descriptor in pairs)
         except (FileNotFoundError, NotADirectoryError):
             same = False
         if not same:
@@ -63,6 +64,11 @@ held_folders: dict[int, HeldFolder] = {}
 """What this process holds, by the descriptor of the lock; `esp_cli.files.locking` keeps it."""
 
 
+def absolute_path(path: str | os.PathLike[str]) -> str:
+    """Return a path from the root on, without "..", as `HeldFolder` compares it; links in it stay."""
+    return os.path.normpath(Path(path).absolute())
+
+
 def require_held(path: str | os.PathLike[str]) -> HeldFolder | None:
     """Check the held folders that a path is in, before something is written there.
 
@@ -74,8 +80,9 @@ def require_held(path: str | os.PathLike[str]) -> HeldFolder | None:
     """
     if not held_folders:
         return None
-    absolute = os.path.abspath(path)
-    covering = sorted((held for held in held_folders.values() if held.covers(absolute)), key=lambda held: len(held.path))
+    absolute = absolute_path(path)
+    covering = [held for held in list(held_folders.values()) if held.covers(absolute)]
+    covering.sort(key=lambda held: len(held.path))
     for held in covering:
         held.require()
     return covering[-1] if covering else None

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from esp_cli.files.failures import sentence
+from esp_cli.files.locking import is_held
+from esp_cli.files.opening import require_held
 from esp_cli.files.writing import remove_file
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.study import Cell, StudyFolder
 from esp_cli.training.folder_names import METRICS
-from esp_cli.files.locking import is_held
 from esp_cli.training.metrics import read_last_row
 from esp_cli.training.run_folder import RunFolder
 
@@ -116,10 +117,14 @@ class Scheduler:
 
         Returns:
             Whether it came to its end; False where the listener asked to stop.
+
+        Raises:
+            FolderLostError: the folder of the study was moved, replaced or deleted; its processes are ended.
         """
         going = True
         try:
             while True:
+                require_held(self.folder.path)
                 if going:
                     self._fill()
                 active = [run for run in self.runs if run.is_active]

@@ -25,14 +25,14 @@ from pydantic import Field
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
 from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_own, read_regular
+from esp_cli.files.locking import acquire, release
+from esp_cli.files.opening import open_own, read_regular, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
-from esp_cli.files.locking import acquire, release
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 
@@ -299,6 +299,7 @@ class StudyFolder:
         Links in its folder are left out: they would bring in files from anywhere.
         """
         part = self.path / self.runs / f".{cell.name}.part"
+        require_held(part)
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:

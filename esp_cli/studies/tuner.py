@@ -15,6 +15,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from esp_cli.files.documents import shortened
+from esp_cli.files.opening import require_held
 from esp_cli.files.writing import mend_last_line, remove_file, replace_file
 from esp_cli.studies.engine import Engine
 from esp_cli.studies.scheduler import Run, Scheduler
@@ -74,7 +75,7 @@ class Trials:
         path = folder.path / JOURNAL
         mend_last_line(path)
         try:
-            storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock()))
+            storage = optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_HeldLock(path)))
             self.studies = {prior: self._study(storage, prior) for prior in self.tuning.priors}
         except (ValueError, KeyError, TypeError, AttributeError) as error:  # whatever Optuna stumbles over
             raise StudyError(f"{path} is damaged: {shortened(str(error))}; choose another --out") from None
@@ -254,7 +255,11 @@ class Tuner(Scheduler):
 class _HeldLock:
     """No lock: that of the tuning's folder is held, and no kill leaves a file behind."""
 
+    def __init__(self, journal: Path) -> None:
+        self._journal = journal
+
     def acquire(self) -> bool:
+        require_held(self._journal)
         return True
 
     def release(self) -> None:

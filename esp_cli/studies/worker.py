@@ -17,11 +17,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
 
+from esp_cli.files.locking import acquire, is_held
 from esp_cli.studies.engine_local import APPLICATION, LocalEngine, LocalJob
 from esp_cli.studies.versions import versions
 from esp_cli.training.checkpoint_names import FILE_NAME, checkpoints_in, place_of
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, FINAL, LOCK, LOG, METRICS, POLICY
-from esp_cli.files.locking import acquire, is_held
 from esp_envs.errors import UserError
 
 CHUNK_BYTES = 8 * 2**20

@@ -14,7 +14,7 @@ from esp_cli.files.documents import one_sentence, validate
 from esp_cli.files.suggesting import did_you_mean
 from esp_cli.files.tables import flat, read_table
 from esp_cli.training.config import SECTIONS, RunConfig, completed
-from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
+from esp_cli.training.run_folder import RunFolder, read_run_config
 from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
@@ -57,7 +57,7 @@ def read_config_file(path: Path) -> ConfigFile:
         return _of_run(path, parse_config(RunFolder.open(path).config, path))
     table = read_table(path)
     if "format" in table:
-        return _of_run(path, parse_config(RUN_FORMAT.read(path), path))
+        return _of_run(path, parse_config(read_run_config(path)[0], path))
     choices, settings = {}, {}
     for name, value in flat(table, whole=("prior.weights",)):
         if name in CHOICES:

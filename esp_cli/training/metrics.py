@@ -22,7 +22,7 @@ from torch import Tensor
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_own
+from esp_cli.files.opening import open_own, require_held
 from esp_cli.files.writing import mend_last_line, replace_file
 from esp_cli.training.trackers import Sink
 from esp_envs.errors import UserError
@@ -79,6 +79,7 @@ class MetricsWriter:
 
         Raises:
             MetricsError: a value is neither a number nor a list of numbers.
+            FolderLostError: the folder of the run was moved, replaced or deleted.
             OSError: the disk is full.
         """
         row: dict[str, Any] = {"step": int(step)}
@@ -89,6 +90,7 @@ class MetricsWriter:
         line = json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with attempting("write", self._path, MetricsError):
             reach("metrics")
+            require_held(self._path)
             # a disk about to be full takes a part only; writing the rest then says so
             while line:
                 line = line[self._file.write(line) :]

@@ -2,7 +2,7 @@
 
 Layout::
 
-    config.json                             the resolved configuration
+    config.json                             the resolved configuration, and the identity of the run
     metrics.jsonl                           a row per update, see esp_cli.training.metrics
     checkpoints/step-000000500000.safetensors   the newest two; only step-...-final.safetensors when training is done
     policy.safetensors                      the trained policy
@@ -10,7 +10,8 @@ Layout::
     run.lock                                held by the process that trains; says which
 
 Every file but the metrics is replaced as a whole. A process may be killed at any moment: the kernel lets go of its
-lock, and the next one goes on from the newest checkpoint that is good.
+lock, and the next one goes on from the newest checkpoint that is good. A checkpoint carries the identity of its run and
+a digest of its configuration; that of another run is neither resumed nor removed.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
@@ -28,7 +30,8 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import attempting
 from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_own
+from esp_cli.files.locking import LockError, acquire, release
+from esp_cli.files.opening import open_own, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
@@ -39,11 +42,10 @@ from esp_cli.training.checkpoint import (
 )
 from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
-from esp_cli.files.locking import LockError, acquire, release
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 from esp_envs.errors import UserError
-from esp_envs.policy_format import POLICY_FORMAT
+from esp_envs.policy_format import POLICY_FORMAT, digest
 
 
 class RunFolderError(UserError):
@@ -51,6 +53,21 @@ class RunFolderError(UserError):
 
 
 RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolderError)
+_RUN_ID, _CONFIG_SHA256 = "run_id", "config_sha256"
+"""Keys of `config.json` and of a checkpoint's description; folders and checkpoints of esp 0.1 may lack them."""
+
+
+def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
+    """Read the `config.json` of a run: its configuration, and its identity where it has one.
+
+    Raises:
+        RunFolderError: it is missing, damaged, foreign or newer.
+    """
+    config = RUN_FORMAT.read(path)
+    identity = config.pop(_RUN_ID, None)
+    if not isinstance(identity, str | None):
+        raise RunFolderError(f"{path} is damaged: its {_RUN_ID} is not a text")
+    return config, identity
 
 
 class RunFolder:
@@ -59,11 +76,11 @@ class RunFolder:
     Attributes:
         path: the folder.
         config: the resolved configuration that the run was made with.
+        identity: of the run, drawn when it was made; None of a run of esp 0.1.
     """
 
-    def __init__(self, path: Path, config: dict[str, Any]) -> None:
-        self.path = path
-        self.config = config
+    def __init__(self, path: Path, config: dict[str, Any], identity: str | None = None) -> None:
+        self.path, self.config, self.identity = path, config, identity
 
     @property
     def metrics_path(self) -> Path:
@@ -96,15 +113,15 @@ class RunFolder:
 
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
-            config: resolved configuration, JSON-able; the keys ``format`` and ``version`` are the folder's own.
+            config: resolved configuration, JSON-able; the keys ``format``, ``version`` and ``run_id`` are taken.
             initial: weights of the policy that the run starts from.
 
         Raises:
             RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
         """
         path = Path(path)
-        if "format" in config or "version" in config:
-            raise RunFolderError("a configuration may not use the reserved keys 'format' and 'version'")
+        if taken := {"format", "version", _RUN_ID} & set(config):
+            raise RunFolderError(f"a configuration may not use the reserved key '{min(taken)}'")
         try:
             resolved = json.loads(json.dumps(dict(config), allow_nan=False))
         except (TypeError, ValueError, RecursionError) as error:
@@ -112,9 +129,10 @@ class RunFolder:
         with attempting("make the run folder", path, RunFolderError):
             if path.exists() and not path.is_dir():
                 raise RunFolderError(f"{path} is a file; choose another --out")
+            require_held(path)
             path.mkdir(parents=True, exist_ok=True)
             _refuse_taken(path)
-            folder = cls(path, resolved)
+            folder = cls(path, resolved, secrets.token_hex(16))
             with folder.lock():
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path)
@@ -124,7 +142,7 @@ class RunFolder:
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
                     write_policy(folder.initial_path, initial, {})
-                RUN_FORMAT.write(path / CONFIG, resolved)
+                RUN_FORMAT.write(path / CONFIG, {_RUN_ID: folder.identity, **resolved})
         return folder
 
     @classmethod
@@ -143,7 +161,7 @@ class RunFolder:
             raise RunFolderError(
                 f"{path} is no run folder: it has no {CONFIG}; give the folder that esp train --out made"
             )
-        return cls(path, RUN_FORMAT.read(file))
+        return cls(path, *read_run_config(file))
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -188,12 +206,12 @@ class RunFolder:
 
         Write the metrics of the step first: they are flushed to the disk before the checkpoint that stands for them.
         The newest two and the newest final one are kept. Checkpoints past ``step`` go, as the run has gone back from
-        there.
+        there; those of another run stay.
 
         Args:
             step: env steps per seed.
             tensors: state by name.
-            meta: JSON-able description; ``step`` is added.
+            meta: JSON-able description; ``step``, the identity and the digest are added.
             final: training is done.
 
         Returns:
@@ -204,12 +222,14 @@ class RunFolder:
         """
         path = self.checkpoint_path(step, final)
         with attempting("write", path, RunFolderError):
+            require_held(path)
             path.parent.mkdir(exist_ok=True)
             sync_file(self.metrics_path)
-        save_checkpoint(path, tensors, {**meta, "step": step})
+        save_checkpoint(path, tensors, {**meta, **self._stamp(), "step": step})
         with attempting("remove old checkpoints beside", path, RunFolderError):
             for file in superseded(self.checkpoints(), step):
-                remove_file(file)
+                if not self._is_foreign(file):
+                    remove_file(file)
         return path
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> Path:
@@ -239,7 +259,8 @@ class RunFolder:
             Its tensors, on the CPU, and its description, with ``step``; None where the run has written none yet.
 
         Raises:
-            RunFolderError: there are checkpoints, and all are damaged.
+            RunFolderError: there are checkpoints, and all are damaged, or the newest good one is of another run or
+                another configuration.
         """
         problem = None
         for file in reversed(self.checkpoints()):
@@ -251,9 +272,10 @@ class RunFolder:
                 if file.exists():  # another process may have ended the run, and removed it, since it was listed
                     problem = problem or str(error)
                 continue
+            self._refuse_other(file, meta)
             if problem:
                 note(f"{problem}; going back to step {step_of(file)}")
-            return tensors, meta
+            return tensors, {key: value for key, value in meta.items() if key not in (_RUN_ID, _CONFIG_SHA256)}
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
         return None
@@ -281,19 +303,44 @@ class RunFolder:
             os.close(open_own(self.metrics_path, os.O_WRONLY))
         return truncate_metrics(self.metrics_path, after_step)
 
+    def _stamp(self) -> dict[str, Any]:
+        """Return what a checkpoint says of the run that it is of."""
+        return {_RUN_ID: self.identity, _CONFIG_SHA256: digest({}, self.config)}
+
+    def _refuse_other(self, file: Path, meta: Mapping[str, Any]) -> None:
+        """Refuse a checkpoint of another run, or one that was written under another configuration.
+
+        Raises:
+            RunFolderError: it is one.
+        """
+        stamp = self._stamp()
+        if meta.get(_RUN_ID) != stamp[_RUN_ID]:
+            raise RunFolderError(f"{file} is a checkpoint of another run; move it out of this folder")
+        if meta.get(_CONFIG_SHA256, stamp[_CONFIG_SHA256]) != stamp[_CONFIG_SHA256]:
+            raise RunFolderError(
+                f"{file} was written under another configuration than that in {self.path / CONFIG}; restore that file, "
+                "or train anew under another --out"
+            )
+
+    def _is_foreign(self, file: Path) -> bool:
+        """Return whether a checkpoint is of another run; a damaged one says nothing of the kind."""
+        with contextlib.suppress(CheckpointError):
+            return read_description(file).get(_RUN_ID) != self.identity
+        return False
+
     def _remove_superseded(self) -> None:
         """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
         if any(map(is_final, files)):
             with attempting("remove old checkpoints in", self.path / CHECKPOINTS, RunFolderError):
                 for file in files:
-                    if not is_final(file):
+                    if not is_final(file) and not self._is_foreign(file):
                         remove_file(file)
 
     def _remove_half_written(self) -> None:
         for folder in (self.path, self.path / CHECKPOINTS):
             for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
-                file.unlink(missing_ok=True)
+                remove_file(file)
 
 
 def _refuse_taken(path: Path) -> None:

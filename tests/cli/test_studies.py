@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -16,12 +15,12 @@ from esp_cli import app, console
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
+from esp_cli.files.locking import acquire, release
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
-from esp_cli.files.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
 from tests.forks import fork, said, wait
@@ -209,8 +208,9 @@ def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, f
     assert "holds another study" in refused(*options)
     options[-1] = tmp_path / "t"
     (tmp_path / "t").mkdir()
-    with contextlib.closing(os.fdopen(acquire(tmp_path / "t" / "study.lock"))):
-        assert "is in use by process" in refused(*options)
+    lock = acquire(tmp_path / "t" / "study.lock")
+    assert "is in use by process" in refused(*options)
+    release(lock)
     assert not (tmp_path / "t" / "runs").exists()
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
+from esp_cli.files.locking import taking_turns
 from esp_cli.policies import bundling, manifest
 from esp_cli.policies.bundled import find, load_entry, open_policy
 from esp_cli.policies.bundling import best_seed, bundle, play_greedily, score_of
@@ -22,7 +23,6 @@ from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.manifest import MANIFEST, Entry, bundled_folder, read_bundled, standard_name
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
-from esp_cli.files.locking import taking_turns
 from esp_cli.training.play import Episodes
 from tests.export.policies import drawn_policy
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from esp_cli.files import faults
+from esp_cli.files.locking import acquire
 from esp_cli.studies import worker as worker_module
 from esp_cli.studies.mirror import FileGoneError, Mirror
 from esp_cli.studies.versions import refuse_difference, versions
 from esp_cli.studies.worker import CellWorker, LeaseLostError
-from esp_cli.files.locking import acquire
 from esp_cli.training.metrics import read_metrics
 from tests.training.runs import tiny_folder
 

@@ -84,7 +84,8 @@ def run_state(path: Path) -> str:
         tensors, meta = load_checkpoint(file)
         for name in sorted(tensors):
             digest.update(name.encode() + tensors[name].numpy().tobytes())
-        digest.update(str(sorted((key, value) for key, value in meta.items() if key != "elapsed_s")).encode())
+        told = sorted((key, value) for key, value in meta.items() if key not in ("elapsed_s", "run_id"))
+        digest.update(str(told).encode())
     for row in read_metrics(path / "metrics.jsonl"):
         digest.update(repr([(key, value) for key, value in row.items() if not key.startswith("time/")]).encode())
     digest.update(str(sorted(entry.name for entry in path.iterdir() if entry.name not in ("log.txt",))).encode())

@@ -58,7 +58,9 @@ def test_create_then_open_gives_the_configuration_back(folder):
         "checkpoints",
         "run.lock",
     }
-    assert json.loads((folder.path / "config.json").read_text()) == {"format": "esp-run", "version": 1, **CONFIG}
+    document = json.loads((folder.path / "config.json").read_text())
+    assert document == {"format": "esp-run", "version": 1, "run_id": folder.identity, **CONFIG}
+    assert opened.identity == folder.identity
 
 
 def test_the_configuration_is_kept_as_json_shows_it(tmp_path):
