@@ -64,14 +64,14 @@ def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
         writer = meta.get("esp_version", __version__)
         return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
     folder = RunFolder.open(path)
-    notes: list[str] = []
+    config, notes = parse_config(folder.config, path), list[str]()
     found = folder.latest_checkpoint(notes.append)
     if found is None and folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
-        return _build(path, parse_config(folder.config, path), *read_policy(folder.policy_path))
+        return _build(path, config, *read_policy(folder.policy_path))
     if found is None:
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
     tensors, meta = found
-    return _build(path, parse_config(folder.config, path), below(tensors, "policy"), meta, tuple(notes))
+    return _build(path, config, below(tensors, "policy"), meta, tuple(notes))
 
 
 def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:

@@ -304,8 +304,9 @@ class RunFolder:
         return truncate_metrics(self.metrics_path, after_step)
 
     def _stamp(self) -> dict[str, Any]:
-        """Return what a checkpoint says of the run that it is of."""
-        return {_RUN_ID: self.identity, _CONFIG_SHA256: digest({}, self.config)}
+        """Return what a checkpoint says of the run that it is of; a run may go on on another device."""
+        decisive = {key: value for key, value in self.config.items() if key != "device"}
+        return {_RUN_ID: self.identity, _CONFIG_SHA256: digest({}, decisive)}
 
     def _refuse_other(self, file: Path, meta: Mapping[str, Any]) -> None:
         """Refuse a checkpoint of another run, or one that was written under another configuration.

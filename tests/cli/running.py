@@ -60,6 +60,13 @@ def written(path: Path, content: object) -> Path:
     return path
 
 
+def stored_config(run: Path) -> dict[str, Any]:
+    """Return what a run folder says of its configuration, as `--print-config` prints it: without its identity."""
+    document = json.loads((run / "config.json").read_text())
+    del document["run_id"]
+    return document
+
+
 def edit_config(run: Path, **changes: Any) -> Path:
     """Change a run's configuration by hand and return its folder."""
     file = run / "config.json"
@@ -136,13 +143,13 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "a network larger than the file": (
         lambda run: edit_config(run, network={"hidden": [4096] * 16}),
-        "the weights do not fit the configuration",
+        "was written under another configuration",
     ),
     "a network of negative size": (
         lambda run: edit_config(run, network={"hidden": [-8]}),
         "bad value -8",
     ),
-    "another number of seeds": (lambda run: edit_config(run, seeds=[3]), "the weights do not fit the configuration"),
+    "another number of seeds": (lambda run: edit_config(run, seeds=[3]), "was written under another configuration"),
     "an empty policy file": (lambda run: _rewrite(run / "policy.safetensors", b""), "is no safetensors file"),
     "a text as a policy file": (lambda run: _rewrite(run / "notes.txt", b"train more, sleep less"), "safetensors"),
     "a truncated policy file": (lambda run: _truncate(run / "policy.safetensors"), "is truncated"),

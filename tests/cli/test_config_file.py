@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
-from esp_cli.training.run_folder import RUN_FORMAT
-from tests.cli.running import printed, refused, written
+from esp_cli.training.run_folder import RunFolder
+from tests.cli.running import printed, refused, stored_config, written
 
 
 def test_a_run_is_configured_again_from_its_folder_and_from_its_file(finished: Path) -> None:
-    stored = json.loads((finished / "config.json").read_text())
+    stored = stored_config(finished)
     assert printed("--config", finished) == stored
     assert printed("--config", finished / "config.json") == stored
 
@@ -187,7 +186,7 @@ def test_a_name_that_is_near_to_nothing_gets_the_list() -> None:
 
 
 def test_a_configuration_without_the_new_key_is_read_as_before(finished: Path) -> None:
-    stored = RUN_FORMAT.read(finished / "config.json")
-    del stored["init_from"]
-    assert parse_config(stored, finished) == parse_config(RUN_FORMAT.read(finished / "config.json"), finished)
+    stored = RunFolder.open(finished).config
+    without = {key: value for key, value in stored.items() if key != "init_from"}
+    assert parse_config(without, finished) == parse_config(stored, finished)
     assert RunConfig.model_fields["init_from"].default is None

@@ -13,7 +13,7 @@ from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.policy_format import POLICY_FORMAT
-from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, train_tiny, written
+from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, stored_config, train_tiny, written
 
 
 def initial_of(run: Path) -> dict[str, torch.Tensor]:
@@ -75,7 +75,7 @@ def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finishe
 def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp_path: Path) -> None:
     run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", finished, steps=50)
     assert read_config_file(run).choices["init_from"] == str(finished)
-    assert printed("--config", run) == json.loads((run / "config.json").read_text())
+    assert printed("--config", run) == stored_config(run)
 
 
 def other_than(run: Path) -> None:
@@ -86,14 +86,14 @@ def other_than(run: Path) -> None:
 
 def test_a_run_is_started_again_from_its_own_copy_whatever_became_of_the_policy(copied: Path, tmp_path: Path) -> None:
     run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
-    stored, weights = json.loads((run / "config.json").read_text()), initial_of(run)
+    stored, weights = stored_config(run), initial_of(run)
     for change in (other_than, shutil.rmtree):
         change(copied)
         assert printed("--config", run) == stored
         again = tmp_path / change.__name__
         esp("train", "--config", run, "--out", again)
         assert all(torch.equal(tensor, weights[name]) for name, tensor in initial_of(again).items())
-        assert json.loads((again / "config.json").read_text()) == stored
+        assert stored_config(again) == stored
     assert "cannot start 3 seed(s)" in refused("train", "--config", run, "--seeds", 3, "--out", tmp_path / "more")
     assert "is [1, 8] there but [1, 9] in" in refused("train", "--config", run, "--set", "network.hidden=[9]")
 
@@ -112,7 +112,7 @@ def test_without_a_copy_the_policy_has_to_be_the_one_that_the_run_started_from(c
     bare = written(tmp_path / "bare.json", (run / "config.json").read_text())
     (run / "initial-policy.safetensors").unlink()
     for where in (bare, run):
-        assert printed("--config", where) == json.loads(bare.read_text())
+        assert printed("--config", where) == stored_config(run)
     other_than(copied)
     started = f"started from the policy {copied}, which"
     sentence = refused("train", "--config", bare, "--print-config")
