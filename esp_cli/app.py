@@ -56,6 +56,7 @@ class LazyGroup(TyperGroup):
         extra["standalone_mode"] = False  # usage errors then come here instead of being printed in a box
         try:
             _refuse_empty(sys.argv[1:] if args is None else args)
+            _refuse_deleted_folder()
             code = super().main(args, prog_name or self.name, **extra)
         except Exception as failure:
             code = report(failure)
@@ -78,6 +79,14 @@ def _refuse_empty(words: Sequence[str]) -> None:
         if not word or re.fullmatch(r"--[a-z-]+=", word):
             where = f"'{word}'" if word else f"argument {place + 1}"
             raise UserError(f"{where} is empty; write its value, or leave it out")
+
+
+def _refuse_deleted_folder() -> None:
+    """Refuse to work in a folder that was deleted; libraries end the process where they meet one."""
+    try:
+        os.getcwd()  # noqa: PTH109 - no Path is wanted
+    except FileNotFoundError:
+        raise UserError("the working directory was deleted; change to another one (cd)") from None
 
 
 def build_command(name: str, target: str) -> Any:
@@ -179,5 +188,6 @@ def root(
 
 def main() -> None:
     """Run the application on the command line of this process."""
+    console.fit_encoding()
     machine.prepare()
     app()

@@ -16,10 +16,10 @@ import torch.profiler  # noqa: F401 - so does the first step of an optimizer
 
 from esp_cli import app
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.files import faults
 from esp_cli.networks.build import NETWORKS
 from esp_cli.studies import engine_local
 from esp_envs.registry import TASKS
+from tests import faults
 
 PATIENCE_S = 240.0
 
@@ -118,7 +118,7 @@ class ForkEngine:
             os.closerange(3, 256)  # the lock of the study is not theirs
             engine_local.follow_parent()
             forget_own_code(Path.cwd())
-            faults.planned = None
+            faults.forget()
             app.app(list(arguments))
 
         return ForkJob(fork(job, log.parent, log), log)

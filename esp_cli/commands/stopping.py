@@ -12,7 +12,9 @@ from esp_cli import console
 
 @contextmanager
 def stop_requests(sentence: str) -> Iterator[list[int]]:
-    """Turn the first Ctrl-C (or termination signal) into a request; a second one interrupts at once.
+    """Turn the first Ctrl-C (or SIGTERM, or the SIGHUP of a closed terminal) into a request; a second one interrupts.
+
+    A SIGHUP that `nohup` ignores stays ignored.
 
     Args:
         sentence: what the first one is answered with.
@@ -28,7 +30,9 @@ def stop_requests(sentence: str) -> Iterator[list[int]]:
         requests.append(number)
         console.note(f"{sentence} (press Ctrl-C again to stop at once)")
 
-    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    heard = [signal.SIGINT, signal.SIGTERM]
+    heard += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []
+    previous = {number: signal.signal(number, handler) for number in heard}
     try:
         yield requests
     finally:

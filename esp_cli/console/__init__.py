@@ -13,13 +13,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.text import Text
 
 from esp_cli.console.progress import TrainingProgress as TrainingProgress
 from esp_cli.console.progress import live_progress as live_progress
+from esp_cli.console.streams import SafeConsole, escaped
 from esp_cli.console.streams import err as err
 from esp_cli.console.streams import error as error
+from esp_cli.console.streams import fit_encoding as fit_encoding
 from esp_cli.console.streams import note as note
 from esp_cli.console.streams import out as out
 from esp_cli.console.streams import paged as paged
@@ -48,8 +49,8 @@ def table(
         title: line above, such as what was measured.
         caption: line below, such as the reward convention.
     """
-    target = out if out.is_terminal else Console(highlight=False, width=PIPE_WIDTH)
-    laid = lay_out(columns, [[str(cell) for cell in row] for row in rows], target.width)
+    target = out if out.is_terminal else SafeConsole(highlight=False, width=PIPE_WIDTH)
+    laid = lay_out(columns, [[escaped(str(cell)) for cell in row] for row in rows], target.width)
     if title:  # outside the grid, which would wrap it to its own width
         target.print(Text(title, style="bold"), soft_wrap=not out.is_terminal)
     for part in laid if isinstance(laid, list) else [laid]:
@@ -80,8 +81,9 @@ def write_json(path: str | Path, value: object) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    text = json.dumps(_plain(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    if str(path) == "-":
+    shown = str(path) == "-"  # in ASCII, which every terminal shows and no control character leaves
+    text = json.dumps(_plain(value), indent=2, ensure_ascii=shown, allow_nan=False) + "\n"
+    if shown:
         sys.stdout.write(text)
         sys.stdout.flush()
         return

@@ -1,29 +1,92 @@
-"""Standard output for results, standard error for the person at the screen."""
+"""Standard output for results, standard error for the person at the screen.
+
+Whatever a file or a command line brought into a text, no control character of it reaches the terminal.
+"""
 
 from __future__ import annotations
 
+import codecs
+import io
 import os
 import pydoc
+import re
 import sys
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
+from rich.segment import Segment
 from rich.text import Text
 
-
-class _Notes(Console):
-    """Standard error, which nobody has to read: long work goes on where a pipe behind it has closed."""
-
-    def on_broken_pipe(self) -> None:
-        """Say no more."""
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_IN_ASCII = {"±": "+-", "━": "=", "╌": "-", "→": "->", "–": "-", "…": "...", "²": "2"}
+"""What is written for a character that a terminal cannot show; a question mark for any other."""
 
 
-out = Console(highlight=False)
-err = _Notes(stderr=True, highlight=False)
+def escaped(text: str) -> str:
+    r"""Return a text whose control characters, line breaks and tabs aside, are written as "\x1b"."""
+    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+
+
+class SafeConsole(Console):
+    """A console that shows the control characters of texts and obeys only those of rich itself."""
+
+    def render(self, *args: Any, **kwargs: Any) -> Iterable[Segment]:
+        """Render as rich does; the place through which all that is printed goes."""
+        for segment in super().render(*args, **kwargs):
+            shown = segment.text if segment.control else escaped(segment.text)
+            yield segment if shown == segment.text else Segment(shown, segment.style)
+
+
+class _StandardError:
+    """Standard error of the moment, which nobody has to read: long work goes on where it cannot be written to."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @property
+    def rich_proxied_file(self) -> _StandardError:
+        """What rich writes to while its live line stands in for standard error."""
+        return self
+
+    @property
+    def _stream(self) -> Any:
+        return getattr(sys.stderr, "rich_proxied_file", sys.stderr)
+
+    def write(self, text: str) -> int:
+        """Write a text; after a failure (a closed pipe, a full disk, a terminal that has gone) say no more."""
+        self._attempt(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush what was written, or say no more."""
+        self._attempt(self._stream.flush)
+
+    def _attempt(self, action: Callable[..., object], *arguments: str) -> None:
+        try:
+            action(*arguments)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+
+
+out = SafeConsole(highlight=False)
+err = SafeConsole(file=_StandardError(), highlight=False)  # type: ignore[arg-type] # a stream in all that rich asks
+
+
+def fit_encoding() -> None:
+    """Let standard output and error write something else for a character that their encoding does not have."""
+    codecs.register_error("esp.ascii", _in_ascii)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # nothing, where a descriptor is closed
+            stream.reconfigure(errors="esp.ascii")
+
+
+def _in_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Return what stands for characters that cannot be encoded, and where to go on."""
+    assert isinstance(error, UnicodeEncodeError)
+    return "".join(_IN_ASCII.get(character, "?") for character in error.object[error.start : error.end]), error.end
 
 
 def say(text: str) -> None:

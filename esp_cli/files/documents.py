@@ -23,6 +23,7 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_DOCUMENT_BYTES = 16 * 2**20
 """Parsed JSON takes some 20 times the space of its text."""
 MAX_NESTING = 64
+_TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 _MAX_INTEGER = 2**63
 
 
@@ -169,13 +170,23 @@ def parse_value(text: str) -> Any:
             text, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite, parse_int=_bounded
         )
     except RecursionError:
-        raise UserError(f"brackets are nested more than {MAX_NESTING} deep") from None
+        raise UserError(_TOO_DEEP) from None
+    check_nesting(value)
+    return value
+
+
+def check_nesting(value: object) -> None:
+    """Refuse lists and tables that are nested more than `MAX_NESTING` deep.
+
+    Raises:
+        UserError: they are.
+    """
     level = [value]
     for _ in range(MAX_NESTING):
         level = [item for outer in level for item in _inside(outer)]
         if not level:
-            return value
-    raise UserError(f"brackets are nested more than {MAX_NESTING} deep")
+            return
+    raise UserError(_TOO_DEEP)
 
 
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:

@@ -11,6 +11,7 @@ import os
 import stat
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from esp_envs.errors import UserError
 
@@ -101,6 +102,19 @@ def open_folder(path: str | os.PathLike[str]) -> int:
     return os.open(os.path.relpath(path, held.path), flags, dir_fd=held.folder_fd)
 
 
+def own_folder(path: Path) -> Path:
+    """Return the path of a folder that the program keeps, which need not exist yet; a link there is not followed.
+
+    Raises:
+        FolderLostError: it is in a held folder that was moved, replaced or deleted.
+        OSError: a link is there.
+    """
+    require_held(path)
+    if path.is_symlink():
+        raise _irregular(path)
+    return path
+
+
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
     """Open a file that the program keeps in a folder of its own, such as a lock or a log; make it if missing.
 
@@ -131,10 +145,18 @@ def read_regular(path: str | os.PathLike[str], max_bytes: int) -> bytes | None:
     Raises:
         OSError: it is missing, unreadable or no regular file.
     """
-    descriptor = _regular(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), path)
-    with os.fdopen(descriptor, "rb") as file:
+    with open_regular(path) as file:
         content = file.read(max_bytes + 1)
     return content if len(content) <= max_bytes else None
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file, which a link may name, for reading; a pipe does not block.
+
+    Raises:
+        OSError: it is missing, unreadable or no regular file.
+    """
+    return os.fdopen(_regular(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), path), "rb")
 
 
 def _regular(descriptor: int, path: str | os.PathLike[str]) -> int:

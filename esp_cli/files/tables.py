@@ -9,7 +9,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from esp_cli.files.documents import DocumentError, parse_object, shortened
+from esp_cli.files.documents import DocumentError, check_nesting, parse_object, shortened
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import read_regular
 
@@ -38,6 +38,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
             raise DocumentError(f"{path} {error}; write TOML into a file whose name ends in .toml") from None
     try:
         table = tomllib.loads(text.decode("utf-8"))
+        check_nesting(table)
     except (ValueError, RecursionError) as error:
         raise DocumentError(f"{path} is not valid TOML: {shortened(str(error))}") from None
     for name, value in flat(table):

@@ -14,9 +14,13 @@ import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_folder, require_held
+from esp_cli.files.opening import open_folder, open_own, require_held
+from esp_envs.errors import UserError
 
+MAX_LINE_BYTES = 16 * 2**20
+"""Of a file of lines, such as metrics; what is longer was not written by this program."""
+_TAIL_BYTES = 2**18
+"""Longer than most lines."""
 TEMPORARY_PREFIX = ".esp-tmp-"
 """Names of half-written files begin so; what a killed process left under such a name may be removed."""
 
@@ -39,7 +43,7 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
         replace_file(os.path.realpath(path), content)
         return
     with path.open("wb", buffering=0) as file:
-        _write_all(file.fileno(), content)
+        write_all(file.fileno(), content)
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
@@ -62,11 +66,28 @@ def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) 
     Args:
         path: a file of lines, or none.
         is_whole: whether what is left is a line that lacks its break alone; then it gets one.
+
+    Raises:
+        UserError: its last line is longer than any line can be.
+        OSError: a link or no regular file is there, or it cannot be written.
     """
-    content = path.read_bytes() if path.is_file() else b""
-    whole, line_break, last = content.rpartition(b"\n")
-    if last:
-        replace_file(path, content + b"\n" if is_whole is not None and is_whole(last) else whole + line_break)
+    if not path.exists():
+        return
+    with os.fdopen(open_own(path, os.O_RDWR), "rb+", buffering=0) as file:
+        size, tail = file.seek(0, os.SEEK_END), b""
+        while b"\n" not in tail and len(tail) < size:
+            if len(tail) > MAX_LINE_BYTES:
+                raise UserError(
+                    f"{path} is damaged: its last line has more than {MAX_LINE_BYTES} bytes; remove that line"
+                )
+            start = file.seek(max(0, size - max(2 * len(tail), _TAIL_BYTES)))
+            tail = file.read(size - start)
+        last = tail.rpartition(b"\n")[2]
+        if last and is_whole is not None and is_whole(last):
+            file.seek(size)
+            file.write(b"\n")
+        elif last:
+            file.truncate(size - len(last))
 
 
 @contextlib.contextmanager
@@ -96,19 +117,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
                 with contextlib.suppress(OSError):  # a new file, or one of somebody else
                     if stat.S_ISREG((before := os.lstat(path.name, dir_fd=folder)).st_mode):
                         os.fchmod(descriptor, before.st_mode & 0o777)
-                yield functools.partial(_write_all, descriptor)
-                reach("fsync")
+                yield functools.partial(write_all, descriptor)
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
-            reach("rename")
             require_held(path)
             os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
         except BaseException:
             with contextlib.suppress(OSError):
                 os.unlink(temporary, dir_fd=folder)
             raise
-        reach("renamed")
         # some network file systems cannot flush a folder; the rename itself has succeeded by now
         with contextlib.suppress(OSError):
             _sync_folder(folder)
@@ -121,7 +139,6 @@ def remove_file(path: Path) -> None:
         FolderLostError: it is in a held folder that was moved, replaced or deleted.
         OSError: it cannot be removed.
     """
-    reach("unlink")
     with _named(path), contextlib.suppress(FileNotFoundError), _folder_of(path) as folder:
         os.unlink(path.name, dir_fd=folder)
 
@@ -133,15 +150,11 @@ def sync_file(path: Path) -> None:
             os.fsync(file.fileno())
 
 
-def _write_all(descriptor: int, content: bytes) -> None:
-    """Write everything; a kill on purpose comes in the middle of it."""
+def write_all(descriptor: int, content: bytes) -> None:
+    """Write every byte; a disk about to be full takes a part only, and the rest then says so."""
     rest = memoryview(content)
-    half = len(rest) // 2
     while rest:
-        rest = rest[os.write(descriptor, rest[: max(half, 1)] if half else rest) :]
-        if half:
-            reach("write")
-            half = 0
+        rest = rest[os.write(descriptor, rest) :]
 
 
 @contextlib.contextmanager

@@ -24,7 +24,6 @@ from pydantic import Field
 
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
-from esp_cli.files.faults import reach
 from esp_cli.files.locking import acquire, release
 from esp_cli.files.opening import open_own, read_regular, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
@@ -138,7 +137,6 @@ class StudyFolder:
         folder, differs = cls.planned(path, study)
         path.mkdir(parents=True, exist_ok=True)
         if differs:
-            reach("study")
             STUDY_FORMAT.write(path / STUDY, folder.study.model_dump(mode="json"))
         return folder
 

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from esp_cli.files.documents import DocumentError, parse_object, shortened
 from esp_cli.files.failures import attempting
+from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
 from esp_envs.policy_format import METADATA_KEY, digest
@@ -159,14 +160,11 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
 
 
 def _read(path: Path, whole: bool = True) -> bytes:
-    """Return the bytes of a plain file whose header, as declared, fits into it; all of them, or up to its tensors."""
-    # a pipe or a device would block or never end, so only plain files are opened
+    """Return the bytes of a plain file that has the size which its header declares; all, or up to its tensors."""
     if not path.is_file():
         raise CheckpointError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > _MAX_FILE_BYTES:
-            raise CheckpointError(f"has {size} bytes, more than the {_MAX_FILE_BYTES} that are read")
         prefix = file.read(_LENGTH_BYTES)
         if len(prefix) < _LENGTH_BYTES:
             raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
@@ -175,7 +173,25 @@ def _read(path: Path, whole: bool = True) -> bytes:
             raise CheckpointError(
                 "is truncated or no safetensors file: the header that it declares does not fit into it"
             )
-        return prefix + file.read(size - _LENGTH_BYTES if whole else header_bytes)
+        header = file.read(header_bytes)
+        if not whole:
+            return prefix + header
+        data_bytes = size - _LENGTH_BYTES - header_bytes
+        if size > _MAX_FILE_BYTES or data_bytes != _declared_bytes(parse_object(header, "header")):
+            raise CheckpointError(f"is truncated or damaged: its size, {size} bytes, is not what its header declares")
+        try:
+            return prefix + header + file.read(data_bytes)
+        except MemoryError:
+            raise CheckpointError(f"does not fit into the memory of this machine: it has {size} bytes") from None
+
+
+def _declared_bytes(header: Mapping[str, Any]) -> int:
+    """Return where the data of the last tensor of a header ends; -1 where it does not say so."""
+    entries = [entry for name, entry in header.items() if name != "__metadata__"]
+    try:
+        return max((int(entry["data_offsets"][1]) for entry in entries), default=0)
+    except (TypeError, KeyError, IndexError, ValueError):
+        return -1
 
 
 def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import itertools
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from esp_cli.files.failures import attempting
-from esp_cli.files.faults import reach
-from esp_cli.files.opening import open_own, require_held
-from esp_cli.files.writing import mend_last_line, replace_file
+from esp_cli.files.opening import open_own, open_regular, require_held
+from esp_cli.files.writing import MAX_LINE_BYTES, mend_last_line, replacing, write_all
 from esp_cli.training.trackers import Sink
 from esp_envs.errors import UserError
 
@@ -61,8 +61,7 @@ class MetricsWriter:
         self._sinks = sinks
         with attempting("write", self._path, MetricsError):
             mend_last_line(self._path, lambda line: _parse(line) is not None)
-            # closed by close(), which __exit__ calls
-            self._file = os.fdopen(open_own(self._path, os.O_WRONLY | os.O_APPEND), "ab", buffering=0)
+            self._descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND)
 
     def __enter__(self) -> MetricsWriter:
         return self
@@ -89,18 +88,15 @@ class MetricsWriter:
             row[name] = _plain(name, value)
         line = json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with attempting("write", self._path, MetricsError):
-            reach("metrics")
             require_held(self._path)
-            # a disk about to be full takes a part only; writing the rest then says so
-            while line:
-                line = line[self._file.write(line) :]
+            write_all(self._descriptor, line)
         del row["step"]
         for sink in self._sinks:
             sink.write(int(step), row)
 
     def close(self) -> None:
         """Close the file and the sinks."""
-        self._file.close()
+        os.close(self._descriptor)
         for sink in self._sinks:
             sink.close()
 
@@ -119,7 +115,7 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     size, row = _TAIL_BYTES, None
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
         end = start = file.seek(0, os.SEEK_END)
-        while row is None and start > 0:
+        while row is None and start > 0 and size <= 2 * MAX_LINE_BYTES:
             start = file.seek(max(0, end - size))
             lines = reversed(file.read().split(b"\n"))
             row = next((row for row in map(_parse, lines) if row is not None), None)
@@ -142,12 +138,14 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
     Raises:
         MetricsError: the file is missing, damaged elsewhere than at its end, or cannot be written.
     """
-    path = Path(path)
-    rows = _rows(path)
-    kept = [line for line, row in rows if row["step"] <= last_step]
-    with attempting("write", path, MetricsError):
-        replace_file(path, b"".join(line + b"\n" for line in kept))
-    return len(rows) - len(kept)
+    path, removed = Path(path), 0
+    with attempting("write", path, MetricsError), replacing(path) as write:
+        for line, row in _rows(path):
+            if row["step"] <= last_step:
+                write(line + b"\n")
+            else:
+                removed += 1
+    return removed
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -204,21 +202,20 @@ def _number(name: str, value: Any) -> float | int | None:
     return value if math.isfinite(value) else None
 
 
-def _rows(path: Path) -> list[tuple[bytes, dict[str, Any]]]:
-    """Return each row with the line that it stands on."""
+def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Yield each row with the line that it stands on, without its break."""
     if not path.is_file():
         raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
-    with attempting("read", path, MetricsError):
-        lines = path.read_bytes().split(b"\n")
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        row = _parse(line)
-        if row is not None:
-            rows.append((line, row))
-        elif number < len(lines):
-            # only the text behind the last line break can be a line that a killed process had not finished
-            raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
-    return rows
+    with attempting("read", path, MetricsError), open_regular(path) as file:
+        for number in itertools.count(1):
+            line = file.readline(MAX_LINE_BYTES)
+            row = _parse(line)
+            if row is not None:
+                yield line.removesuffix(b"\n"), row
+            elif line.endswith(b"\n") or len(line) == MAX_LINE_BYTES:
+                raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
+            else:  # the end, or a line that a killed process had not finished
+                return
 
 
 def _parse(line: bytes) -> dict[str, Any] | None:

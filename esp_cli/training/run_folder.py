@@ -29,7 +29,6 @@ from torch import Tensor
 
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import attempting
-from esp_cli.files.faults import reach
 from esp_cli.files.locking import LockError, acquire, release
 from esp_cli.files.opening import open_own, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
@@ -244,7 +243,6 @@ class RunFolder:
             RunFolderError: a checkpoint cannot be removed (CheckpointError where the content cannot be stored, or the
                 file cannot be written).
         """
-        reach("policy")
         write_policy(self.policy_path, tensors, meta)
         self._remove_superseded()
         return self.policy_path

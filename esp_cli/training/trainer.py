@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from esp_cli.files.faults import reach
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics
@@ -199,7 +198,6 @@ class Trainer:
 
     def _evaluate(self) -> dict[str, Tensor]:
         """Play greedy and stochastic episodes; every seed's worlds depend on its seed, the step and the mode."""
-        reach("evaluation")
         env, row = self._eval_env, {}
         for mode in ("greedy", "stochastic"):
             stream = ("evaluation", mode, self.step)

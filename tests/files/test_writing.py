@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files import faults
-from esp_cli.files.writing import TEMPORARY_PREFIX, replace_file, write_file
+from esp_cli.files.writing import TEMPORARY_PREFIX, mend_last_line, replace_file, write_file
+from esp_envs.errors import UserError
+from tests.faults import Fault
 
 WRITERS = pytest.mark.parametrize("write", [write_file, replace_file])
 
@@ -58,10 +59,10 @@ def test_the_longest_names_are_taken(tmp_path, write):
 
 
 @WRITERS
-@pytest.mark.parametrize("place", ["write", "fsync", "rename"])
+@pytest.mark.parametrize("place", ["write", "fsync", "replace"])
 def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path, monkeypatch, write, place):
     (tmp_path / "a").write_bytes(b"old")
-    monkeypatch.setattr(faults, "planned", faults.Fault.parse(f"{place}:1:ENOSPC"))
+    Fault(place, 1, "ENOSPC").plan(monkeypatch)
     with pytest.raises(OSError, match="No space left on device"):
         write(tmp_path / "a", b"new")
     assert (tmp_path / "a").read_bytes() == b"old"
@@ -178,11 +179,11 @@ def test_missing_folders_are_made_for_a_file_that_the_user_names(tmp_path):
 
 
 def test_a_process_killed_at_a_place_leaves_the_old_or_the_new_file(tmp_path):
-    for place, seen in (("write", b"old"), ("fsync", b"old"), ("rename", b"old"), ("renamed", b"new")):
+    for place, seen in (("write", b"old"), ("fsync", b"old"), ("replace", b"old"), ("replaced", b"new")):
         replace_file(tmp_path / "a", b"old")
         child = os.fork()
         if child == 0:
-            faults.planned = faults.Fault.parse(f"{place}:1:KILL")
+            Fault(place, 1, "KILL").plan()
             replace_file(tmp_path / "a", b"new")
             os._exit(0)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -9
@@ -190,3 +191,29 @@ def test_a_process_killed_at_a_place_leaves_the_old_or_the_new_file(tmp_path):
     left = {entry.name for entry in tmp_path.iterdir()} - {"a"}
     assert len(left) == 3  # negative control: the kills came while a file was half-written
     assert all(name.startswith(TEMPORARY_PREFIX) for name in left)
+
+
+@pytest.mark.parametrize(
+    ("content", "mended"),
+    [
+        (b"", b""),
+        (b"a\nb\n", b"a\nb\n"),
+        (b"a\nb", b"a\n"),
+        (b"b", b""),
+        (b"a\nwhole", b"a\nwhole\n"),
+        (b"a\n" + b"x" * 700_000, b"a\n"),
+    ],
+)
+def test_a_torn_last_line_goes_and_a_whole_one_gets_its_break(tmp_path, content, mended):
+    (tmp_path / "a").write_bytes(content)
+    mend_last_line(tmp_path / "a", lambda line: line == b"whole")
+    assert (tmp_path / "a").read_bytes() == mended
+    mend_last_line(tmp_path / "missing")
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_last_line_of_gigabytes_is_refused_before_it_is_read(tmp_path):
+    with (tmp_path / "a").open("wb") as file:
+        file.truncate(40 * 2**30)  # a hole, which takes no space
+    with pytest.raises(UserError, match="its last line has more than"):
+        mend_last_line(tmp_path / "a")

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files import faults
-from esp_cli.files.locking import acquire
+from esp_cli.files.locking import acquire, release
 from esp_cli.studies import worker as worker_module
 from esp_cli.studies.mirror import FileGoneError, Mirror
 from esp_cli.studies.versions import refuse_difference, versions
 from esp_cli.studies.worker import CellWorker, LeaseLostError
 from esp_cli.training.metrics import read_metrics
+from tests.faults import Fault
 from tests.training.runs import tiny_folder
 
 WRITES_AND_WAITS = (
@@ -172,7 +172,7 @@ def test_folders_that_killed_workers_left_are_removed_and_those_in_use_stay(tmp_
         assert {"esp-cell-alive", "esp-cell-young"} < names
     finally:
         leave(made)
-        os.close(held)
+        release(held)
 
 
 def test_metrics_that_a_resumed_job_rewrote_replace_those_here(folder):
@@ -205,7 +205,7 @@ def test_a_checkpoint_comes_as_a_whole_or_not_at_all(folder, monkeypatch, fault)
         with pytest.raises(FileGoneError):
             mirror.fetch(name, stamp, lambda offset: read(offset) if offset < 3 else b"", "-")
     else:
-        monkeypatch.setattr(faults, "planned", faults.Fault.parse("write:1:ENOSPC"))
+        Fault("write", 1, "ENOSPC").plan(monkeypatch)
         with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
             mirror.fetch(name, stamp, read, "-")
     assert [file.name for file in (folder.path / "checkpoints").iterdir()] == [folder.checkpoint_path(100).name]

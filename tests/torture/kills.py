@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from esp_cli.files import faults
+from tests import faults
 from tests.forks import Job, fork, said, wait
 from tests.torture.disks import WHY_NOT, can_mount, start_on_full_disk, start_on_read_only_disk
 from tests.torture.runs import all_configs, newest_step, run_job, run_state
@@ -136,7 +136,8 @@ def _with(
     file_bytes: int = -1,
     clock_back: bool = False,
 ) -> None:
-    faults.planned = fault
+    if fault is not None:
+        fault.plan()
     if file_bytes >= 0:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, resource.RLIM_INFINITY))
     if clock_back:

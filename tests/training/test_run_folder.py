@@ -12,12 +12,12 @@ import sys
 import pytest
 import torch
 
-from esp_cli.files import faults
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
 from esp_cli.training.metrics import MetricsWriter, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_envs.policy_format import POLICY_FORMAT
+from tests.faults import Fault
 
 CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -175,11 +175,11 @@ def test_only_the_final_checkpoint_stays_beside_the_trained_policy(folder):
     assert folder.latest_checkpoint(pytest.fail)[1]["step"] == 300
 
 
-@pytest.mark.parametrize("place", ["renamed", "unlink"])
+@pytest.mark.parametrize("place", ["replaced", "unlink"])
 def test_checkpoints_that_a_kill_left_beside_the_trained_policy_go_at_the_next_start(folder, monkeypatch, place):
     write_checkpoints(folder, 100, 200)
     folder.write_checkpoint(300, weights(300), {}, final=True)
-    monkeypatch.setattr(faults, "planned", faults.Fault.parse(f"{place}:1:EIO"))
+    Fault(place, 1, "EIO").plan(monkeypatch)
     with pytest.raises(OSError, match="Input/output error"):
         folder.write_policy(weights(300), {})
     assert len(names(folder)) == 3

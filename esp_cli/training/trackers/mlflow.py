@@ -15,6 +15,7 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
+from esp_cli.files.opening import own_folder
 from esp_cli.files.tables import flat
 from esp_cli.files.writing import replace_file
 from esp_cli.training.trackers.sink import Row, TrackedRun, scalars
@@ -30,10 +31,11 @@ class MlFlow:
     def __init__(self, run: TrackedRun) -> None:
         folder = run.folder.absolute()
         self._seeds = run.seeds
-        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or (folder / "mlruns").as_uri())
+        store = own_folder(folder / "mlruns")
+        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or store.as_uri())
         found = self._client.get_experiment_by_name("esp")
         experiment = found.experiment_id if found is not None else self._client.create_experiment("esp")
-        file = folder / "mlruns" / "run-id"
+        file = store / "run-id"
         if file.is_file():
             self._run_id = file.read_text(encoding="utf-8").strip()
             self._client.update_run(self._run_id, status="RUNNING")
@@ -42,7 +44,7 @@ class MlFlow:
         params = [Param(name, str(value)[:_LONGEST_VALUE]) for name, value in flat(run.config)]
         for begin in range(0, len(params), _MOST_PARAMS):
             self._client.log_batch(self._run_id, params=params[begin : begin + _MOST_PARAMS])
-        file.parent.mkdir(exist_ok=True)
+        store.mkdir(exist_ok=True)
         replace_file(file, self._run_id.encode())
 
     def write(self, step: int, values: Row) -> None:

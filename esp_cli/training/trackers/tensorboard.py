@@ -6,6 +6,7 @@ from typing import Any
 
 from torch.utils.tensorboard import SummaryWriter
 
+from esp_cli.files.opening import own_folder
 from esp_cli.training.trackers.sink import Row, TrackedRun, scalars
 
 
@@ -29,8 +30,8 @@ class TensorBoard:
 
     def _board(self, seed: int | None) -> Any:
         if seed not in self._boards:
-            folder = self._run.folder / "tensorboard"
-            place = folder if seed is None else folder / f"seed-{seed}"
+            folder = own_folder(self._run.folder / "tensorboard")
+            place = folder if seed is None else own_folder(folder / f"seed-{seed}")
             # what a resumed run writes again is hidden, also where it begins anew without a checkpoint
             purge = self._run.first_step + 1 if self._run.first_step else 0
             self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)

@@ -8,6 +8,7 @@ from typing import Any
 
 import wandb
 
+from esp_cli.files.opening import own_folder
 from esp_cli.files.writing import replace_file
 from esp_cli.training.trackers.sink import Row, TrackedRun, scalars
 
@@ -20,7 +21,7 @@ class WeightsAndBiases:
     def __init__(self, run: TrackedRun) -> None:
         self._seeds = run.seeds
         folder = run.folder.absolute()
-        places = {f"WANDB_{place}_DIR": str(folder / "wandb" / place.lower()) for place in _PLACES}
+        places = {f"WANDB_{place}_DIR": str(own_folder(folder / "wandb") / place.lower()) for place in _PLACES}
         self._set = [name for name in places if name not in os.environ]  # until the run closes: the next has its own
         os.environ.update({name: places[name] for name in self._set})
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
