@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from esp_envs.errors import UserError
 from esp_envs.spec import (
     Continuous,
     Discrete,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
         generators_for,
         restore_generators,
     )
-    from esp_envs.lockstep import BatchedTask, Outcome, World, to_others
+    from esp_envs.batched import BatchedTask, Outcome, World, to_others
     from esp_envs.registry import make, register, task_class, task_names
     from esp_envs.scene import Body, Scene
 
@@ -47,6 +48,7 @@ __all__ = [
     "Step",
     "TaskSettings",
     "TaskSpec",
+    "UserError",
     "World",
     "generator_states",
     "generators_for",
@@ -64,7 +66,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import what makes worlds when it is asked for; a spec alone needs the standard library alone."""
     if name in __all__:
-        for module in map(import_module, ("esp_envs.base", "esp_envs.scene", "esp_envs.registry", "esp_envs.lockstep")):
+        for module in map(import_module, ("esp_envs.base", "esp_envs.scene", "esp_envs.registry", "esp_envs.batched")):
             if hasattr(module, name):
                 return getattr(module, name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

@@ -9,13 +9,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
+from esp_envs.breaking import Breaks, remaining
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter, Scene
 from esp_envs.spec import Continuous, TaskSpec
@@ -165,13 +166,36 @@ class TaskSettings(BaseModel):
         """Return the names of settings that change nothing beside the others."""
         return frozenset()
 
+    @classmethod
+    def breakable(cls) -> dict[str, Breaks]:
+        """Return what each setting that breaks a symmetry leaves of it, by the setting's name."""
+        return {
+            name: mark
+            for name, field in cls.model_fields.items()
+            for mark in field.metadata
+            if isinstance(mark, Breaks)
+        }
+
+    def broken(self) -> dict[str, Breaks]:
+        """Return what those leave that are not 0, each with the name of a planar group."""
+        marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name)}
+        return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
+
+    def left_of(self, whole: str, *further: Breaks) -> str:
+        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents"."""
+        return remaining(whole, (*self.broken().values(), *further))
+
+    def broken_in_words(self) -> str:
+        """Return what a reward convention adds about the settings that break a symmetry: ", wind 0.3"."""
+        return "".join(f", {name} {getattr(self, name):g}" for name in self.broken())
+
 
 class Environment(ABC):
     """A batch of worlds of one task.
 
     A subclass names its settings model, builds `spec` from settings in its constructor and implements the abstract
-    methods. `set_state`, `heuristic` and `scene` are optional: a task without them is trained and evaluated like any
-    other. Its class docstring is the environment card.
+    methods. `set_state`, `heuristic`, `scene` and `state_dict` are optional: a task without them is trained and
+    evaluated like any other. Its class docstring is the environment card.
     """
 
     Settings: ClassVar[type[TaskSettings]] = TaskSettings
@@ -210,13 +234,23 @@ class Environment(ABC):
             action: [S, E, N] int64 for a discrete action space, else [S, E, N, width] float32.
         """
 
-    @abstractmethod
     def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that `load_state_dict` needs to go on bit for bit, generators included."""
+        """Return what a resumed run needs of the worlds.
 
-    @abstractmethod
+        Here these are the generators alone: a run goes on with new episodes. A task that overrides this and
+        `load_state_dict` goes on bit for bit.
+        """
+        return {"generators": generator_states(self.generators)}
+
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned.
+
+        Raises:
+            UserError: the tensors belong to an environment of another size.
+        """
+        if len(tensors["generators"]) != self.num_seeds:
+            raise UserError(OTHER_SIZE)
+        restore_generators(self.generators, tensors["generators"])
 
     def set_state(self, state: Tensor) -> Observation:
         """Put every world into a global state (as laid out by `spec.state`) at the start of an episode.
@@ -262,7 +296,7 @@ class Environment(ABC):
         raise UserError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
 
     def has(self, method: str) -> bool:
-        """Return whether the task offers one of the optional methods `set_state`, `heuristic` and `scene`."""
+        """Return whether the task offers an optional method: `set_state`, `heuristic`, `scene` or `state_dict`."""
         return getattr(type(self), method) is not getattr(Environment, method)
 
     def painter(self, size: int) -> AbstractContextManager[Painter] | None:

@@ -12,7 +12,7 @@ from esp_cli.checking import check_symmetry
 from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
 from esp_envs import make
-from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.breaking import Breaks, remaining
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
 from esp_envs.spec import Spaces
 from tests.envs.test_frozen_prey import write
@@ -75,15 +75,15 @@ def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path, prey) ->
 
 
 def test_what_several_breakings_leave() -> None:
-    wind, mud, gust = Breaking("wind", 1, "flip-x"), Breaking("mud", 1, "flip-x"), Breaking("gust", 1, "flip-diagonal")
-    weak = Breaking("weak", 1, None, agents=False)
+    wind, mud, gust, weak = Breaks("flip-x"), Breaks("flip-x"), Breaks("flip-diagonal"), Breaks(None, agents=False)
     assert remaining("d4*agents", []) == "d4*agents"
-    assert remaining("d4*agents", [Breaking("wind", 0, "flip-x")]) == "d4*agents"
     assert remaining("o2*agents", [wind, mud]) == "flip-x*agents"
     assert remaining("d4*agents", [wind, gust, weak]) == "c1"
     assert remaining("d4*agents*landmarks-3", [wind, weak]) == "flip-x*landmarks-3"
     assert remaining("d4", [weak]) == "d4"
-    assert described([wind, Breaking("mud", 0.0, "flip-x")]) == ", wind 1"
+    settings = make("navigation", 1, [0], {"wind": 1, "action_turn_rad": 0.5, "actions": "continuous"}).settings
+    assert settings.broken() == {"wind": wind, "action_turn_rad": Breaks("so2")}, "those that are 0 break nothing"
+    assert settings.broken_in_words() == ", wind 1, action_turn_rad 0.5"
 
 
 def still(task: str, **settings: object):

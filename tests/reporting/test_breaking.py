@@ -16,7 +16,7 @@ from esp_cli.studies.catalogue import plan
 from esp_cli.studies.kinds import BREAKINGS, KINDS
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import build_learner
-from esp_envs import make
+from esp_envs import task_class
 from tests.studies.small_studies import request, small_study, write_run, write_study
 
 METHODS = list(KINDS["ablate-breaking"].variants)
@@ -53,14 +53,14 @@ def test_every_method_meets_every_strength_of_its_task(monkeypatch: pytest.Monke
     cells = plan("ablate-breaking", request(tasks=("navigation", "predator-prey"), seeds=(0,))).cells
     for task in ("navigation", "predator-prey"):
         own = [cell for cell in cells if cell.config.task == task]
-        known = {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
+        known = set(task_class(task).Settings.breakable())
         broken = [{s: v for s in known if (v := cell.config.task_settings[s])} for cell in own]
         expected = [{}, *({s: value} for s, values in BREAKINGS[task].items() for value in values)]
         assert list(zip(broken, (cell.variant for cell in own), strict=True)) == [
             (one, method) for one in expected for method in METHODS
         ]
     for task, settings in BREAKINGS.items():
-        assert set(settings) <= {breaking.name for breaking in make(task, 1, [0]).settings.breakings}
+        assert set(settings) <= set(task_class(task).Settings.breakable())
         assert all(0 < low < high for low, high in settings.values())
     configs = {cell.variant: cell.config for cell in cells}
     assert [configs[m].prior.kind for m in METHODS] == ["none", *["esp"] * (len(METHODS) - 2), "none"]

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
+from esp_envs.base import TaskSettings
+from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.epuck import steering
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
@@ -20,14 +21,13 @@ from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within
-from esp_envs.errors import UserError
-from esp_envs.lockstep import LockstepTask, Outcome
 from esp_envs.scene import Painter, Scene
+from esp_envs.spec import TaskSpec
 
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
 
 
-class Formation(LockstepTask):
+class Formation(BatchedTask):
     """Formation change of e-pucks: every robot drives to the antipode of its post, past the others and past pillars.
 
     N robots (discs of radius 0.037 m, 0.16 kg, at most 0.1256 m/s) stand around the edge of a walled square, eight on
@@ -88,7 +88,6 @@ class Formation(LockstepTask):
     def __init__(self, settings: FormationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         self.arena = settings.arena
-        self.spec = formation_spec(settings)
         self.num_worlds = self.num_seeds * num_envs
         self.physics = make_physics(
             settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
@@ -109,32 +108,35 @@ class Formation(LockstepTask):
         pose = np.concatenate([self._posts, np.zeros((*robots, 1))], -1)
         self._place(pose, np.zeros_like(pose))
 
+    def _describe(self) -> TaskSpec:
+        return formation_spec(self.settings)
+
     def _furnish(self) -> None:
         """Put goals and pillars where the arena has them."""
         self._goals, self._pillars = -self._posts, np.tile(self.arena.pillars(), (self.num_worlds, 1, 1))
 
-    def _begin(self) -> None:
-        settings = self.settings
-        draws = [self._draw_episode(generator) for generator in self.generators]
-        noise, heading, factor, mass, friction = (np.concatenate(parts) for parts in zip(*draws, strict=True))
-        self._furnish()
-        self._wheel_factor = 1 + settings.wheel_mismatch * factor
-        self._mass = 1 + settings.mass_spread * mass
-        self._friction = 1 + settings.friction_spread * friction
-        pose = np.concatenate([self._posts + settings.start_noise_m * noise, math.pi * heading[..., None]], -1)
-        self._place(pose, np.zeros_like(pose))
-
-    def _draw_episode(self, generator: torch.Generator) -> tuple[Array, ...]:
-        """Draw all random numbers of the starts of one seed: uniform in [-1, 1], wheel factors normal."""
+    def _start(self, generator: torch.Generator) -> World:
+        """Draw all that chance decides: uniform in [-1, 1], wheel factors normal."""
         robots = (self.num_envs, self.settings.num_agents)
 
-        def uniform(*shape: int) -> Array:
+        def uniform(*shape: int) -> Tensor:
             drawn = torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device)
-            return (drawn * 2 - 1).cpu().numpy()
+            return drawn * 2 - 1
 
-        start, heading = uniform(2), uniform()
-        factor = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device).cpu().numpy()
-        return start, heading, factor, uniform(), uniform()
+        drawn = {"place": uniform(2), "heading": uniform()}
+        drawn["wheels"] = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device)
+        return drawn | {"mass": uniform(), "friction": uniform()}
+
+    def _begin_with(self, drawn: World) -> None:
+        settings = self.settings
+        own = {name: value.flatten(0, 1).cpu().numpy() for name, value in drawn.items()}
+        self._furnish()
+        self._wheel_factor = 1 + settings.wheel_mismatch * own["wheels"]
+        self._mass = 1 + settings.mass_spread * own["mass"]
+        self._friction = 1 + settings.friction_spread * own["friction"]
+        places = self._posts + settings.start_noise_m * own["place"]
+        pose = np.concatenate([places, math.pi * own["heading"][..., None]], -1)
+        self._place(pose, np.zeros_like(pose))
 
     def _place(self, pose: Array, velocity: Array) -> None:
         """Begin an episode with the robots here."""
@@ -143,7 +145,7 @@ class Formation(LockstepTask):
         self._look()
         self._touching = self._apart < self._contact
 
-    def _play(self, action: Tensor) -> Outcome:
+    def _advance(self, world: World, action: Tensor) -> Outcome:
         before, distance_before = self._position, self._distance
         self.physics.advance(self._wheel_speeds(action))
         self._look()
@@ -188,7 +190,7 @@ class Formation(LockstepTask):
         final_distance = self._distance * ended
         return step_metrics(self.settings, new, self._arrived, begun, self._apart, way, final_distance)
 
-    def _seen(self) -> Observation:
+    def _observe(self, world: World) -> Tensor:
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
         offsets = [self._to_goal[:, :, None]]
         if pillars:
@@ -212,13 +214,12 @@ class Formation(LockstepTask):
             pillar = nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
             others = nearness(others, 2 * BODY_RADIUS_M)
         obs = np.concatenate([direction[:, :, None], pillar, goal, others], 2)
-        return Observation(self._per_world(obs).flatten(3), self._per_world(self._state()))
+        return self._per_world(obs)
 
-    def _state(self) -> Array:
-        """Return the global state [W, state width]."""
+    def _state(self) -> Tensor:
         velocity = self.physics.velocity
         rows = (self._direction, self._position, velocity[..., :2], velocity[..., 2], self._goals, self._pillars)
-        return np.concatenate([part.reshape(self.num_worlds, -1) for part in rows], 1)
+        return self._per_world(np.concatenate([part.reshape(self.num_worlds, -1) for part in rows], 1))
 
     def _disturbed(self, seen: Array) -> tuple[Array, Array]:
         """Return the heading [W, N] and the offsets [W, N, B, 2] with the sensors' noise."""
@@ -251,28 +252,16 @@ class Formation(LockstepTask):
         self._wheel_factor = np.ones_like(self._wheel_factor)
         self._place(pose, velocity)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return physics, clock, memory of the metrics, what this episode drew, and generators."""
-        arrays = {name: getattr(self, f"_{name}").copy() for name in _REMEMBERED}
+    def _to_save(self) -> dict[str, Tensor]:
+        arrays = {name: getattr(self, f"_{name}") for name in _REMEMBERED}
         arrays |= {f"physics.{name}": array for name, array in self.physics.state_dict().items()}
-        own = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        return own | {"time": torch.tensor(self._time), "generators": generator_states(self.generators)}
+        return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            UserError: the tensors belong to an environment of another size or another physics.
-        """
-        physics = {k.removeprefix("physics."): v.numpy() for k, v in tensors.items() if k.startswith("physics.")}
-        own = self.state_dict()
-        if {k: v.shape for k, v in tensors.items()} != {k: v.shape for k, v in own.items()}:
-            raise UserError(OTHER_SIZE)
+    def _take_back(self, saved: dict[str, Tensor]) -> None:
+        arrays = {name: tensor.cpu().numpy() for name, tensor in saved.items()}
         for name in _REMEMBERED:
-            setattr(self, f"_{name}", tensors[name].numpy().copy())
-        self.physics.load_state_dict(physics)
-        self._time = int(tensors["time"])
-        restore_generators(self.generators, tensors["generators"])
+            setattr(self, f"_{name}", arrays[name].copy())
+        self.physics.load_state_dict({k.removeprefix("physics."): v for k, v in arrays.items() if "." in k})
         self._look()
 
     def heuristic(self, name: str | None = None) -> Tensor:

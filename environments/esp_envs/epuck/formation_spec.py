@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field as Setting
 from pydantic import model_validator
 from torch import Tensor
 
 from esp_envs.base import TaskSettings
-from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.breaking import Breaks
 from esp_envs.epuck.arena import Arena
 from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -78,28 +78,18 @@ class FormationSettings(TaskSettings):
     mass_spread: float = Setting(0.0, ge=0, lt=1, description="masses are drawn from 1 - spread to 1 + spread e-pucks")
     friction_spread: float = Setting(0.0, ge=0, lt=1, description="likewise the grip of the wheels")
 
-    slope: float = Setting(
+    slope: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, lt=1, description="breaks symmetry: share of a wheel's speed lost uphill, along x, and won downhill"
     )
-    lame_wheel: float = Setting(
+    lame_wheel: Annotated[float, Breaks("c4", agents=False)] = Setting(
         0.0, ge=0, le=1, description="breaks mirrors: share of its speed that the first robot's left wheel lacks"
     )
-    heading_offset_rad: float = Setting(
+    heading_offset_rad: Annotated[float, Breaks("c4")] = Setting(
         0.0, ge=0, le=3.15, description="breaks mirrors: the seen heading is off by this, rad"
     )
-    blind_sector_rad: float = Setting(
+    blind_sector_rad: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=6.3, description="breaks symmetry: width of the sector around x in which no body is seen, rad"
     )
-
-    @property
-    def breakings(self) -> tuple[Breaking, ...]:
-        """What breaks the symmetry, with the group that is left."""
-        return (
-            Breaking("slope", self.slope, "flip-x"),
-            Breaking("lame_wheel", self.lame_wheel, "c4", agents=False),
-            Breaking("heading_offset_rad", self.heading_offset_rad, "c4"),
-            Breaking("blind_sector_rad", self.blind_sector_rad, "flip-x"),
-        )
 
     def without_effect(self) -> frozenset[str]:
         """Return the names of settings that change nothing beside the others."""
@@ -163,7 +153,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         name="formation",
         version=1,
         convention=f"{settings.convention}: {settings.progress_weight:g} per metre, -{penalty}; {settings.physics}"
-        + described(settings.breakings),
+        + settings.broken_in_words(),
         num_agents=robots,
         horizon=settings.horizon,
         observation=filled_layout(
@@ -182,7 +172,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
             Field("obstacles", Kind.VECTOR, pillars, "m"),
         ),
         action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
-        symmetry=remaining("d4*agents", settings.breakings),
+        symmetry=settings.left_of("d4*agents"),
         nearly="d4*agents",
         shared_reward=False,
         control_period_s=settings.control_period_s,

@@ -9,11 +9,10 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.breaking import described, remaining
-from esp_envs.lockstep import to_others
+from esp_envs.batched import World, to_others
 from esp_envs.mpe import covering
 from esp_envs.mpe.particles import Bodies
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, place
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
 from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -123,28 +122,59 @@ class Navigation(ParticleTask):
         agents, landmarks = settings.num_agents, settings.landmarks
         if agents**landmarks > covering.MAX_SHARINGS:
             self.heuristics = ("greedy",)
-        bodies = Bodies(
+        self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
+        contacts = self.worlds.bodies.contacts
+        # [N, pairs]: which agents take part in which pair
+        self._takes_part = torch.zeros(agents, len(contacts), device=self.device)
+        for pair, (a, b) in enumerate(contacts):
+            self._takes_part[a, pair] = self._takes_part[b, pair] = 1.0
+
+    def _describe(self) -> TaskSpec:
+        settings = self.settings
+        agents, landmarks = settings.num_agents, settings.landmarks
+        discrete = settings.actions == "discrete"
+        whole = "d4*agents" if discrete else "o2*agents"
+        esp = settings.convention == "esp"
+        reward = "team sum, self-collision counted" if esp else f"local_ratio {settings.local_ratio:g}"
+        return TaskSpec(
+            name="navigation",
+            version=1,
+            convention=f"{settings.convention}: {reward}{settings.broken_in_words()}",
+            num_agents=agents,
+            horizon=settings.horizon,
+            observation=filled_layout(
+                Field("velocity", Kind.VECTOR, 1, "length/s"),
+                Field("position", Kind.VECTOR, 1, "length"),
+                Field("landmarks", Kind.VECTOR, landmarks, "length"),
+                Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS),
+            ),
+            state=layout(
+                Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
+                Field("position", Kind.VECTOR, agents, "length", Items.AGENTS),
+                Field("landmarks", Kind.VECTOR, landmarks, "length"),
+            ),
+            action=MOVES if discrete else FORCE,
+            symmetry=settings.left_of(whole),
+            nearly=whole,
+            shared_reward=esp,
+            settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
+        )
+
+    def _bodies(self) -> Bodies:
+        agents, landmarks = self.settings.num_agents, self.settings.landmarks
+        return Bodies(
             radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
-            gain=settings.gains(*(SENSITIVITY,) * agents),
+            gain=(SENSITIVITY,) * agents,
             max_speed=None,
             contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
             watched=tuple((a, agents + k) for a in range(agents) for k in range(landmarks)),
+            extent=(1.0,) * agents + (self.settings.extent,) * landmarks,
         )
-        self._extents = torch.tensor((1.0,) * agents + (settings.extent,) * landmarks, device=self.device)
-        self._build(_spec(settings), bodies, (SENSITIVITY,) * agents)
-        self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
-        # [N, pairs]: which agents take part in which pair
-        self._takes_part = torch.zeros(agents, len(bodies.contacts), device=self.device)
-        for pair, (a, b) in enumerate(bodies.contacts):
-            self._takes_part[a, pair] = self._takes_part[b, pair] = 1.0
 
-    def observation_of(self, state: Tensor) -> Tensor:
-        """Return all observations [..., N * D] in a global state [..., width]."""
-        agents = self.settings.num_agents
-        rows = state.unflatten(-1, (-1, 2))
-        velocity, position, landmark = rows.split((agents, agents, self.settings.landmarks), dim=-2)
-        landmarks = (landmark.unsqueeze(-3) - position.unsqueeze(-2)).flatten(-2)
-        return torch.cat([velocity, position, landmarks, to_others(position).flatten(-2)], -1).flatten(-2)
+    def _observe(self, world: World) -> Tensor:
+        velocity, position = world["velocity"], world["position"]
+        landmarks = world["landmarks"].unsqueeze(-3) - position.unsqueeze(-2)
+        return torch.cat([velocity, position, landmarks.flatten(-2), to_others(position).flatten(-2)], -1)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy` (default) or `cover`."""
@@ -169,9 +199,6 @@ class Navigation(ParticleTask):
         ]
         return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
-    def _start(self, seed: int, lanes: slice) -> None:
-        place(self.worlds, lanes, self._extents, self.generators[seed])
-
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
         bumps = (self.worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
@@ -181,41 +208,10 @@ class Navigation(ParticleTask):
         if self.settings.reward_offset:
             paid = self._squared_to(self.worlds.entity[agents:]).amin(0).sqrt_().sum(0)
         if self.settings.convention == "esp":
-            reward = (paid * -agents).sub_(collisions, alpha=2).sub_(agents).unsqueeze(0)
+            reward = (paid * -agents).sub_(collisions, alpha=2).sub_(agents)
         else:
             ratio = self.settings.local_ratio
             reward = torch.addmm(paid.expand(agents, -1), self._takes_part, bumps, beta=ratio - 1, alpha=-ratio)
         coverage = (nearest < OCCUPIED_WITHIN).float().mean(0)
         metrics = {"collisions": collisions, "landmark_distance": distance / landmarks, "coverage": coverage}
         return reward, metrics
-
-
-def _spec(settings: NavigationSettings) -> TaskSpec:
-    agents, landmarks = settings.num_agents, settings.landmarks
-    discrete = settings.actions == "discrete"
-    whole = "d4*agents" if discrete else "o2*agents"
-    esp = settings.convention == "esp"
-    reward = "team sum, self-collision counted" if esp else f"local_ratio {settings.local_ratio:g}"
-    return TaskSpec(
-        name="navigation",
-        version=1,
-        convention=f"{settings.convention}: {reward}{described(settings.breakings)}",
-        num_agents=agents,
-        horizon=settings.horizon,
-        observation=filled_layout(
-            Field("velocity", Kind.VECTOR, 1, "length/s"),
-            Field("position", Kind.VECTOR, 1, "length"),
-            Field("landmarks", Kind.VECTOR, landmarks, "length"),
-            Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS),
-        ),
-        state=layout(
-            Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
-            Field("position", Kind.VECTOR, agents, "length", Items.AGENTS),
-            Field("landmarks", Kind.VECTOR, landmarks, "length"),
-        ),
-        action=MOVES if discrete else FORCE,
-        symmetry=remaining(whole, settings.breakings),
-        nearly=whole,
-        shared_reward=esp,
-        settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
-    )

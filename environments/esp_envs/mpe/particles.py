@@ -52,6 +52,7 @@ class Bodies:
         max_speed: one per agent in length / s, or None where speed is not limited.
         contacts: pairs (a, b) of entities that push each other apart; a is an agent.
         watched: further pairs (a, b) whose distance the task wants to know; they exert no force.
+        extent: one per entity, half the side of the square in which it starts, lengths; empty where the task says.
     """
 
     radius: tuple[float, ...]
@@ -59,6 +60,7 @@ class Bodies:
     max_speed: tuple[float, ...] | None
     contacts: tuple[tuple[int, int], ...]
     watched: tuple[tuple[int, int], ...] = ()
+    extent: tuple[float, ...] = ()
 
     @property
     def num_agents(self) -> int:

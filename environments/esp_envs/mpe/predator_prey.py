@@ -9,12 +9,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.lockstep import to_others
+from esp_envs.batched import World, to_others
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
-from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, place, unit_disc
+from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
 from esp_envs.scene import Body, Scene
+from esp_envs.spec import TaskSpec
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
 PREDATOR_GAIN, PREY_GAIN = 3.0, 4.0
@@ -100,59 +101,61 @@ class PredatorPrey(ParticleTask):
     settings: PredatorPreySettings
 
     def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
-        super().__init__(settings, num_envs, generators)
-        predators, obstacles = settings.num_predators, settings.num_obstacles
-        agents = predators + 1
-        touches = tuple((a, predators) for a in range(predators))
-        shoves = [(a, b) for a in range(predators) for b in range(a + 1, predators)]
-        bumps = [(a, agents + k) for a in range(agents) for k in range(obstacles)]
-        full_gain = (PREDATOR_GAIN,) * predators + (PREY_GAIN,)
-        bodies = Bodies(
-            radius=(PREDATOR_RADIUS,) * predators + (PREY_RADIUS,) + (OBSTACLE_RADIUS,) * obstacles,
-            gain=settings.gains(*full_gain),
-            max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
-            contacts=(*touches, *shoves, *bumps),
-        )
-        self._extents = torch.tensor((1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles, device=self.device)
         self._prey_learns = settings.control == "prey"
-        first_learner = predators if self._prey_learns else 0
-        self._build(predator_prey_spec(settings), bodies, full_gain, first_learner)
-        self._prey_plan = torch.zeros(settings.horizon, 2, self.worlds.num_lanes, device=self.device)
-        follows = (settings.horizon, self.worlds.num_lanes) if settings.learned_prey else (0,)
-        self._follows = torch.zeros(follows, dtype=torch.bool, device=self.device)
+        self.first_learner = settings.num_predators if self._prey_learns else 0
+        super().__init__(settings, num_envs, generators)
+        lanes, horizon = self.worlds.num_lanes, settings.horizon
+        self._prey_plan = torch.zeros(horizon, 2, lanes, device=self.device)
+        self.world["prey_moves"] = self._by_world(self._prey_plan)
+        if settings.learned_prey:
+            self._follows = torch.zeros(horizon, lanes, dtype=torch.bool, device=self.device)
+            self.world["follows"] = self._by_world(self._follows)
         self._frozen: FrozenPrey | None = None
         if settings.prey_policy is not None:
             width = prey_layout(settings).width
             seed = settings.prey_policy_seed
             self._frozen = FrozenPrey(settings.prey_policy, seed, width, MOVES.count, self.device)
 
+    def _describe(self) -> TaskSpec:
+        return predator_prey_spec(self.settings)
+
+    def _bodies(self) -> Bodies:
+        predators, obstacles = self.settings.num_predators, self.settings.num_obstacles
+        agents = predators + 1
+        touches = tuple((a, predators) for a in range(predators))
+        shoves = [(a, b) for a in range(predators) for b in range(a + 1, predators)]
+        bumps = [(a, agents + k) for a in range(agents) for k in range(obstacles)]
+        return Bodies(
+            radius=(PREDATOR_RADIUS,) * predators + (PREY_RADIUS,) + (OBSTACLE_RADIUS,) * obstacles,
+            gain=(PREDATOR_GAIN,) * predators + (PREY_GAIN,),
+            max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
+            contacts=(*touches, *shoves, *bumps),
+            extent=(1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles,
+        )
+
     @property
     def prey_moves(self) -> Tensor:
         """The random prey's controls of this episode, a view [horizon, S, E, 2] that may be written to."""
-        real = self._prey_plan[:, :, : self.worlds.num_worlds]
-        return real.unflatten(2, (self.num_seeds, self.num_envs)).permute(0, 2, 3, 1)
+        return self.world["prey_moves"].permute(2, 0, 1, 3)
 
-    def observation_of(self, state: Tensor) -> Tensor:
-        """Return all observations [..., N * D] in a global state [..., width]."""
+    def _observe(self, world: World) -> Tensor:
         if self._prey_learns:
-            return self.prey_observation_of(state)
-        predators = self.settings.num_predators
-        velocity, position, obstacle = self._split(state)
-        here, prey = position.split((predators, 1), -2)
-        own_velocity, prey_velocity = velocity.split((predators, 1), -2)
-        obstacles = (obstacle.unsqueeze(-3) - here.unsqueeze(-2)).flatten(-2)
-        others = to_others(here).flatten(-2)
-        parts = [own_velocity, here, obstacles, others, prey - here, prey_velocity.expand_as(here)]
-        return torch.cat(parts, -1).flatten(-2)
+            return self._prey_sees(world).unsqueeze(-2)
+        here, prey, velocity = world["position"], world["prey_position"], world["velocity"]
+        parts = [velocity, here, self._obstacles_from(here, world), to_others(here).flatten(-2)]
+        return torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
 
-    def prey_observation_of(self, state: Tensor) -> Tensor:
-        """Return the prey's observation [..., D] in a global state [..., width]."""
-        predators = self.settings.num_predators
-        velocity, position, obstacle = self._split(state)
-        here = position[..., predators, :]
-        obstacles = (obstacle - here.unsqueeze(-2)).flatten(-2)
-        others = (position[..., :predators, :] - here.unsqueeze(-2)).flatten(-2)
-        return torch.cat([velocity[..., predators, :], here, obstacles, others], dim=-1)
+    def _prey_sees(self, world: World) -> Tensor:
+        """Return the prey's observation [..., D]."""
+        prey = world["prey_position"]
+        others = (world["position"] - prey).flatten(-2).unsqueeze(-2)
+        return torch.cat([world["prey_velocity"], prey, self._obstacles_from(prey, world), others], -1).squeeze(-2)
+
+    def _obstacles_from(self, place: Tensor, world: World) -> Tensor:
+        """Return the obstacles as they are seen from places [..., items, 2]: [..., items, 2 L]."""
+        if "obstacles" not in world:
+            return place[..., :0]
+        return (world["obstacles"].unsqueeze(-3) - place.unsqueeze(-2)).flatten(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy`: the chase, or the flight with `control="prey"`."""
@@ -172,40 +175,24 @@ class PredatorPrey(ParticleTask):
         bodies.append(Body((x, y), PREY_RADIUS, "#3fa86a", trail=True, label="prey"))
         return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return physics, clock, generators, the random prey's plan, and when it follows its policy, if it has one."""
-        plan = {"prey_moves": self.prey_moves.clone(memory_format=torch.contiguous_format)}
-        return super().state_dict() | plan | ({"follows": self._follows.clone()} if self.settings.learned_prey else {})
+    def _to_save(self) -> dict[str, Tensor]:
+        follows = {"follows": self._follows} if self.settings.learned_prey else {}
+        return super()._to_save() | {"prey_moves": self.prey_moves} | follows
 
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        super().load_state_dict(tensors)
-        self.prey_moves.copy_(tensors["prey_moves"])
-        if self.settings.learned_prey:
-            self._follows.copy_(tensors["follows"])
-
-    def _split(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return velocities and positions of predators and prey, and obstacles, each [..., items, 2]."""
-        agents = self.settings.num_predators + 1
-        rows = state.unflatten(-1, (-1, 2))
-        velocity, position, obstacle = rows.split((agents, agents, self.settings.num_obstacles), dim=-2)
-        return velocity, position, obstacle
-
-    def _start(self, seed: int, lanes: slice) -> None:
-        generator = self.generators[seed]
-        place(self.worlds, lanes, self._extents, generator)
+    def _chance(self, generator: torch.Generator) -> World:
         shape, device = (self.settings.horizon, self.num_envs), self.device
+        drawn = {}
         if share := self.settings.learned_prey:
-            self._follows[:, lanes] = torch.rand(shape, generator=generator, device=device) < share
+            drawn["follows"] = (torch.rand(shape, generator=generator, device=device) < share).t()
         if self._prey_learns or self.settings.prey != "random":
-            return
+            return drawn
         move = torch.randint(MOVES.count, shape, generator=generator, device=device)
         if self.settings.actions == "discrete":
             plan = self._move_control(move)
         else:
             angle = torch.rand(shape, generator=generator, device=device) * (2 * math.pi)
             plan = torch.stack([angle.cos(), angle.sin()], dim=1) * (move != 0).unsqueeze(1)
-        self._prey_plan[:, :, lanes] = plan
+        return drawn | {"prey_moves": plan.movedim(-1, 0)}
 
     def _drive(self) -> None:
         """Set the controls of the bodies that do not learn."""
@@ -219,7 +206,7 @@ class PredatorPrey(ParticleTask):
         elif self.settings.prey == "still":
             self._control[predators:] = 0.0
         if self._frozen is not None:
-            moves = self._frozen.moves(self.prey_observation_of(self.worlds.rows().t()))
+            moves = self._frozen.moves(self._prey_sees(self._split(self.worlds.rows().t())))
             learned, control = self._move_control(moves.unsqueeze(0)), self._control[predators:, :, : len(moves)]
             follows = self._follows[self._time, : len(moves)] if self.settings.learned_prey else None
             control.copy_(learned if follows is None else torch.where(follows, learned, control))
@@ -246,7 +233,7 @@ class PredatorPrey(ParticleTask):
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
             reward = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
-        return reward.unsqueeze(0), metrics
+        return reward, metrics
 
 
 def _touches(squared_distance: Tensor) -> Tensor:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field as Setting
 from pydantic import field_validator, model_validator
 
-from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.breaking import Breaks
 from esp_envs.errors import UserError
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
@@ -29,7 +29,7 @@ class PredatorPreySettings(ParticleSettings):
         None, max_length=255, description="safetensors policy file, for prey 'policy' or a learned_prey above 0"
     )
     prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
-    learned_prey: float = Setting(
+    learned_prey: Annotated[float, Breaks("c1", agents=False)] = Setting(
         0.0, ge=0, le=1, description="breaks symmetry: probability of a step in which the prey follows prey_policy"
     )
 
@@ -42,11 +42,6 @@ class PredatorPreySettings(ParticleSettings):
     def turns(self) -> str:
         """The rotations that actions, dynamics and reward carry; the learning prey's bounds are a square."""
         return "c4" if self.control == "prey" else super().turns
-
-    @property
-    def breakings(self) -> tuple[Breaking, ...]:
-        """What breaks the symmetry, with the group that is left."""
-        return (*super().breakings, Breaking("learned_prey", self.learned_prey, "c1", agents=False))
 
     def without_effect(self) -> frozenset[str]:
         """Return the names of settings that change nothing beside the others."""
@@ -72,17 +67,17 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
     opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
     whole = "d4*agents" if discrete or prey_learns else "o2*agents"
-    always = Breaking("prey", float(settings.prey == "policy"), "c1", agents=False)
+    learned = [Breaks("c1", agents=False)] if settings.prey == "policy" else []
     return TaskSpec(
         name="predator-prey",
         version=1,
-        convention=f"{settings.convention}: {reward}, {opponent}, {order}{described(settings.breakings)}",
+        convention=f"{settings.convention}: {reward}, {opponent}, {order}{settings.broken_in_words()}",
         num_agents=1 if prey_learns else settings.num_predators,
         horizon=settings.horizon,
         observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
         state=_state_layout(settings),
         action=MOVES if discrete else FORCE,
-        symmetry=remaining(whole, (*settings.breakings, always)),
+        symmetry=settings.left_of(whole, *learned),
         nearly=whole,
         shared_reward=True,
         settings=settings.model_dump(),

@@ -1,4 +1,4 @@
-"""What the particle tasks share: fast readouts, actions, saving and restoring.
+"""What the particle tasks share: settings, actions, and worlds whose steps and readouts are matrix products.
 
 All random numbers of an episode are drawn at its start, from each seed's own generator.
 """
@@ -8,18 +8,18 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import replace
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.base import OTHER_SIZE, Observation, TaskSettings, generator_states, restore_generators
-from esp_envs.breaking import Breaking
-from esp_envs.errors import UserError
-from esp_envs.lockstep import LockstepTask, Outcome
+from esp_envs.base import Observation, TaskSettings
+from esp_envs.batched import BatchedTask, Outcome, World
+from esp_envs.breaking import Breaks
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, TaskSpec, layout
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, layout
 
 STILL = (0.0, 0.0)
 MOVES = Discrete(Kind.VECTOR, (STILL, LEFT, RIGHT, DOWN, UP), ("no-op", "left", "right", "down", "up"))
@@ -39,25 +39,25 @@ class ParticleSettings(TaskSettings):
         "discrete", description="five moves, or a planar force in the unit disc"
     )
     horizon: int = Setting(25, ge=1, le=100_000, description="steps of an episode (0.1 s each); 25 in MPE")
-    wind: float = Setting(
+    wind: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=10, description="breaks symmetry: a force on every body along x, as a share of its full force"
     )
-    gust_mean: float = Setting(
+    gust_mean: Annotated[float, Breaks("flip-diagonal")] = Setting(
         0.0, ge=0, le=100, description="breaks symmetry: mean of a random force per step and axis, length/s^2"
     )
-    gust_std: float = Setting(
+    gust_std: Annotated[float, Breaks(None)] = Setting(
         0.0, ge=0, le=100, description="standard deviation of that force; alone it keeps the symmetry in distribution"
     )
-    mud: float = Setting(
+    mud: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=1, description="breaks symmetry: share of the velocity that a step costs more where x > 0"
     )
-    weak_agent: float = Setting(
+    weak_agent: Annotated[float, Breaks(None, agents=False)] = Setting(
         0.0, ge=0, lt=1, description="breaks the exchange of agents: share of its force that the first one lacks"
     )
-    action_turn_rad: float = Setting(
+    action_turn_rad: Annotated[float, Breaks("turns")] = Setting(
         0.0, ge=0, le=3, description="breaks mirrors: the learners' forces are turned by this angle, which nobody sees"
     )
-    reward_offset: float = Setting(
+    reward_offset: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=10, description="breaks symmetry: the reward counts places that lie so far to the right, lengths"
     )
 
@@ -66,87 +66,86 @@ class ParticleSettings(TaskSettings):
         """The rotations that actions, dynamics and reward carry."""
         return "c4" if self.actions == "discrete" else "so2"
 
-    @property
-    def breakings(self) -> tuple[Breaking, ...]:
-        """What breaks the symmetry, with the group that is left."""
-        return (
-            Breaking("wind", self.wind, "flip-x"),
-            Breaking("gust_mean", self.gust_mean, "flip-diagonal"),
-            Breaking("gust_std", self.gust_std, None),
-            Breaking("mud", self.mud, "flip-x"),
-            Breaking("weak_agent", self.weak_agent, None, agents=False),
-            Breaking("action_turn_rad", self.action_turn_rad, self.turns),
-            Breaking("reward_offset", self.reward_offset, "flip-x"),
-        )
 
-    def gains(self, *full: float) -> tuple[float, ...]:
-        """Return the accelerations of the agents, given the full ones; the first may be weaker."""
-        return (full[0] * (1 - self.weak_agent), *full[1:])
+class ParticleTask(BatchedTask):
+    """A batch of particle worlds.
 
-
-class ParticleTask(LockstepTask):
-    """A batch of particle worlds in lockstep.
-
-    A subclass builds `spec`, calls `_build`, and implements the methods below that are abstract. Its state is laid out
-    like the rows of `ParticleWorlds.physics`.
+    A subclass implements `_describe` and the abstract methods below. Its state is laid out like the rows of
+    `ParticleWorlds.physics`, of which the tensors in `world` are views.
     """
 
+    makes_new_tensors = True
     settings: ParticleSettings
+    first_learner = 0
+    """Index of the first of the agents that learn; the task drives the others."""
 
-    def _build(self, spec: TaskSpec, bodies: Bodies, full_gain: Sequence[float], first_learner: int = 0) -> None:
-        """Make the worlds; `spec.num_agents` agents from `first_learner` on learn, the task drives the others."""
-        self.spec = spec
-        velocity_first = self.settings.convention == "esp"
-        self.worlds = ParticleWorlds(bodies, self.num_seeds * self.num_envs, self.device, velocity_first)
+    def __init__(self, settings: ParticleSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
+        super().__init__(settings, num_envs, generators)
+        spec, bodies = self.spec, self._bodies()
+        gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
+        weak = (bodies.gain[0] * (1 - settings.weak_agent), *bodies.gain[1:])
+        num_worlds, velocity_first = self.num_seeds * num_envs, settings.convention == "esp"
+        self.worlds = ParticleWorlds(replace(bodies, gain=weak), num_worlds, self.device, velocity_first)
         lanes = self.worlds.num_lanes
+        counts = [field.count for field in spec.state.fields]
+        rows = self._by_world(self.worlds.physics).split(counts, 2)
+        self.world = {field.name: view for field, view in zip(spec.state.fields, rows, strict=True)}
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
-        self._learner_control = self._control[first_learner : first_learner + spec.num_agents]
+        self._learner_control = self._control[self.first_learner : self.first_learner + spec.num_agents]
         self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
         directions = [MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP)]
         self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
         self._points = torch.tensor(MOVES.points, device=self.device)
-        settings, gain = self.settings, torch.tensor(full_gain, device=self.device).view(-1, 1, 1)
+        self._extents = torch.tensor(bodies.extent, device=self.device).view(-1, 1, 1)
         push = torch.cat([gain * settings.wind, torch.zeros_like(gain)], 1) + settings.gust_mean
         self._push = push if settings.wind or settings.gust_mean else None
-        gusts = (spec.horizon, bodies.num_agents, 2, lanes) if settings.gust_std else (0,)
-        self._gusts = torch.zeros(gusts, device=self.device)
+        if settings.gust_std:
+            self._gusts = torch.zeros(spec.horizon, bodies.num_agents, 2, lanes, device=self.device)
+            self.world["gusts"] = self._by_world(self._gusts)
         self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
         # the matrix of a linear function is what it gives for the basis vectors
-        self._readout = self.observation_of(torch.eye(spec.state.width)).to(self.device)
+        readout = self._observe(self._split(torch.eye(spec.state.width)))
+        self._readout = readout.flatten(1).to(self.device)
 
     @abstractmethod
-    def observation_of(self, state: Tensor) -> Tensor:
-        """Return all observations in a global state, written to be read: the fast path is derived from it.
-
-        Args:
-            state: [..., state width]; the result is linear in it.
-
-        Returns:
-            [..., N * D].
-        """
+    def _bodies(self) -> Bodies:
+        """Return what the bodies are, with their full gains."""
 
     @abstractmethod
-    def _start(self, seed: int, lanes: slice) -> None:
-        """Draw a new episode for the worlds `lanes` of one seed into the physics (velocities are already zero)."""
+    def _observe(self, world: World) -> Tensor:
+        """Return all observations, written to be read: the fast path is derived from it, so it must be linear."""
 
     @abstractmethod
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the reward [N or 1, W'] and the metrics (each [W']) of the step just made; W' counts padded lanes."""
+        """Return the reward [N, W'] or [W'] and the metrics [W'] of the step just made; W' counts padded lanes."""
+
+    def _chance(self, generator: torch.Generator) -> World:
+        """Draw what else chance decides in the episodes of one seed, [E, ...] by name."""
+        return {}
 
     def _drive(self) -> None:
         """Fill the controls of the agents that do not learn."""
 
-    def _begin(self) -> None:
+    def _start(self, generator: torch.Generator) -> World:
+        """Draw every position uniformly from its own square, then what else chance decides."""
+        shape = (len(self._extents), 2, self.num_envs)
+        unit = torch.rand(shape, generator=generator, device=self.device).mul_(2).sub_(1)
+        places = (unit * self._extents).permute(2, 0, 1)
+        fields = [field for field in self.spec.state.fields if not field.name.endswith("velocity")]
+        parts = places.split([field.count for field in fields], 1)
+        drawn = {field.name: part for field, part in zip(fields, parts, strict=True)} | self._chance(generator)
+        if self.settings.gust_std:
+            gusts = torch.randn((*self._gusts.shape[:3], self.num_envs), generator=generator, device=self.device)
+            drawn["gusts"] = gusts.movedim(-1, 0)
+        return drawn
+
+    def _begin_with(self, drawn: World) -> None:
         self.worlds.velocity.zero_()
-        for seed in range(self.num_seeds):
-            lanes = slice(seed * self.num_envs, (seed + 1) * self.num_envs)
-            self._start(seed, lanes)
-            if self.settings.gust_std:
-                shape = (*self._gusts.shape[:3], self.num_envs)
-                self._gusts[..., lanes] = torch.randn(shape, generator=self.generators[seed], device=self.device)
+        for name, values in drawn.items():
+            self.world[name].copy_(values)
         self.worlds.measure()
 
-    def _play(self, action: Tensor) -> Outcome:
+    def _advance(self, world: World, action: Tensor) -> Outcome:
         self._act(action)
         self._drive()
         push = self._push
@@ -155,42 +154,27 @@ class ParticleTask(LockstepTask):
             push = gust if push is None else gust + push
         self.worlds.advance(self._control, push, self.settings.mud)
         reward, metrics = self._outcome()
-        per_agent = self._per_world(reward.expand(self.spec.num_agents, -1).t())
-        return per_agent, {name: self._per_world(value) for name, value in metrics.items()}
-
-    def _put(self, state: Tensor) -> None:
-        self.worlds.rows().copy_(state.reshape(-1, self.spec.state.width).t())
-        self.worlds.measure()
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return physics, clock, generators and the episode's gusts, if any."""
-        return {
-            "physics": self.worlds.rows().clone(memory_format=torch.contiguous_format),
-            "time": torch.tensor(self._time),
-            "generators": generator_states(self.generators),
-        } | ({"gusts": self._gusts.clone()} if self.settings.gust_std else {})
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            UserError: the tensors belong to an environment of another size.
-        """
-        physics, states = tensors["physics"], tensors["generators"]
-        if physics.shape != self.worlds.rows().shape or len(states) != self.num_seeds:
-            raise UserError(OTHER_SIZE)
-        self.worlds.rows().copy_(physics)
-        self._time = int(tensors["time"])
-        if self.settings.gust_std:
-            self._gusts.copy_(tensors["gusts"])
-        restore_generators(self.generators, states)
-        self.worlds.measure()
+        worlds, lead = self.worlds.num_worlds, self._worlds_shape
+        per_world = reward[:worlds].view(lead) if reward.dim() == 1 else self._by_world(reward)
+        return per_world, {name: value[:worlds].view(lead) for name, value in metrics.items()}
 
     def _seen(self) -> Observation:
         rows = self.worlds.rows().t()
         lead = (self.num_seeds, self.num_envs)
         obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
         return Observation(obs, rows.contiguous().view(*lead, -1))
+
+    def _put(self, state: Tensor) -> None:
+        self.worlds.rows().copy_(state.reshape(-1, self.spec.state.width).t())
+        self.worlds.measure()
+
+    def _to_save(self) -> dict[str, Tensor]:
+        return {"physics": self.worlds.rows()} | ({"gusts": self._gusts} if self.settings.gust_std else {})
+
+    def _take_back(self, saved: dict[str, Tensor]) -> None:
+        for name, values in self._to_save().items():
+            values.copy_(saved[name])
+        self.worlds.measure()
 
     def _squared_to(self, target: Tensor) -> Tensor:
         """Return the squared distances [N, K, W'] of the first agents to where the reward counts targets [K, 2, W']."""
@@ -205,8 +189,7 @@ class ParticleTask(LockstepTask):
             chosen = (self._moves == self._directions).view(torch.int8)
             self._learner_control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
         else:
-            force = self.spec.action.admissible(action).reshape(worlds, learners, 2)
-            self._learner_control[:, :, :worlds] = force.permute(1, 2, 0)
+            self._learner_control[:, :, :worlds] = action.reshape(worlds, learners, 2).permute(1, 2, 0)
         if self.settings.action_turn_rad:
             self._learner_control.copy_(_turned(self._learner_control, self.settings.action_turn_rad))
 
@@ -222,9 +205,10 @@ class ParticleTask(LockstepTask):
         """Return the controls [N, 2, W] of discrete moves [N, W]."""
         return self._points[moves].movedim(-1, 1)
 
-    def _per_world(self, values: Tensor) -> Tensor:
-        """Return [S, E, ...] of the real worlds from [W', ...], as memory of its own."""
-        return values[: self.worlds.num_worlds].contiguous().view(self.num_seeds, self.num_envs, *values.shape[1:])
+    def _by_world(self, values: Tensor) -> Tensor:
+        """Return the real worlds' part of [..., W'] as a view [S, E, ...]."""
+        real = values[..., : self.worlds.num_worlds].movedim(-1, 0)
+        return real.unflatten(0, (self.num_seeds, self.num_envs))
 
 
 def _turned(force: Tensor, angle: float) -> Tensor:
@@ -255,17 +239,3 @@ def nearest_move(wish: Tensor) -> Tensor:
 def unit_disc(wish: Tensor) -> Tensor:
     """Scale wishes [N, 2, W] longer than 1 back to length 1."""
     return wish / wish.norm(dim=1, keepdim=True).clamp_min(1.0)
-
-
-def place(worlds: ParticleWorlds, lanes: slice, extents: Tensor, generator: torch.Generator) -> None:
-    """Draw the position of every entity of the worlds `lanes` uniformly from its own square.
-
-    Args:
-        worlds: where to write.
-        lanes: the worlds of one seed.
-        extents: [entities], half side of the square of each, agents first.
-        generator: that seed's generator.
-    """
-    shape = (len(extents), 2, lanes.stop - lanes.start)
-    unit = torch.rand(shape, generator=generator, device=extents.device).mul_(2).sub_(1)
-    worlds.entity[:, :, lanes] = unit * extents.view(-1, 1, 1)

@@ -8,25 +8,16 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import (
-    OTHER_SIZE,
-    Environment,
-    Observation,
-    Step,
-    generator_states,
-    require_shape,
-    restore_generators,
-)
-from esp_envs.errors import UserError
+from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.scene import COLORS, Body, Scene
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, others_of
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, TaskSpec, others_of
 from esp_envs.wildlife.pictures import all_pictures, cell_index
 from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec
 
 _POACHER_COLOR = "#202020"
 
 
-class Wildlife(Environment):
+class Wildlife(BatchedTask):
     """Wildlife monitoring, the drones' game of van der Pol et al. (2022).
 
     N drones and a poacher move on a grid of cells whose opposite edges are joined. One drone has to hover above the
@@ -75,11 +66,11 @@ class Wildlife(Environment):
 
     Settings: ClassVar[type[WildlifeSettings]] = WildlifeSettings
     heuristics = ("surround",)
+    makes_new_tensors = True
     settings: WildlifeSettings
 
     def __init__(self, settings: WildlifeSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
-        self.spec = wildlife_spec(settings)
         agents, device = settings.num_agents, self.device
         self._size = torch.tensor([settings.width, settings.height], device=device)
         self._half = self._size // 2
@@ -89,99 +80,90 @@ class Wildlife(Environment):
         self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
         self._others = torch.tensor(others_of(agents), device=device)
         lead = (self.num_seeds, num_envs)
-        self._cells = torch.zeros(*lead, agents + 1, 2, dtype=torch.int64, device=device)
-        self._time = torch.zeros(lead, dtype=torch.int64, device=device)
-        self._clock = 0
         self.plan = torch.zeros(settings.horizon, *lead, agents + 2, 2, dtype=torch.int16, device=device)
         """[horizon, S, E, N + 2, 2], all that chance decides, drawn in advance: in each step the poacher's move, then
         the cells of drones and poacher with which an episode would begin. A new plan follows when it is used up."""
+        self._put(torch.zeros(self.state_shape, device=device))
 
-    def reset(self) -> Observation:
-        """Start a new episode in every world."""
-        self._clock = 0
-        self._time.zero_()
-        self._cells = self._draw_plan()
-        return self._observe(self._cells)
+    def _describe(self) -> TaskSpec:
+        return wildlife_spec(self.settings)
 
-    def step(self, action: Tensor) -> Step:
-        """Advance every world by one step.
-
-        Raises:
-            UserError: the action has another shape than [S, E, N].
-        """
+    def _start(self, generator: torch.Generator) -> World:
+        """Draw cells to begin with, and all that chance decides in the next `horizon` steps."""
         settings, agents = self.settings, self.settings.num_agents
-        require_shape("joint action", action, self.action_shape)
-        before = self._cells
-        chance = self.plan[self._clock].long()
-        after = self._wrap(before + torch.cat([self._points[action], chance[:, :, :1]], 2))
+        shape = (settings.horizon + 1, self.num_envs, agents + 3)
+        drawn = torch.rand(shape, generator=generator, device=self.device)
+        way = drawn[:-1, ..., 1]
+        direction = 1 + (4 * (way - settings.wind) / max(1 - settings.wind, 1e-9)).long().clamp_(max=3)
+        move = self._points[torch.where(way < settings.wind, MOVES.points.index(RIGHT), direction)]
+        move = torch.where(drawn[:-1, ..., :1] < settings.poacher_moves, move, 0)
+        starts = self._different_cells(drawn[..., 2:])
+        return {"cells": starts[-1], "plan": torch.cat([move.unsqueeze(2), starts[:-1]], 2)}
+
+    def _episodes(self) -> World:
+        drawn = [self._start(generator) for generator in self.generators]
+        self.plan.copy_(torch.stack([one["plan"] for one in drawn], 1))
+        return {"cells": torch.stack([one["cells"] for one in drawn])}
+
+    def _next_episodes(self) -> World:
+        if self._time + 1 == self.settings.horizon:
+            self._episodes()
+        return {"cells": self._chance[:, :, 1:]}
+
+    def _begin_with(self, drawn: World) -> None:
+        self.world = drawn
+
+    def _advance(self, world: World, action: Tensor) -> Outcome:
+        settings, agents = self.settings, self.settings.num_agents
+        before = world["cells"]
+        self._chance = self.plan[self._time].long()
+        after = self._wrap(before + torch.cat([self._points[action], self._chance[:, :, :1]], 2))
         drones = after[:, :, :agents]
         bumped = (drones.unsqueeze(3) == drones.unsqueeze(2)).all(-1).sum(-1) > 1
         drones = torch.where(bumped.unsqueeze(-1), before[:, :, :agents], drones)
-        cells = torch.cat([drones, after[:, :, agents:]], 2)
+        cells = world["cells"] = torch.cat([drones, after[:, :, agents:]], 2)
         poacher = (before if settings.convention == "esp" else cells)[:, :, agents:]
         landed, helpers = self._trap(drones, poacher, bumped)
-        captured = landed & (helpers > 0)
-        self._time += 1
-        truncated = (self._time == settings.horizon) & ~captured
-        ended = captured | truncated
-        final = self._observe(cells)
-        self._cells = torch.where(ended[..., None, None], chance[:, :, 1:], cells)
-        self._time = torch.where(ended, 0, self._time)
-        self._clock += 1
-        if self._clock == settings.horizon:
-            self._draw_plan()
-            self._clock = 0
-        reward = torch.where(captured, 1.0 + helpers, 0.0) - STEP_COST
-        return Step(
-            next=self._observe(self._cells),
-            reward=reward.unsqueeze(-1).expand(self.action_shape).contiguous(),
-            terminated=captured,
-            truncated=truncated,
-            final=final,
-            metrics={
-                "captures": captured.float(),
-                "lone_landings": (landed & (helpers == 0)).float(),
-                "collisions": bumped.sum(-1).float(),
-                "steps": torch.ones_like(reward),
-            },
-        )
-
-    def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode; the plan stays and restarts."""
-        require_shape("state", state, self.state_shape)
-        self._clock = 0
-        self._time.zero_()
-        self._cells = state.round().long().unflatten(-1, (-1, 2))
-        return self._observe(self._cells)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return everything that `load_state_dict` needs to go on bit for bit."""
-        return {
-            "cells": self._cells.to(torch.int16),
-            "time": self._time.clone(),
-            "clock": torch.tensor(self._clock),
-            "plan": self.plan.clone(),
-            "generators": generator_states(self.generators),
+        self._captured = landed & (helpers > 0)
+        reward = torch.where(self._captured, 1.0 + helpers, 0.0) - STEP_COST
+        return reward, {
+            "captures": self._captured,
+            "lone_landings": landed & (helpers == 0),
+            "collisions": bumped.sum(-1),
+            "steps": torch.ones_like(reward),
         }
 
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
+    def _ended(self, world: World) -> Tensor:
+        return self._captured
 
-        Raises:
-            UserError: the tensors belong to an environment of another size.
-        """
-        if tensors["plan"].shape != self.plan.shape or len(tensors["generators"]) != self.num_seeds:
-            raise UserError(OTHER_SIZE)
-        self._cells = tensors["cells"].to(self.device).long()
-        self._time = tensors["time"].to(self.device).clone()
-        self._clock = int(tensors["clock"])
-        self.plan.copy_(tensors["plan"])
-        restore_generators(self.generators, tensors["generators"])
+    def _observe(self, world: World) -> Tensor:
+        drones, poacher = world["cells"][:, :, :-1], world["cells"][:, :, -1:]
+        settings = self.settings
+        picture = cell_index(self._wrap(poacher - drones), settings.width, settings.height)
+        obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
+        others = drones[:, :, self._others] - drones.unsqueeze(3)
+        if settings.convention == "corrected":
+            others = self._wrap(others)
+        obs[..., -2 * (settings.num_agents - 1) :] = others.flatten(-2)
+        return obs
+
+    def _state(self) -> Tensor:
+        return self.world["cells"].flatten(-2).float()
+
+    def _put(self, state: Tensor) -> None:
+        self.world = {"cells": state.round().long().unflatten(-1, (-1, 2))}
+
+    def _to_save(self) -> dict[str, Tensor]:
+        return {"cells": self.world["cells"].to(torch.int16), "plan": self.plan}
+
+    def _take_back(self, saved: dict[str, Tensor]) -> None:
+        self.world = {"cells": saved["cells"].long()}
+        self.plan.copy_(saved["plan"])
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `surround`."""
         self.named_heuristic(name)
-        drones, poacher = self._cells[:, :, :-1], self._cells[:, :, -1:]
+        drones, poacher = self.world["cells"].split((self.settings.num_agents, 1), 2)
         way = self._wrap(poacher - drones)
         distance = way.abs().sum(-1)
         nearest, second = distance.topk(2, dim=-1, largest=False, sorted=True).values.unbind(-1)
@@ -196,7 +178,7 @@ class Wildlife(Environment):
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return the drones of one world and the poacher on top of them, on the lines between the cells."""
-        *drones, poacher = [(float(x), float(y)) for x, y in self._cells[world].tolist()]
+        *drones, poacher = [(float(x), float(y)) for x, y in self.world["cells"][world].tolist()]
         bodies = [Body(place, 0.4, COLORS[i % len(COLORS)], label="drone") for i, place in enumerate(drones)]
         bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross", label="poacher"))
         right, top = self.settings.width / 2, self.settings.height / 2
@@ -213,30 +195,6 @@ class Wildlife(Environment):
             offset = self._wrap(offset)
         distance = offset.abs().sum(-1)
         return (distance == 0).sum(-1) == 1, ((distance == 1) & ~bumped).sum(-1)
-
-    def _observe(self, cells: Tensor) -> Observation:
-        drones, poacher = cells[:, :, :-1], cells[:, :, -1:]
-        settings = self.settings
-        picture = cell_index(self._wrap(poacher - drones), settings.width, settings.height)
-        obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
-        others = drones[:, :, self._others] - drones.unsqueeze(3)
-        if settings.convention == "corrected":
-            others = self._wrap(others)
-        obs[..., -2 * (settings.num_agents - 1) :] = others.flatten(-2)
-        return Observation(obs, cells.flatten(-2).float())
-
-    def _draw_plan(self) -> Tensor:
-        """Draw all that chance decides in the next `horizon` steps; return the cells to start from now."""
-        agents, (rows, _, worlds) = self.settings.num_agents, self.plan.shape[:3]
-        shape = (rows + 1, worlds, agents + 3)
-        drawn = torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self.generators], 1)
-        wind, way = self.settings.wind, drawn[:-1, ..., 1]
-        direction = 1 + (4 * (way - wind) / max(1 - wind, 1e-9)).long().clamp_(max=3)
-        move = self._points[torch.where(way < wind, MOVES.points.index(RIGHT), direction)]
-        self.plan[..., 0, :] = torch.where(drawn[:-1, ..., :1] < self.settings.poacher_moves, move, 0)
-        starts = self._different_cells(drawn[..., 2:])
-        self.plan[..., 1:, :] = starts[:-1]
-        return starts[-1]
 
     def _different_cells(self, uniform: Tensor) -> Tensor:
         """Turn numbers in [0, 1), [..., K], into K different cells [..., K, 2], all choices equally likely."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field as Setting
 from pydantic import model_validator
 
 from esp_envs.base import TaskSettings
-from esp_envs.breaking import Breaking, described, remaining
+from esp_envs.breaking import Breaks
 from esp_envs.errors import UserError
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
 from esp_envs.wildlife.pictures import PIXELS
@@ -32,15 +32,9 @@ class WildlifeSettings(TaskSettings):
     height: int = Setting(7, ge=3, le=63, description="rows of the grid, an odd number")
     horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode, at most")
     poacher_moves: float = Setting(0.8, ge=0, le=1, description="probability that the poacher moves in a step")
-
-    wind: float = Setting(
+    wind: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=1, description="breaks symmetry: probability that a moving poacher is carried to the right"
     )
-
-    @property
-    def breakings(self) -> tuple[Breaking, ...]:
-        """What breaks the symmetry, with the group that is left."""
-        return (Breaking("wind", self.wind, "flip-x"),)
 
     @model_validator(mode="after")
     def _fits(self) -> WildlifeSettings:
@@ -63,7 +57,7 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
         name="wildlife",
         version=1,
         convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}"
-        + described(settings.breakings),
+        + settings.broken_in_words(),
         num_agents=agents,
         horizon=settings.horizon,
         observation=layout(
@@ -75,7 +69,7 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
             Field("poacher", Kind.VECTOR, 1, "cell"),
         ),
         action=MOVES,
-        symmetry=remaining(whole, settings.breakings),
+        symmetry=settings.left_of(whole),
         nearly=whole,
         control_period_s=0.25,
         totals=("captures", "lone_landings", "collisions", "steps"),

@@ -1,4 +1,4 @@
-"""Tasks derived from `BatchedTask`, and what the optional methods answer where a task lacks them."""
+"""Tasks derived from `BatchedTask`: ends, masks, memory, and what optional methods answer where a task lacks them."""
 
 from __future__ import annotations
 
@@ -43,6 +43,19 @@ def test_the_task_of_the_page_keeps_every_promise(rendezvous: type[Environment])
     assert [f.promise for f in findings if f.not_asked] == [
         "episodes that end for themselves end at the horizon at the latest"
     ]
+
+
+def test_the_task_of_the_page_that_ends_early_keeps_every_promise(tmp_path: Path, monkeypatch) -> None:
+    save_page_files(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    meeting = load(tmp_path / "meeting.py").Meeting
+    findings = list(check(Subject(lambda num_envs, seeds: worlds(meeting, num_envs, seeds))))
+    assert [finding for finding in findings if finding.broken] == []
+    env = worlds(meeting, 20)
+    env.reset()
+    steps = [env.step(env.heuristic()) for _ in range(25)]
+    assert sum(int(step.terminated.sum()) for step in steps) >= 40, "every world has met"
+    assert all(torch.equal(step.terminated, step.metrics["met"].bool()) for step in steps)
 
 
 def test_a_complete_task_is_short() -> None:
@@ -163,8 +176,13 @@ def test_a_start_of_another_shape_is_refused() -> None:
     [
         ("_living", torch.ones(2, 5, 1, dtype=torch.bool), r"'_living' has shape \(2, 5, 1\), expected \(2, 5, 2\)"),
         ("_living", torch.ones(2, 5, 2), "'_living' is torch.float32, expected torch.bool"),
-        ("_allow", torch.ones(2, 5, 1, 5, dtype=torch.bool), r"mask has shape \(2, 5, 1, 5\), expected \(2, 5, 2, 5\)"),
-        ("_allow", torch.ones(2, 5, 2, 5), "the action mask is torch.float32, expected torch.bool"),
+        (
+            "_allow",
+            torch.ones(2, 5, 1, 5, dtype=torch.bool),
+            r"'_allow' has shape \(2, 5, 1, 5\), expected \(2, 5, 2, 5\)",
+        ),
+        ("_allow", torch.ones(2, 5, 2, 5), "'_allow' is torch.float32, expected torch.bool"),
+        ("_ended", torch.ones(2, dtype=torch.bool), r"'_ended' has shape \(2,\), expected \(2, 5\)"),
         (
             "_advance",
             (torch.zeros(2, 5, 2), {"met": torch.zeros(())}),
@@ -174,7 +192,11 @@ def test_a_start_of_another_shape_is_refused() -> None:
 )
 def test_flags_and_metrics_of_another_shape_are_refused(method: str, value, sentence: str) -> None:
     def describe(self) -> TaskSpec:
-        extras = {"_living": {"agents_end": True}, "_allow": {"masks": True, "action": MOVES}}
+        extras = {
+            "_living": {"agents_end": True},
+            "_allow": {"masks": True, "action": MOVES},
+            "_ended": {"terminates": True},
+        }
         return replace(Plain._describe(self), **extras.get(method, {}))
 
     cls = type("Odd", (Plain,), {"_describe": describe, method: lambda self, *_: value})
@@ -213,13 +235,90 @@ def test_an_observation_of_another_width_is_refused() -> None:
         worlds(Wide).reset()
 
 
-def test_ends_of_an_episode_s_own_are_refused() -> None:
-    class Ending(Plain):
-        def _describe(self):
-            return TaskSpec(**{**vars(super()._describe()), "terminates": True})
+@pytest.mark.parametrize("switch", ["terminates", "masks", "agents_end"])
+@pytest.mark.parametrize("has_method", [True, False])
+def test_a_method_and_its_switch_in_the_spec_go_together(switch: str, has_method: bool) -> None:
+    method, shape = {"terminates": ("_ended", ()), "masks": ("_allow", (2, 5)), "agents_end": ("_living", (2,))}[switch]
 
-    with pytest.raises(ValueError, match="all episodes of a BatchedTask last 'horizon' steps; leave 'terminates' out"):
-        worlds(Ending)
+    def describe(self) -> TaskSpec:
+        return replace(Plain._describe(self), action=MOVES, **({} if has_method else {switch: True}))
+
+    def advance(self, world, action):
+        return -world["position"].norm(dim=-1), {}
+
+    own = {method: lambda self, world: torch.ones(2, 5, *shape, dtype=torch.bool)} if has_method else {}
+    env = worlds(type("Half", (Plain,), {"_describe": describe, "_advance": advance, **own}))
+    with pytest.raises(ValueError, match=f"plain: implement '{method}' and set '{switch}' in the spec, or do neither"):
+        env.reset(), env.step(env.random_action())
+
+
+class Climb(Plain):
+    """Heights that rise by what chance has drawn before the episode; an episode is over at 2."""
+
+    def _describe(self) -> TaskSpec:
+        height = layout(Field("height", Kind.SCALAR))
+        own = {"terminates": True, "shared_reward": True, "symmetry": "c1", "hidden": ("rises",)}
+        return replace(super()._describe(), observation=height, state=height, **own)
+
+    def _start(self, generator):
+        rise = torch.rand(self.num_envs, self.spec.horizon, generator=generator)
+        return {
+            "height": self.draw(1, 1, generator=generator),
+            "rise": rise,
+            "steps": torch.zeros(self.num_envs).long(),
+        }
+
+    def _advance(self, world, action):
+        rise = world["rise"].gather(-1, world["steps"].unsqueeze(-1) % 4)
+        world["height"] = world["height"] + rise.unsqueeze(-1) + 0.2 * (1 + action[..., :1, 2:])
+        world["steps"] = world["steps"] + 1
+        return world["height"].flatten(2).sum(-1), {}
+
+    def _observe(self, world):
+        return world["height"].expand(-1, -1, 2, -1)
+
+    def _ended(self, world):
+        return world["height"][..., 0, 0] > 2
+
+
+def test_a_task_whose_worlds_end_apart_and_remember_keeps_every_promise() -> None:
+    findings = {f.promise: f for f in check(Subject(lambda num_envs, seeds: worlds(Climb, num_envs, seeds)))}
+    assert [finding for finding in findings.values() if finding.broken] == []
+    assert findings["episodes end together at the horizon"].not_asked
+    assert not findings["a saved environment goes on bit for bit"].not_asked
+
+
+def test_a_world_that_ends_begins_anew_alone() -> None:
+    env = worlds(Climb, 1000, (3,))
+    env.reset()
+    age = torch.zeros(1, 1000)
+    for _ in range(12):
+        step = env.step(torch.zeros(env.action_shape))
+        age += 1
+        assert torch.equal(step.terminated, step.final.state[..., 0] > 2)
+        assert torch.equal(step.truncated, (age == 4) & ~step.terminated)
+        ended = step.ended
+        assert torch.equal(step.next.state[~ended], step.final.state[~ended])
+        assert bool((step.next.state[ended].abs() <= 1).all()), "a start"
+        age[ended] = 0
+        assert torch.equal(env.world["steps"].float(), age), "what a world remembers begins anew with it"
+        assert 0 < int(step.terminated.sum()) < 1000 or bool((age <= 1).all())
+
+
+def test_what_a_world_remembers_is_saved_and_left_alone_by_set_state() -> None:
+    env, other = worlds(Climb), worlds(Climb, seeds=(100, 101))
+    env.reset()
+    env.step(env.random_action())
+    saved = env.state_dict()
+    assert {name for name in saved if name.startswith("world")} == {"world", "world.rise", "world.steps"}
+    other.load_state_dict(saved)  # before any reset of its own
+    assert torch.equal(other.world["rise"], env.world["rise"])
+    rise = env.world["rise"].clone()
+    env.set_state(torch.zeros(env.state_shape))
+    assert torch.equal(env.world["rise"], rise)
+    del saved["world.rise"], saved["world.steps"]  # as a run of before wrote it
+    env.load_state_dict(saved)
+    assert torch.equal(env.state_dict()["world"], saved["world"])
 
 
 def test_others_are_seen_in_index_order() -> None:
@@ -258,8 +357,8 @@ class GlobalDice(Plain):
 
 
 class SharedDice(Plain):
-    def _begin(self):
-        self.world = {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])}
+    def _episodes(self):
+        return {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])}
 
 
 class Crowd(Plain):
