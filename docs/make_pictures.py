@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from esp_cli.checking.measured import prepared
-from esp_cli.symmetry import parse_elements
+from esp_cli.symmetry import Element, parse_elements
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.training.config import resolve_config
 
@@ -109,9 +109,9 @@ ROOMS: tuple[dict[str, Box], tuple[Arrow, ...]] = (
 )
 
 
-def scene(ax: Axes, element: PlaneElement, title: str) -> None:
+def scene(ax: Axes, element: Element, title: str) -> None:
     """Draw agents, landmarks and moves, turned by an element."""
-    agents, landmarks, moves = (points @ element.matrix.T for points in (AGENTS, LANDMARKS, MOVES))
+    agents, landmarks, moves = (points @ PlaneElement.of(element).matrix.T for points in (AGENTS, LANDMARKS, MOVES))
     ax.plot(*landmarks.T, "x", color="#444444", markersize=9, markeredgewidth=2)
     for place, move, colour in zip(agents, moves, COLOURS, strict=True):
         ax.add_patch(Circle(tuple(place), 0.15, color=colour))
@@ -120,7 +120,7 @@ def scene(ax: Axes, element: PlaneElement, title: str) -> None:
     ax.set_title(title, fontsize=10)
 
 
-def scenes(elements: Sequence[PlaneElement], titles: Sequence[str], rows: int) -> Figure:
+def scenes(elements: Sequence[Element], titles: Sequence[str], rows: int) -> Figure:
     """Return a figure of the scene under each element."""
     columns = len(elements) // rows
     figure = Figure(figsize=(2.1 * columns, 2.3 * rows), layout="constrained")
@@ -168,9 +168,9 @@ def trust() -> Figure:
 def main() -> None:
     """Draw every picture."""
     mpl.rcParams.update({"font.size": 9})
-    elements = [element for element in parse_elements("d4", num_agents=1) if isinstance(element, PlaneElement)]
+    elements = list(parse_elements("d4", num_agents=1))
     named = {element.name: element for element in elements}
-    still, turn = PlaneElement(), named["rot90"]
+    still, turn = Element(), named["rot90"]
     figures = {
         "turned-scene": scenes([still, turn], ["state s, joint action a", "rot90: L_g s, K_g a"], 1),
         "eight-images": scenes([still, *named.values()], ["identity", *named], 2),

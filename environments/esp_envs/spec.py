@@ -283,8 +283,9 @@ class Spaces:
         observation: layout of one agent's row, D numbers.
         state: layout of the global state that a centralised critic or mixer may see.
         action: the action space, the same for every agent.
-        symmetry: what leaves *dynamics and reward* alone: the largest planar group or one element ("d4", "flip-y"),
-            times "agents" and FIELD-COUNT where agents or like items may change places ("d4*agents*landmarks-3").
+        symmetry: the group that leaves *dynamics and reward* alone, or generators of it: what holds of the scene ("d4",
+            "flip-y"), times "agents" and FIELD-COUNT where agents or like items may change places
+            ("d4*agents*landmarks-3"), or coupled with such orders ("flip-x*agents-3-2-1-0").
         nearly: a larger symmetry that holds nearly, which a prior may use all the same; empty where there is none.
         masks: whether each observation says which of the discrete actions each agent may take.
     """

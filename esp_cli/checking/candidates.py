@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
-from esp_cli.symmetry.admission import exchangeable
+from esp_cli.symmetry.admission import declares, exchangeable
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.groups import swap_and_round
 from esp_cli.symmetry.parse import Factors
@@ -34,7 +34,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     Raises:
         UserError: the text means nothing, or nothing that is asked for can be tried.
     """
-    texts = [transforms] if transforms is not None else [_TRIED, Factors.of(spaces.symmetry).plane]
+    texts = [transforms] if transforms is not None else [_TRIED, Factors.of(spaces.symmetry).scene]
     if transforms is None:
         agents = {"agents": spaces.num_agents} if spaces.num_agents > 1 else {}
         for name, count in (agents | Factors.of(spaces.symmetry).items).items():
@@ -78,37 +78,16 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 
 def is_declared(element: Element, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element."""
-    if _lists(spaces, element):
-        return True
-    try:
-        factors = Factors.of(spaces.symmetry)
-    except ValueError:  # it names single orders of items, and this is none of them
-        return False
-    if not all(factors.allow(name, len(places)) for name, places in element.orders):
-        return False
-    if element.in_place.is_identity:
-        return True
-    if factors.plane in ("", "c1"):
-        return False
-    group = parse_elements(factors.plane, spaces.num_agents)
-    return element.in_place in group
-
-
-def _lists(spaces: Spaces, element: Element) -> bool:
-    """Return whether a declared symmetry can be listed, and holds an element as it is written."""
-    try:
-        return element in parse_elements(spaces.symmetry, spaces.num_agents)
-    except ValueError:
-        return False
+    return declares(spaces.symmetry, spaces.num_agents)(element)
 
 
 def found_group(verdicts: Sequence[ElementVerdict], spaces: Spaces) -> str:
     """Name the largest group whose tried elements all hold: "d4*agents", "c2", or "c1" for none."""
     holding = {verdict.element for verdict in verdicts if verdict.outcome == "holds"}
     broken = {verdict.element for verdict in verdicts if verdict.outcome == "broken"}
-    plane = "c1"
-    for name in sorted((*_NAMED, Factors.of(spaces.symmetry).plane), key=lambda name: len(_listed(name, 1))):
-        elements = _elements(name, 1)
+    plane, count = "c1", spaces.num_agents
+    for name in sorted((*_NAMED, Factors.of(spaces.symmetry).scene), key=lambda name: len(_listed(name, count))):
+        elements = _elements(name, count)
         known = [element for element in elements if element.name in holding | broken]
         whole = generate(known, elements) if name in _NAMED else len(known) == len(elements)
         if known and whole and broken.isdisjoint(element.name for element in known):

@@ -37,14 +37,14 @@ class IoSpec:
         return self.spaces.state if self.reads == "state" else self.spaces.observation
 
     def group(self, name: str) -> FiniteGroup:
-        """Return a group of turns and mirrors by its name.
+        """Return a group that leaves agents in their places by its name.
 
         Raises:
-            UserError: there is no such group, it is infinite or moves agents or items, or the task cannot carry it.
+            UserError: there is no such group, it is infinite or moves agents, or the task cannot carry it.
         """
         group = parse_group(name, self.spaces.num_agents)
-        if not isinstance(group, FiniteGroup) or any(element.orders for element in group.elements):
-            raise UserError(f"a network cannot be built for '{name}'; choose a finite group of the plane, as c4 or d4")
+        if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
+            raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents, as c4")
         admit(name, group, self.spaces, instead="use another network")
         return group
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from esp_cli.networks.contract import Network
 from esp_cli.networks.io_spec import IoSpec
-from esp_cli.symmetry.maps import rows_map
+from esp_cli.symmetry.maps import map_of
+from esp_cli.symmetry.representation import rows_operator
 
 
 class Symmetrised(Network):
@@ -32,7 +33,7 @@ class Symmetrised(Network):
         self.group = io.group(group)
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
-        self.image = rows_map(io.layout, self.group.elements, io.spaces.num_agents)
+        self.image = map_of(rows_operator(io.layout, self.group.elements, io.spaces.num_agents))
         back = [
             torch.block_diag(
                 *(

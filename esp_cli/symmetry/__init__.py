@@ -2,26 +2,18 @@
 
 from esp_cli.symmetry.admission import admit, admit_declared, carried_groups, default_transforms
 from esp_cli.symmetry.checks import environment_errors, network_equivariance_error
-from esp_cli.symmetry.elements import Element
-from esp_cli.symmetry.groups import (
-    FiniteGroup,
-    Group,
-    agent_permutations,
-    cyclic,
-    dihedral,
-    direct_product,
-    item_orders,
-    orthogonal,
-    special_orthogonal,
-)
+from esp_cli.symmetry.elements import Element, Geometry
+from esp_cli.symmetry.groups import FiniteGroup, Group, agent_permutations, direct_product, item_orders
 from esp_cli.symmetry.parse import parse_elements, parse_group
 from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
+from esp_cli.symmetry.plane_groups import cyclic, dihedral, orthogonal, special_orthogonal
 from esp_cli.symmetry.transform_set import TransformSet, transform_set
 from esp_cli.symmetry.transforms import Transform, build_transform
 
 __all__ = [
     "Element",
     "FiniteGroup",
+    "Geometry",
     "Group",
     "PlaneElement",
     "Transform",

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, item_places
-from esp_cli.symmetry.groups import MOST_ITEMS, Group
-from esp_cli.symmetry.parse import Factors, is_item_name, parse_elements
-from esp_cli.symmetry.representation import action_map, block_matrix, joint_sources, state_sources
+from esp_cli.symmetry.elements import AGENTS, Element, item_places
+from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
+from esp_cli.symmetry.parse import Factors, declared_factors, is_item_name, parse_elements
+from esp_cli.symmetry.representation import action_map, field_names, joint_sources, layout_operator, state_sources
 from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
 DISCOVERED = "discovered:"
 """Begins transforms that were found in data, and that the task need not declare."""
 _WITHOUT = "use --prior none, or let what holds be found: --prior auto, or --set prior.transforms=discovered"
+_ANYTHING, _ANY_SCENE = "any", "any-scene"
+"""Declared symmetries that no task writes: every element, and every one that leaves agents and items in place."""
 _FEW_ORDERS = 23
 """Orders that are weighed beside d4, each of which takes about as long: those of four agents."""
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
@@ -42,7 +44,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
         return
     advice = instead or _WITHOUT
     if carried := carried_groups(spaces):
-        plane = [name for name in carried if name in (*PLANE_GROUPS, Factors.of(_usable(spaces)).plane)]
+        plane = [name for name in carried if name in (*PLANE_GROUPS, Factors.of(_usable(spaces)).scene)]
         advice = f"use a group within {plane[-1]}" if plane else instead or f"use {carried[0]}"
         if _action_reason(moved, spaces):
             advice = advice.replace("use ", "use continuous actions or ", 1)
@@ -55,7 +57,7 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
     `agents` follows if the agents of the task may change places, then orders of items that it declares.
     """
     factors = Factors.of(_usable(spaces))
-    own = factors.plane
+    own = "" if factors.scene in (_ANYTHING, _ANY_SCENE) else factors.scene
     names = PLANE_GROUPS if own in ("", "c1", *PLANE_GROUPS) else (*PLANE_GROUPS, own)
     agents = ["agents"] if spaces.num_agents > 1 else []
     return tuple(name for name in (*names, *agents, *factors.orders) if _carries(name, spaces))
@@ -99,10 +101,10 @@ def admit_declared(spaces: Spaces) -> None:
 
 
 def _factors(symmetry: str, spaces: Spaces) -> list[str]:
-    """Return the factors of a symmetry that move something, the planar one first: "d4*agents" -> ["d4", "agents"]."""
+    """Return the factors of a symmetry that move something, the scene's first: "d4*agents" -> ["d4", "agents"]."""
     factors = Factors.of(symmetry)
-    plane = [factors.plane] if factors.plane not in ("", "c1") else []
-    return [*plane, *(["agents"] if factors.agents and spaces.num_agents > 1 else []), *factors.orders]
+    scene = [factors.scene] if factors.scene not in ("", "c1") else []
+    return [*scene, *([AGENTS] if factors.agents and spaces.num_agents > 1 else []), *factors.orders]
 
 
 def exchangeable(spaces: Spaces) -> dict[str, int]:
@@ -122,13 +124,32 @@ def exchangeable(spaces: Spaces) -> dict[str, int]:
 
 
 def unrestricted(spaces: Spaces) -> Spaces:
-    """Return spaces whose task may have any symmetry: actions and layouts alone say what is carried."""
-    return replace(spaces, nearly=Factors("o2", True, exchangeable(spaces)).name)
+    """Return spaces without a declaration to hold to: actions and layouts alone say what is carried."""
+    return replace(spaces, nearly=_ANYTHING)
 
 
 def under_a_compass(spaces: Spaces) -> Spaces:
-    """Return spaces whose agents see a compass and labels: whatever moves plane and agents holds, of items what did."""
-    return replace(spaces, nearly=Factors("o2", True, Factors.of(_usable(spaces)).items).name)
+    """Return spaces whose agents see a compass and labels.
+
+    They admit whatever moves the scene, every order of agents, and the orders of items declared before.
+    """
+    return replace(spaces, nearly=Factors(_ANY_SCENE, True, Factors.of(_usable(spaces)).items).name)
+
+
+def declares(symmetry: str, num_agents: int) -> Callable[[Element], bool]:
+    """Return what says whether a declared symmetry holds an element.
+
+    Raises:
+        UserError: the symmetry means nothing.
+    """
+    if symmetry == _ANYTHING:
+        return lambda _: True
+    factors = Factors.of(symmetry)
+    if factors.scene != _ANY_SCENE:
+        group = ProductGroup(*declared_factors(symmetry, num_agents))
+        return lambda element: element in group
+    orders = declares(replace(factors, scene="c1").name, num_agents)
+    return lambda element: orders(Element(permutation=element.permutation, items=element.items))
 
 
 def _carries(name: str, spaces: Spaces) -> bool:
@@ -143,62 +164,58 @@ def _usable(spaces: Spaces) -> str:
 
 def _reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why a task cannot carry elements, if it cannot."""
+    scenes = tuple(dict.fromkeys(element.in_place for element in elements))
+    declared = declares(_usable(spaces), spaces.num_agents)
+    undeclared = [element for element in elements if not declared(element)]
     return (
-        _action_reason(elements, spaces)
-        or _task_reason(elements, spaces)
-        or _layout_reason(elements, spaces)
-        or _agents_reason(elements, spaces)
+        _action_reason(scenes, spaces)
+        or _scene_reason([element for element in undeclared if not declared(element.in_place)], spaces)
+        or _layout_reason(scenes, elements, spaces)
+        or _agents_reason([element for element in elements if element.permutation is not None], spaces)
         or _items_reason(elements, spaces)
+        or _order_reason(undeclared, declared, spaces)
     )
 
 
-def _action_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
+def _action_reason(scenes: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which action has no image, if one has none."""
     if isinstance(spaces.action, Discrete):
         try:
-            action_map(spaces.action, elements)
-        except ValueError as error:
+            action_map(spaces.action, scenes)
+        except UserError as error:
             return str(error)
     return None
 
 
-def _task_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
-    """Say which element is no symmetry of the dynamics and reward, if one is none."""
-    name = Factors.of(_usable(spaces)).plane or "c1"
-    declared = () if name == "c1" else parse_elements(name, spaces.num_agents)
-    for element in elements:
-        if not element.in_place.is_identity and element.in_place not in declared:
-            return f"{element.in_place.name} is no symmetry of its dynamics and reward, which carry {name}"
-    return None
+def _scene_reason(undeclared: Sequence[Element], spaces: Spaces) -> str | None:
+    """Say what an element does to the scene that dynamics and reward do not carry."""
+    if not undeclared:
+        return None
+    carried = Factors.of(_usable(spaces)).scene or "c1"
+    return f"{undeclared[0].in_place.name} is no symmetry of its dynamics and reward, which carry {carried}"
 
 
-def _layout_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
+def _layout_reason(scenes: Sequence[Element], elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say which field cannot be transformed, if one cannot."""
     layouts = [spaces.observation, spaces.state]
     if isinstance(spaces.action, Continuous):
         layouts.append(spaces.action.layout)
     try:
-        for field in (field for layout in layouts for field in layout.fields):
-            item_places(elements, field)
-            if field.pixels is None:
-                block_matrix(field, elements)
-            else:
-                for element in elements:
-                    element.gather(field)  # instead of a matrix of the pixels' square
-    except ValueError as error:
+        for layout in layouts:
+            for field in layout.fields:
+                item_places(elements, field)
+            layout_operator(layout, scenes)
+    except UserError as error:
         return str(error)
     return None
 
 
-def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
+def _agents_reason(moving: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why agents cannot change places, if some are asked to and cannot."""
-    moving = [element for element in elements if element.permutation is not None]
     if not moving:
         return None
     if any(len(element.permutation or ()) != spaces.num_agents for element in moving):
         return f"the permutation is not one of its {spaces.num_agents} agents"
-    if not Factors.of(_usable(spaces)).agents:
-        return f"its declared symmetry, {_usable(spaces)}, does not say that agents may be exchanged"
     if not spaces.is_joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
         return "its state does not say which numbers belong to which agent"
     try:
@@ -206,21 +223,34 @@ def _agents_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
         joint_sources(spaces.observation, places)
         if not spaces.is_joint:
             state_sources(spaces.state, places)
-    except ValueError as error:
+    except UserError as error:
         return str(error)
     return None
 
 
 def _items_reason(elements: Sequence[Element], spaces: Spaces) -> str | None:
     """Say why items cannot change places, if some are asked to and cannot."""
-    usable, seen = _usable(spaces), [field.name for field in spaces.observation.fields]
-    for name, places in dict.fromkeys(order for element in elements for order in element.items):
-        if name not in seen:
-            return f"it has no field '{name}', but {', '.join(seen)}"
-        if not Factors.of(usable).allow(name, len(places)):
-            return f"its declared symmetry, {usable}, does not say that its {name} may be exchanged"
-        if not spaces.is_joint and all(field.name != name for field in spaces.state.fields):
+    known, seen = field_names(spaces), [field.name for field in spaces.observation.fields]
+    for name in dict.fromkeys(name for element in elements for name, _ in element.items):
+        if name not in known:
+            return f"it has no field '{name}', but {', '.join(known)}"
+        if name in seen and not spaces.is_joint and all(field.name != name for field in spaces.state.fields):
             return f"its state does not hold its {name}"
+    return None
+
+
+def _order_reason(undeclared: Sequence[Element], declared: Callable[[Element], bool], spaces: Spaces) -> str | None:
+    """Say which order of agents or items is not declared, if one is not."""
+    usable = _usable(spaces)
+    for element in undeclared:
+        parts = {name: Element(items=((name, order),)) for name, order in element.items}
+        if element.permutation is not None:
+            parts = {AGENTS: Element(permutation=element.permutation), **parts}
+        for name, part in parts.items():
+            if not declared(part):
+                what = AGENTS if name == AGENTS else f"its {name}"
+                alone = " by themselves" if f"*{name}-" in usable else ""
+                return f"its declared symmetry, {usable}, does not say that {what} may be exchanged{alone}"
     return None
 
 

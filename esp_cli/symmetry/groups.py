@@ -1,21 +1,20 @@
-"""Groups built from generators: C_n, D_n, SO(2), O(2), orders of agents or items, and their direct products."""
+"""Groups from generators, orders of agents and items, and direct products; `plane_groups` has those of the plane."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
-from fractions import Fraction
-from functools import cached_property, reduce
+from collections.abc import Iterable
+from functools import cached_property, lru_cache, reduce
 from itertools import permutations, product
 from operator import matmul
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from esp_cli.symmetry.elements import Element
-from esp_cli.symmetry.plane import PlaneElement, mirror
+from esp_cli.symmetry.elements import AGENTS, Element, Geometry, aspects_of
 from esp_envs.errors import UserError
 
 LISTED_LIMIT = 1024
@@ -41,9 +40,20 @@ class Group(ABC):
     def generators(self) -> tuple[Element, ...]:
         """Return elements whose products are the group, or come near each of its elements if it is continuous."""
 
+    @cached_property
+    def aspects(self) -> frozenset[Any]:
+        """All that its elements act on, see `Element.aspects`."""
+        return aspects_of(self.generators())
+
+    def part(self, element: Element) -> Element:
+        """Return what an element does to all that the group acts on."""
+        return element.restricted(self.aspects)
+
 
 class FiniteGroup(Group):
-    """A listed group, sorted by `Element.order`: identity first.
+    """A listed group, sorted by `Element.sort_key`: identity first.
+
+    FiniteGroup.generated_by("d2", [rotation(180), mirror()]).order  # 4
 
     Attributes:
         name: what `parse_elements` calls it.
@@ -52,19 +62,18 @@ class FiniteGroup(Group):
 
     def __init__(self, name: str, elements: Iterable[Element]) -> None:
         self.name = name
-        self.elements = tuple(sorted(set(elements), key=lambda e: e.order))
+        self.elements = tuple(sorted(set(elements), key=lambda e: e.sort_key))
         self._index = {element: i for i, element in enumerate(self.elements)}
 
     @classmethod
-    def generated_by(cls, name: str, generators: Iterable[Element]) -> FiniteGroup:
+    def generated_by(cls, name: str, generators: Iterable[Element | Geometry]) -> FiniteGroup:
         """Build the smallest group that holds the generators.
 
         Raises:
             UserError: it has more than `LISTED_LIMIT` elements.
         """
-        gens = tuple(generators)
-        identity = gens[0] @ gens[0].inverse()
-        found, frontier = {identity}, [identity]
+        gens = tuple(map(Element.of, generators))
+        found, frontier = {Element()}, [Element()]
         while frontier:
             # In a finite group, products of generators already contain every inverse.
             frontier = [p for p in {g @ h for g in gens for h in frontier} if p not in found]
@@ -95,53 +104,29 @@ class FiniteGroup(Group):
         return self.elements
 
 
-class PlaneGroup(Group):
-    """SO(2), all turns, or O(2), all turns and mirrors; drawn from the uniform (Haar) measure."""
-
-    def __init__(self, mirrors: bool) -> None:
-        self.name = "o2" if mirrors else "so2"
-        self.mirrors = mirrors
-
-    def draw(self, generator: torch.Generator) -> Element:
-        """Draw an angle uniformly, and for O(2) a fair mirror flag."""
-        turn = Fraction(float(torch.rand((), generator=generator, dtype=torch.float64)))
-        mirrored = self.mirrors and bool(torch.randint(2, (), generator=generator))
-        return PlaneElement(turn, mirrored)
-
-    def __contains__(self, element: object) -> bool:
-        if not isinstance(element, PlaneElement) or element != element.in_place:
-            return False
-        return self.mirrors or not element.mirrored
-
-    def generators(self) -> tuple[Element, ...]:
-        """Return one radian (its multiples come near every turn) and, for O(2), `flip-x`."""
-        radian = PlaneElement(Fraction(1 / math.tau))
-        return (radian, mirror()) if self.mirrors else (radian,)
-
-
 class AgentPermutations(Group):
     """All orders of N agents, sampled; for N with more than `LISTED_LIMIT` orders."""
 
     def __init__(self, num_agents: int) -> None:
-        self.name = "agents"
+        self.name = AGENTS
         self.num_agents = num_agents
 
     def draw(self, generator: torch.Generator) -> Element:
         """Draw an order uniformly."""
-        return PlaneElement(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
+        return Element(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
 
     def __contains__(self, element: object) -> bool:
-        if not isinstance(element, Element) or not element.in_place.is_identity or element.items:
+        if not isinstance(element, Element) or element != Element(permutation=element.permutation):
             return False
         return element.permutation is None or len(element.permutation) == self.num_agents
 
     def generators(self) -> tuple[Element, ...]:
         """Return the swap of the first two agents and the round of all of them, which generate every order."""
-        return tuple(PlaneElement(permutation=order) for order in swap_and_round(self.num_agents))
+        return tuple(Element(permutation=order) for order in swap_and_round(self.num_agents))
 
 
 class ProductGroup(Group):
-    """The direct product of a planar group, orders of agents and orders of items, sampled factor by factor."""
+    """The direct product of groups that act on different aspects, sampled factor by factor."""
 
     def __init__(self, *factors: Group) -> None:
         self.name = "*".join(factor.name for factor in factors)
@@ -154,19 +139,13 @@ class ProductGroup(Group):
     def __contains__(self, element: object) -> bool:
         if not isinstance(element, Element):
             return False
-        return all(part.is_identity or any(part in factor for factor in self.factors) for part in _parts(element))
+        parts = [factor.part(element) for factor in self.factors]
+        within = all(part in factor for part, factor in zip(parts, self.factors, strict=True))
+        return within and reduce(matmul, parts, Element()) == element
 
     def generators(self) -> tuple[Element, ...]:
         """Return those of all factors."""
         return tuple(element for factor in self.factors for element in factor.generators())
-
-
-def _parts(element: Element) -> Iterator[Element]:
-    """Yield what an element does in the plane, to agents, and to the items of each field."""
-    yield element.in_place
-    yield PlaneElement(permutation=element.permutation)
-    for order in element.items:
-        yield PlaneElement(items=(order,))
 
 
 def swap_and_round(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -174,26 +153,7 @@ def swap_and_round(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return (1, 0, *range(2, count)), (*range(1, count), 0)
 
 
-def cyclic(n: int) -> FiniteGroup:
-    """Return C_n, the turns by multiples of 360/n degrees."""
-    return FiniteGroup.generated_by(f"c{n}", [PlaneElement(Fraction(1, n))])
-
-
-def dihedral(n: int) -> FiniteGroup:
-    """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
-    return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])
-
-
-def special_orthogonal() -> PlaneGroup:
-    """Return SO(2)."""
-    return PlaneGroup(mirrors=False)
-
-
-def orthogonal() -> PlaneGroup:
-    """Return O(2)."""
-    return PlaneGroup(mirrors=True)
-
-
+@lru_cache(maxsize=16)
 def agent_permutations(num_agents: int) -> Group:
     """Return S_N: listed up to `LISTED_LIMIT` orders, sampled beyond.
 
@@ -204,7 +164,7 @@ def agent_permutations(num_agents: int) -> Group:
         raise UserError("agents can only change places where there are two or more; choose a planar group")
     if math.factorial(num_agents) > LISTED_LIMIT:
         return AgentPermutations(num_agents)
-    return FiniteGroup("agents", (PlaneElement(permutation=p) for p in permutations(range(num_agents))))
+    return FiniteGroup(AGENTS, (Element(permutation=p) for p in permutations(range(num_agents))))
 
 
 def item_orders(field: str, count: int) -> FiniteGroup:
@@ -215,11 +175,21 @@ def item_orders(field: str, count: int) -> FiniteGroup:
     """
     if not 2 <= count <= MOST_ITEMS:
         raise UserError(f"{count} {field} have no group of orders; 2 to {MOST_ITEMS} like items of a field have one")
-    return FiniteGroup(f"{field}-{count}", (PlaneElement(items=((field, p),)) for p in permutations(range(count))))
+    return FiniteGroup(f"{field}-{count}", (Element(items=((field, p),)) for p in permutations(range(count))))
+
+
+def are_independent(groups: Iterable[Group]) -> bool:
+    """Return whether no two groups act on a common aspect, so that they have a direct product."""
+    aspects = [group.aspects for group in groups]
+    return sum(map(len, aspects)) == len(frozenset[Any]().union(*aspects))
 
 
 def direct_product(*factors: Group) -> Group:
-    """Return the direct product of a planar group, orders of agents and orders of items, listed where small enough."""
+    """Return the direct product of groups that act on different aspects, listed where small enough."""
+    if not factors:
+        return FiniteGroup("c1", [Element()])
+    if len(factors) == 1:
+        return factors[0]
     sampled = ProductGroup(*factors)
     listed = [factor.elements for factor in factors if isinstance(factor, FiniteGroup)]
     if len(listed) < len(factors) or math.prod(map(len, listed)) > LISTED_LIMIT:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Floats
+from esp_cli.symmetry.elements import Floats, item_places
 from esp_cli.symmetry.groups import FiniteGroup
-from esp_cli.symmetry.representation import action_map, block_matrix
+from esp_cli.symmetry.representation import action_map, field_operator, item_operator
 from esp_envs.spec import ActionSpace, Discrete, Field, Kind, Layout
 
 _INDEPENDENT = 1e-6
@@ -54,9 +54,14 @@ def regular(group: FiniteGroup, copies: int) -> Block:
 
 
 def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
-    """Return one block per field of a layout."""
-    matrices = [block_matrix(field, group.elements) for field in layout.fields]
-    return [Block(m, field.width // m.shape[-1]) for m, field in zip(matrices, layout.fields, strict=True)]
+    """Return one block per field of a layout: a copy is an item, or the whole field where its items change places."""
+    return [_field_block(field, group) for field in layout.fields]
+
+
+def _field_block(field: Field, group: FiniteGroup) -> Block:
+    if item_places(group.elements, field) is None:
+        return Block(item_operator(field, group.elements).matrix, field.count)
+    return Block(field_operator(field, group.elements).matrix, 1)
 
 
 def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:
@@ -71,7 +76,7 @@ def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:
 
 def with_pixels(block: Block, side: int, group: FiniteGroup) -> Block:
     """Return how a square patch of pixels, each holding one copy of a block, transforms: number, then pixel."""
-    pixels = block_matrix(Field("patch", Kind.PICTURE, pixels=(side, side)), group.elements)
+    pixels = item_operator(Field("patch", Kind.PICTURE, pixels=(side, side)), group.elements).matrix
     size = block.size * side * side
     return Block(np.einsum("gij,gkl->gikjl", block.matrices, pixels).reshape(-1, size, size), block.copies)
 

@@ -15,9 +15,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry.elements import Element, Floats, Indices
-from esp_cli.symmetry.representation import rows_matrix, rows_permutation, state_matrix, state_permutation
-from esp_envs.spec import Layout, Spaces
+from esp_cli.symmetry.representation import Operator
+from esp_envs.errors import UserError
+
+_GATHERED_WIDTH = 128
+"""Numbers in a row from which a gather is faster than a matrix product, on a CPU."""
+_LARGEST_MATRIX = 4096
+"""Numbers in a row beyond which no matrix is built."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +102,6 @@ class Gather:
         """The map whose entries are squared: how variances of independent numbers move."""
         return Gather(self.source, self.back)
 
-    def inverse(self) -> Gather:
-        """Return the unsigned map that undoes this one."""
-        return Gather(self.back, self.source)
-
     def apply(self, function: Callable[[Tensor], Tensor]) -> Gather:
         """Return the map whose tensors went through a function, which selects some of the stack or moves all."""
         return Gather(function(self.source), function(self.back), None if self.sign is None else function(self.sign))
@@ -110,51 +110,24 @@ class Gather:
 Map = Dense | Gather
 
 
-def dense(matrix: Floats, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Dense:
-    """Return the map of matrices [S, width, width]."""
-    return Dense(torch.as_tensor(matrix, dtype=dtype, device=device))
-
-
-def gather(source: Indices, sign: Floats | None = None, device: torch.device | str = "cpu") -> Gather:
-    """Return the map of permutations [S, width] with signs [S, width]."""
-    index = torch.as_tensor(source, device=device)
-    signs = None if sign is None else torch.as_tensor(sign, dtype=torch.float32, device=device)
-    return Gather(index, index.argsort(1), signs)
-
-
-def rows_map(
-    layout: Layout,
-    elements: tuple[Element, ...],
-    num_agents: int,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
-) -> Map:
-    """Return L_g on an agent's row, or on all agents' rows end to end where agents move.
+def map_of(operator: Operator, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Map:
+    """Return what computes an operator: a gather where one is possible and faster, else a matrix product.
 
     Raises:
-        UserError: the layout cannot be transformed.
+        UserError: it is no signed permutation, and its matrix would be too large.
     """
-    if _holds_pictures(layout):
-        return gather(*rows_permutation(layout, elements, num_agents), device)
-    return dense(rows_matrix(layout, elements, num_agents), device, dtype)
+    if operator.terms == 1 and operator.width >= _GATHERED_WIDTH:
+        return gather_of(operator, device)
+    if operator.width > _LARGEST_MATRIX:
+        raise UserError(
+            f"{operator.width} numbers are too many for a map that mixes them; with pictures of this size, use quarter "
+            "turns and mirrors"
+        )
+    return Dense(torch.as_tensor(operator.matrix, dtype=dtype, device=device))
 
 
-def state_map(
-    spaces: Spaces,
-    elements: tuple[Element, ...],
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float32,
-) -> Map:
-    """Return L_g on the global state.
-
-    Raises:
-        UserError: the state cannot be transformed.
-    """
-    if _holds_pictures(spaces.state):
-        return gather(*state_permutation(spaces, elements), device)
-    return dense(state_matrix(spaces, elements), device, dtype)
-
-
-def _holds_pictures(layout: Layout) -> bool:
-    """Return whether a matrix of a layout's numbers would grow with the square of its pixels."""
-    return any(field.pixels is not None for field in layout.fields)
+def gather_of(operator: Operator, device: torch.device | str = "cpu") -> Gather:
+    """Return the gather of an operator that is a signed permutation."""
+    source = torch.as_tensor(operator.source[:, :, 0], device=device)
+    sign = torch.as_tensor(operator.weight[:, :, 0], dtype=torch.float32, device=device)
+    return Gather(source, source.argsort(1), None if bool((sign == 1).all()) else sign)

@@ -1,45 +1,32 @@
-"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`, `d4*landmarks-3`."""
+"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`, `flip-x*hips-3-2-1-0`."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
-from fractions import Fraction
+from dataclasses import dataclass, field
 from functools import reduce
+from operator import matmul
 
-from esp_cli.symmetry.elements import Element, order_name
+from esp_cli.symmetry.elements import AGENTS, Element, Geometry, order_name
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,
     MOST_ITEMS,
     FiniteGroup,
     Group,
     agent_permutations,
-    cyclic,
-    dihedral,
+    are_independent,
     direct_product,
     item_orders,
-    orthogonal,
-    special_orthogonal,
     swap_and_round,
 )
-from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
+from esp_cli.symmetry.plane_groups import read_plane
 from esp_envs.errors import UserError
 
-_NAMED = {
-    "identity": PlaneElement(),
-    "flip-x": mirror(0),
-    "flip-diagonal": mirror(45),
-    "flip-y": mirror(90),
-    "flip-antidiagonal": mirror(135),
-}
 _KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, c4, d4, c8, so2, o2, agents, landmarks-3, d4*agents"
-_DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
 _ORDER = r"(?!(?i:rot|flip|agents)-)([A-Za-z]\w*)((?:-\d{1,4})+)"
 """A field and numbers: how many items it has, or the place that each of them moves to."""
-_MAX_FOLD = 360
-_PLANE = (0, "")
-"""Rank of planar groups in a direct product, see `_rank`."""
 
 
 def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
@@ -70,70 +57,79 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
 
 
 def parse_group(text: str, num_agents: int) -> Group:
-    """Read one group name or a product of a planar group, `agents` and orders of items: a task's declared symmetry.
+    """Read a declared symmetry: groups, and elements as generators, `d4*agents` or `flip-x*hips-3-2-1-0`.
+
+    Factors that act on different things make up their direct product. A comma, or factors that act on a common thing,
+    stand for all that they generate together.
 
     Raises:
-        UserError: unknown, or no group.
+        UserError: an unknown name, or generators of more than `LISTED_LIMIT` elements.
     """
-    factors = [_factor(part.strip(), text, num_agents) for part in text.split("*")]
-    groups = [f for f in factors if isinstance(f, Group)]
-    if len(groups) != len(factors):
-        raise UserError(f"'{text}' is not a group; write for example c4, d4, o2, agents or d4*agents")
-    ranked = {_rank(group): group for group in groups}
-    if len(ranked) < len(groups) or (len(groups) > 1 and next(reversed(ranked)) == _PLANE):
-        raise UserError(
-            f"'{text}' is not a direct product; write a planar group, agents and fields, each once, as d4*agents"
-        )
-    return groups[0] if len(groups) == 1 else direct_product(*(ranked[rank] for rank in sorted(ranked)))
+    return direct_product(*declared_factors(text, num_agents))
+
+
+def declared_factors(text: str, num_agents: int) -> list[Group]:
+    """Return independent groups whose direct product is a declared symmetry, see `parse_group`."""
+    groups = [group for part in text.split(",") for group in _declared(part.strip(), text, num_agents)]
+    if are_independent(groups):
+        return sorted(groups, key=_rank)
+    if not all(isinstance(group, FiniteGroup) for group in groups):
+        raise UserError(f"'{text}' generates no group that can be listed; let so2, o2 or many agents act on their own")
+    return [FiniteGroup.generated_by(f"'{text}'", [g for group in groups for g in group.generators()])]
+
+
+def _declared(part: str, text: str, num_agents: int) -> list[Group]:
+    """Return the groups of a product, and that which the product of its elements generates."""
+    words = [word.strip() for word in part.split("*")]
+    if num_agents < 2:  # one agent has no others to change places with
+        words = [word for word in words if word.lower() != AGENTS]
+    factors = [_factor(word, text, num_agents) for word in words]
+    elements = [factor for factor in factors if isinstance(factor, Element)]
+    groups = [factor for factor in factors if isinstance(factor, Group)]
+    if elements:
+        name = "*".join(word for word, factor in zip(words, factors, strict=True) if isinstance(factor, Element))
+        groups.append(FiniteGroup.generated_by(name, [reduce(matmul, elements)]))
+    return groups
 
 
 @dataclass(frozen=True)
 class Factors:
-    """What a task's symmetry moves: "d4*agents*landmarks-3".
+    """The words of a declared symmetry, by what they move: "d4*agents*landmarks-3".
 
     Attributes:
-        plane: name of the planar part, empty where there is none.
-        agents: whether agents change places.
-        items: fields whose items change places, each with how many it has.
+        scene: what moves the scene, with coupled orders if there are: "d4", "flip-x*hips-3-2-1-0"; or empty.
+        agents: whether all orders of agents belong to it.
+        items: fields all of whose orders belong to it, each with how many items it has.
     """
 
-    plane: str
-    agents: bool
-    items: dict[str, int]
+    scene: str
+    agents: bool = False
+    items: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, symmetry: str) -> Factors:
-        """Read a task's symmetry.
-
-        Raises:
-            UserError: it has one order of items, and not all.
-        """
-        plane, items = [], dict[str, int]()
+        """Read a task's symmetry."""
+        if "," in symmetry:
+            return cls(symmetry)
+        scene, items = [], dict[str, int]()
         words = [part.strip() for part in symmetry.split("*")]
         for word in words:
             match = re.fullmatch(_ORDER, word)
-            if match is None:
-                plane += [word.lower()] if word.lower() != "agents" else []
-            elif match[2].count("-") == 1:
+            if match is not None and match[2].count("-") == 1 and _read_word(word.lower(), 2) is None:
                 items[match[1]] = int(match[2][1:])
-            else:
-                count = match[2].count("-")
-                raise UserError(f"'{word}' is one order of items; declare all of them, as in {match[1]}-{count}")
-        return cls("*".join(plane), "agents" in map(str.lower, words), items)
+            elif word.lower() != AGENTS:
+                scene.append(word if match else word.lower())
+        return cls("*".join(scene), AGENTS in map(str.lower, words), items)
 
     @property
     def name(self) -> str:
         """The symmetry as a task declares it."""
-        return "*".join((*filter(None, [self.plane]), *(["agents"] if self.agents else []), *self.orders))
+        return "*".join((*filter(None, [self.scene]), *([AGENTS] if self.agents else []), *self.orders))
 
     @property
     def orders(self) -> list[str]:
         """The groups of all orders of items: ["landmarks-3"]."""
         return [f"{name}-{count}" for name, count in self.items.items()]
-
-    def allow(self, name: str, count: int) -> bool:
-        """Return whether agents (so named), or the items of a field, may take any order."""
-        return self.agents if name == "agents" else self.items.get(name) == count
 
 
 def is_item_name(name: str) -> bool:
@@ -142,77 +138,77 @@ def is_item_name(name: str) -> bool:
 
 
 def _rank(group: Group) -> tuple[int, str]:
-    """Return where a group stands in a direct product: plane, agents, items of each field by name."""
-    moved = {name for element in group.generators() for name, _ in element.orders}
-    if not moved:
-        return _PLANE
-    return (1, "") if moved == {"agents"} else (2, min(moved))
+    """Return where a group stands in a direct product: scene, agents, items of each field by name."""
+    names = [aspect for aspect in group.aspects if isinstance(aspect, str)]
+    if len(names) < len(group.aspects) or not names:
+        return (0, "")
+    return (1, "") if names == [AGENTS] else (2, min(names))
+
+
+def _moves_scene(group: Group) -> bool:
+    """Return whether a group leaves all agents and items in their places."""
+    return not any(isinstance(aspect, str) for aspect in group.aspects)
 
 
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     """Read one item of the list: a tuple of elements, or a group that has to be sampled."""
-    factors = [_factor(p.strip(), text, num_agents) for p in part.split("*")]
-    groups = [f for f in factors if isinstance(f, Group)]
-    if len(groups) == len(factors) and (len(groups) == 1 or _rank(groups[-1]) != _PLANE):
-        group = parse_group(part, num_agents)
-        return group.elements if isinstance(group, FiniteGroup) else group
+    factors = [_factor(word.strip(), text, num_agents) for word in part.split("*")]
+    groups = [factor for factor in factors if isinstance(factor, Group)]
+    if len(groups) == len(factors):
+        ordered = len(groups) == 1 or not _moves_scene(groups[-1])
+        if are_independent(groups) and (ordered or all(map(_moves_scene, groups))):
+            group = direct_product(*sorted(groups, key=_rank))
+            return group.elements if isinstance(group, FiniteGroup) else group
+        if ordered:
+            raise UserError(f"'{part}' is not a direct product; write each thing that moves once, as in d4*agents")
     lists = []
     for factor in factors:
         if isinstance(factor, Group) and not isinstance(factor, FiniteGroup):
             raise UserError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
         lists.append(factor.elements if isinstance(factor, FiniteGroup) else (factor,))
-    if len({type(element) for elements in lists for element in elements}) > 1:
-        raise UserError(f"'{part}' multiplies transforms of several kinds; list them with commas, or choose one kind")
-    size = reduce(lambda a, b: a * b, (len(x) for x in lists))
+    size = math.prod(map(len, lists))
     if size > LISTED_LIMIT:
         raise UserError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
     return reduce(lambda a, b: tuple(g @ h for g in a for h in b), lists)
 
 
 def _factor(word: str, text: str, num_agents: int) -> Element | Group:
-    """Read one word: an element or a group."""
+    """Read one word: an element or a group. Fields keep their capitals, and come after all other words."""
+    found = _read_word(word.lower(), num_agents)
+    found = _read_items(word) if found is None else found
+    if found is None:
+        where = f" in '{text}'" if word != text else ""
+        raise UserError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+    return found
+
+
+def _read_word(word: str, num_agents: int) -> Element | Group | None:
+    """Read a word that is no order of items, in lower case; None where nothing knows it."""
     for read in READERS:
-        if (found := read(word.lower(), num_agents)) is not None:
-            return found
-    if (orders := _read_items(word)) is not None:
-        return orders
-    where = f" in '{text}'" if word != text else ""
-    raise UserError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
-
-
-def _read_plane(word: str, _: int) -> Element | Group | None:
-    if word in _NAMED:
-        return _NAMED[word]
-    if word in ("so2", "o2"):
-        return special_orthogonal() if word == "so2" else orthogonal()
-    if match := re.fullmatch(r"([cd])(\d{1,3})", word):
-        return _polygon(match[1], int(match[2]))
-    if match := re.fullmatch("rot" + _DEGREES, word):
-        return rotation(Fraction(match[1]))
-    if match := re.fullmatch("flip-?" + _DEGREES, word):
-        return mirror(Fraction(match[1]))
+        if (found := read(word, num_agents)) is not None:
+            return found if isinstance(found, Group) else Element.of(found)
     return None
 
 
 def _read_agents(word: str, num_agents: int) -> Element | Group | None:
-    if word == "agents":
+    if word == AGENTS:
         return agent_permutations(num_agents)
     if not re.fullmatch(r"agents(-\d{1,4})+", word):
         return None
-    return PlaneElement(permutation=_order(word, num_agents))
+    return Element(permutation=_order(word, num_agents))
 
 
-READERS: list[Callable[[str, int], Element | Group | None]] = [_read_plane, _read_agents]
-"""What reads a word for N agents, or returns None; each kind of transform has its own."""
+READERS: list[Callable[[str, int], Element | Geometry | Group | None]] = [read_plane, _read_agents]
+"""What reads a word for N agents, or returns None; each kind of geometry has its own."""
 
 
 def _read_items(word: str) -> Element | Group | None:
-    """Read an order of a field's items, or all orders; fields keep their capitals, and come after all other words."""
+    """Read an order of a field's items, or all orders."""
     if not (match := re.fullmatch(_ORDER, word)):
         return None
     count = match[2].count("-")
     if count > 1:
-        return PlaneElement(items=((match[1], _order(word, count)),))
+        return Element(items=((match[1], _order(word, count)),))
     items = int(match[2][1:])
     return item_orders(match[1], items) if 2 <= items <= MOST_ITEMS else None
 
@@ -229,9 +225,3 @@ def _order(word: str, count: int) -> tuple[int, ...]:
         example = order_name(name, swap_and_round(count)[1])
         raise UserError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
     return places
-
-
-def _polygon(letter: str, n: int) -> FiniteGroup:
-    if not 1 <= n <= _MAX_FOLD:
-        raise UserError(f"group '{letter}{n}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
-    return cyclic(n) if letter == "c" else dihedral(n)

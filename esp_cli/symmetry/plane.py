@@ -1,11 +1,11 @@
-"""Turns and mirrors of the plane, with or without orders of agents and items, and how they act on each field kind.
+"""Turns and mirrors of the plane, and how they act on each kind of field.
 
 Convention, pinned by `tests/symmetry/test_elements.py`: angles are counter-clockwise, `rot90` sends (1, 0) to (0, 1),
 so *right* becomes *up*; a product `g @ h` applies h first, hence L_g L_h = L_{gh}. `flip-x` is the mirror in the
 x-axis, (x, y) -> (x, -y); `flip-y` the one in the y-axis, (x, y) -> (-x, y).
 
-An element is stored as an exact fraction of a turn, a mirror flag and permutations, so that closure, products and
-inverses are decided without rounding; matrices are derived.
+An element is an exact fraction of a turn and a mirror flag, so that closure, products and inverses are decided without
+rounding; matrices are derived.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Floats, Indices, Orders, compose_permutations, order_name
+from esp_cli.symmetry.elements import Element, Floats, Geometry, Indices
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
 
@@ -67,7 +67,10 @@ KIND_MATRICES: dict[Kind, Callable[[Floats], Floats]] = {
     Kind.VECTOR: lambda planar: planar,
     Kind.WHEELS: _wheels,
 }
-"""One representation per field kind, pictures apart: a planar matrix [2, 2] to [width, width]."""
+"""One representation per field kind, pictures and rings apart: a planar matrix [2, 2] to [width, width].
+
+A kind that turns and mirrors leave alone, such as one of another geometry, says so here with a unit matrix.
+"""
 
 
 def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
@@ -121,31 +124,30 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
 
 
 @dataclass(frozen=True)
-class PlaneElement(Element):
-    """One transform: mirror in the x-axis if `mirrored`, then turn, and let agents and items change places.
+class PlaneElement(Geometry):
+    """Mirror in the x-axis if `mirrored`, then turn.
+
+    PlaneElement(Fraction(1, 4)).block(Field("way", Kind.VECTOR))  # [[0, -1], [1, 0]]
 
     Attributes:
         turn: counter-clockwise fraction of a full turn in [0, 1).
         mirrored: whether y changes sign before the turn.
-        permutation: sigma, with sigma[i] the place that agent i moves to; None where agents stay.
-        items: fields whose like items change places, each with the place that item k moves to.
     """
 
     turn: Fraction = Fraction(0)
     mirrored: bool = False
-    permutation: tuple[int, ...] | None = None
-    items: Orders = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "turn", Fraction(self.turn) % 1)
-        if self.permutation is not None and not _moves(self.permutation):
-            object.__setattr__(self, "permutation", None)
-        moving = ((name, places) for name, places in self.items if _moves(places))
-        object.__setattr__(self, "items", tuple(sorted(moving)))
+
+    @staticmethod
+    def of(element: Element) -> PlaneElement:
+        """Return what an element does to the plane."""
+        return next((g for g in element.geometry if isinstance(g, PlaneElement)), PlaneElement())
 
     @cached_property
     def matrix(self) -> Floats:
-        """The orthogonal 2x2 matrix of the planar part, Eq. 1; exact integers at multiples of 90 degrees."""
+        """The orthogonal 2x2 matrix, Eq. 1; exact integers at multiples of 90 degrees."""
         cos, sin = _cos_sin(self.turn)
         sign = -1.0 if self.mirrored else 1.0
         return np.array([[cos, -sin * sign + 0.0], [sin, cos * sign + 0.0]])
@@ -158,97 +160,56 @@ class PlaneElement(Element):
     @property
     def is_identity(self) -> bool:
         """Whether nothing moves."""
-        return self == PlaneElement()
+        return not (self.turn or self.mirrored)
 
     @property
-    def in_place(self) -> PlaneElement:
-        """The same element with all agents and items in their places."""
-        return PlaneElement(self.turn, self.mirrored)
-
-    @property
-    def order(self) -> tuple[Orders, tuple[int, ...], bool, Fraction]:
-        """What the elements of a group are sorted by: items, permutation, mirror, turn."""
-        return self.items, self.permutation or (), self.mirrored, self.turn
+    def sort_key(self) -> tuple[bool, Fraction]:
+        """What the elements of a group are sorted by: mirror, turn."""
+        return self.mirrored, self.turn
 
     @property
     def participle(self) -> str:
         """How messages say that something was transformed."""
-        return f"mirrored by {self.in_place.name}" if self.mirrored else f"turned by {float(self.degrees):g} degrees"
+        return f"mirrored by {self.name}" if self.mirrored else f"turned by {float(self.degrees):g} degrees"
 
     @property
     def name(self) -> str:
-        """The name that `parse_elements` reads: rot90, flip-x, flip22.5, rot90*agents-1-0-2*landmarks-1-0."""
-        parts = []
+        """The name that `parse_elements` reads: rot90, flip-x, flip22.5."""
         if self.mirrored:
             axis = self.degrees / 2
-            parts.append(_MIRROR_NAMES.get(axis, f"flip{_number(axis)}"))
-        elif self.turn:
-            parts.append(f"rot{_number(self.degrees)}")
-        parts += [order_name(name, places) for name, places in self.orders]
-        return "*".join(parts) or "identity"
+            return _MIRROR_NAMES.get(axis, f"flip{_number(axis)}")
+        return f"rot{_number(self.degrees)}" if self.turn else "identity"
 
     def __matmul__(self, other: PlaneElement) -> PlaneElement:
-        """Compose: `g @ h` applies h first, then g.
-
-        Raises:
-            UserError: the two permute different numbers of agents or items.
-        """
+        """Compose: `g @ h` applies h first, then g."""
         # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
         turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
-        permutation = compose_permutations(self.permutation, other.permutation)
-        mine, others = dict(self.items), dict(other.items)
-        items = {name: compose_permutations(mine.get(name), others.get(name)) or () for name in mine | others}
-        return PlaneElement(turn, self.mirrored != other.mirrored, permutation, tuple(items.items()))
+        return PlaneElement(turn, self.mirrored != other.mirrored)
 
     def inverse(self) -> PlaneElement:
         """Return the element that undoes this one."""
-        turn = self.turn if self.mirrored else -self.turn
-        permutation = None if self.permutation is None else _undone(self.permutation)
-        items = tuple((name, _undone(places)) for name, places in self.items)
-        return PlaneElement(turn, self.mirrored, permutation, items)
+        return self if self.mirrored else PlaneElement(-self.turn)
 
-    def block(self, field: Field) -> Floats:
-        """Return how one item of a field transforms: [item width, item width].
+    def block(self, field: Field) -> Floats | Indices:
+        """Return how the numbers of one item of a field transform.
 
         Raises:
             UserError: pixels or rays do not come to lie on others, or the kind is unknown in the plane.
         """
         if field.pixels is not None:
-            return np.eye(field.item_width)[picture_sources(field.pixels, self.matrix)]
+            return picture_sources(field.pixels, self.matrix)
         if field.rays:
-            return np.eye(field.rays)[ring_sources(field.rays, self.matrix)]
+            return ring_sources(field.rays, self.matrix)
         if field.kind not in KIND_MATRICES:
             raise UserError(f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns")
         return KIND_MATRICES[field.kind](self.matrix)
 
-    def gather(self, field: Field) -> tuple[Indices, Floats]:
-        """Return `block` as a signed permutation; of a picture without the large matrix."""
-        if field.pixels is None:
-            return super().gather(field)
-        return picture_sources(field.pixels, self.matrix), np.ones(field.item_width)
 
-
-def _moves(places: tuple[int, ...]) -> bool:
-    """Return whether a permutation moves something.
-
-    Raises:
-        UserError: it is none.
-    """
-    stay = tuple(range(len(places)))
-    if tuple(sorted(places)) != stay:
-        raise UserError(f"{places} is not a permutation; write each number from 0 to {len(places) - 1} once")
-    return places != stay
-
-
-def _undone(places: tuple[int, ...]) -> tuple[int, ...]:
-    return tuple(places.index(i) for i in range(len(places)))
-
-
-def rotation(degrees: Fraction | int | str) -> PlaneElement:
+def rotation(degrees: Fraction | int | str) -> Element:
     """Return the counter-clockwise turn by an exact number of degrees."""
-    return PlaneElement(Fraction(degrees) / 360)
+    return Element.of(PlaneElement(Fraction(degrees) / 360))
 
 
-def mirror(axis_degrees: Fraction | int | str = 0) -> PlaneElement:
+def mirror(axis_degrees: Fraction | int | str = 0) -> Element:
     """Return the mirror in the line through the origin at this angle; 0 is `flip-x`, 90 is `flip-y`."""
-    return PlaneElement(Fraction(axis_degrees) / 180, mirrored=True)
+    return Element.of(PlaneElement(Fraction(axis_degrees) / 180, mirrored=True))

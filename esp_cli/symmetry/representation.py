@@ -1,53 +1,160 @@
-"""What elements do to numbers: layouts to L_g, action spaces to K_g, as matrices or as signed permutations.
+"""What elements do to numbers: layouts to L_g, action spaces to K_g, as one operator on rows of numbers.
 
-Everything is stacked over G elements; float64 throughout. All matrices are orthogonal, so an inverse is a transpose.
+Everything is stacked over G elements, in float64. All operators are orthogonal, so an inverse is a transpose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Floats, Indices, item_places, places_of
+from esp_cli.symmetry.elements import Element, Floats, Geometry, Indices, item_places, places_of
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, others_of
 
 _MATCH_TOLERANCE = 1e-6
 
 
-def block_matrix(field: Field, elements: Sequence[Element]) -> Floats:
-    """Return how each run of d numbers of a field transforms, d dividing its width: [G, d, d].
+@dataclass(frozen=True)
+class Operator:
+    """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]].
 
-    Where items change places, the run is the whole field.
+    Attributes:
+        source: [G, D, m] int64; a new number is made of m old ones.
+        weight: [G, D, m].
     """
+
+    source: Indices
+    weight: Floats
+
+    @classmethod
+    def of_block(cls, block: Floats | Indices) -> Operator:
+        """Return the operator of one block, as `Geometry.block` gives it."""
+        if block.ndim == 1:
+            return cls.reordering(np.asarray(block, dtype=np.int64)[None])
+        most = max(1, np.count_nonzero(block, axis=1).max(initial=0))
+        source = np.argsort(block == 0, axis=1, kind="stable")[None, :, :most]
+        return cls(source, np.take_along_axis(np.asarray(block, dtype=np.float64)[None], source, 2))
+
+    @classmethod
+    def reordering(cls, order: Indices) -> Operator:
+        """Return the operator that puts old number order[g, k] at place k: [G, D]."""
+        return cls(order[:, :, None], np.ones((*order.shape, 1)))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Operator], num_elements: int) -> Operator:
+        """Return the operator of rows laid end to end, each with its own."""
+        starts = np.cumsum([0, *(part.width for part in parts)])
+        shape = (num_elements, starts[-1], max((part.terms for part in parts), default=1))
+        source, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        for part, start in zip(parts, starts, strict=False):
+            where = np.s_[:, start : start + part.width, : part.terms]
+            source[where], weight[where] = part.source + start, part.weight
+        return cls(source, weight)
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Operator]) -> Operator:
+        """Return the operators of some elements, one after the other."""
+        shape = (len(parts), parts[0].width, max(part.terms for part in parts))
+        source, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        for g, part in enumerate(parts):
+            source[g, :, : part.terms], weight[g, :, : part.terms] = part.source[0], part.weight[0]
+        return cls(source, weight)
+
+    @property
+    def terms(self) -> int:
+        """m; 1 where numbers only change places and signs."""
+        return self.source.shape[2]
+
+    @property
+    def width(self) -> int:
+        """D."""
+        return self.source.shape[1]
+
+    @property
+    def matrix(self) -> Floats:
+        """The same as matrices [G, D, D]."""
+        out = np.zeros((len(self.source), self.width, self.width))
+        elements, rows = np.arange(len(self.source))[:, None, None], np.arange(self.width)[:, None]
+        np.add.at(out, (elements, rows, self.source), self.weight)
+        return out
+
+    def push(self, rows: Floats) -> Floats:
+        """Apply it to rows [D]: [G, D]."""
+        return (self.weight * rows[self.source]).sum(-1)
+
+    def after(self, first: Operator) -> Operator:
+        """Return the product that applies `first`, then this."""
+        elements, shape = np.arange(len(self.source))[:, None, None], (len(self.source), self.width, -1)
+        source, weight = first.source[elements, self.source], first.weight[elements, self.source]
+        return Operator(source.reshape(shape), (self.weight[..., None] * weight).reshape(shape))
+
+    def ordered(self, order: Indices) -> Operator:
+        """Return this operator followed by another order of its results: place k takes result order[g, k]."""
+        index = order[:, :, None]
+        return Operator(np.take_along_axis(self.source, index, 1), np.take_along_axis(self.weight, index, 1))
+
+    def repeated(self, count: int) -> Operator:
+        """Return the operator of `count` rows laid end to end, all with this one."""
+        starts = self.width * np.arange(count)[:, None, None]
+        shape = (len(self.source), count * self.width, self.terms)
+        return Operator((self.source[:, None] + starts).reshape(shape), np.tile(self.weight, (1, count, 1)))
+
+    def selected(self, index: Sequence[int]) -> Operator:
+        """Return the operators at some places of the stack."""
+        return Operator(self.source[index], self.weight[index])
+
+
+def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
+    """Return how the numbers of one item of a field transform, with all things in their places.
+
+    Raises:
+        UserError: a geometry cannot transform the field, or two do not commute on it.
+    """
+    geometries = list(dict.fromkeys(element.geometry for element in elements))
+    index = [geometries.index(element.geometry) for element in elements]
     if field.parts:
-        item = layout_matrix(Layout(field.parts), [element.in_place for element in elements])
-    else:
-        item = np.stack([element.block(field) for element in elements])
-    places = item_places(elements, field)
-    if places is None:
-        return item
-    came_from = np.eye(field.count)[np.argsort(places, axis=1)]
-    each = np.kron(np.eye(field.item_width // item.shape[-1]), item)  # one item may be several runs
-    return np.einsum("gkm,gde->gkdme", came_from, each).reshape(len(elements), field.width, field.width)
+        return layout_operator(Layout(field.parts), [Element(geometry) for geometry in geometries]).selected(index)
+    return Operator.stacked([_item_operator(field, geometry) for geometry in geometries]).selected(index)
 
 
-def layout_matrix(layout: Layout, elements: Sequence[Element]) -> Floats:
-    """Return L_g of a layout of D numbers, block by block, with all agents in their places: [G, D, D]."""
-    out = np.zeros((len(elements), layout.width, layout.width))
-    start = 0
-    for field in layout.fields:
-        block = block_matrix(field, elements)
-        width, end = block.shape[-1], start + field.width
-        for first in range(start, end, width):
-            out[:, first : first + width, first : first + width] = block
-        start = end
-    return out
+def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
+    """Return how one item transforms under one of each kind of geometry, G = 1."""
+    whole = Operator.reordering(np.arange(field.item_width)[None])
+    for one in geometry:
+        part = Operator.of_block(one.block(field))
+        if part.width != field.item_width:
+            raise UserError(
+                f"{one.name} transforms {part.width} numbers of field '{field.name}', but an item of it has "
+                f"{field.item_width}"
+            )
+        probe = np.random.default_rng(0).normal(size=field.item_width)
+        if not np.allclose(part.push(whole.push(probe)[0]), whole.push(part.push(probe)[0])):
+            names = " and ".join(g.name for g in geometry)
+            raise UserError(f"{names} do not commute on field '{field.name}', so their product is no symmetry")
+        whole = part.after(whole)
+    return whole
 
 
-def joint_matrix(layout: Layout, elements: Sequence[Element], places: Indices) -> Floats:
-    """Return L_g of all agents' rows laid end to end: row i is transformed and moves to row sigma(i).
+def field_operator(field: Field, elements: Sequence[Element]) -> Operator:
+    """Return how a field transforms: each of its items, and their order.
+
+    Raises:
+        UserError: an element cannot transform it.
+    """
+    items, places = item_operator(field, elements).repeated(field.count), item_places(elements, field)
+    return items if places is None else items.ordered(_numbers(np.argsort(places, axis=1), field.item_width))
+
+
+def layout_operator(layout: Layout, elements: Sequence[Element]) -> Operator:
+    """Return L_g of a layout of D numbers, field by field, with all agents in their places."""
+    return Operator.beside([field_operator(field, elements) for field in layout.fields], len(elements))
+
+
+def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) -> Operator:
+    """Return L_g of an agent's row, or where agents move of all rows end to end: row i moves to row sigma(i).
 
     Inside a row, items that count over OTHERS or over AGENTS are reordered so that each keeps describing the agent
     that it described before.
@@ -55,81 +162,17 @@ def joint_matrix(layout: Layout, elements: Sequence[Element], places: Indices) -
     Args:
         layout: one agent's row, D numbers.
         elements: G of them.
-        places: [G, N], places[g, i] = sigma_g(i).
+        num_agents: N.
 
     Returns:
-        [G, N * D, N * D].
+        An operator on D or on N D numbers.
     """
-    num_agents = places.shape[1]
-    row = layout_matrix(layout, elements)
-    blocks = np.einsum("nm,gde->gndme", np.eye(num_agents), row)
-    width = num_agents * layout.width
-    source = joint_sources(layout, places)
-    return np.take_along_axis(blocks.reshape(-1, width, width), source[:, :, None], axis=1)
+    row, places = layout_operator(layout, elements), places_of(elements, num_agents)
+    return row if places is None else row.repeated(num_agents).ordered(joint_sources(layout, places))
 
 
-def rows_matrix(layout: Layout, elements: Sequence[Element], num_agents: int) -> Floats:
-    """Return `joint_matrix` where agents move, else `layout_matrix`, the same for every agent's row."""
-    places = places_of(elements, num_agents)
-    return layout_matrix(layout, elements) if places is None else joint_matrix(layout, elements, places)
-
-
-def layout_permutation(layout: Layout, elements: Sequence[Element]) -> tuple[Indices, Floats]:
-    """Return `layout_matrix` as a signed permutation: source and sign, [G, D] each; see `rows_permutation`."""
-    sources, signs, start = [], [], 0
-    for field in layout.fields:
-        source, sign = _signed_permutations(field, elements)
-        runs = field.width // source.shape[1]
-        first = start + source.shape[1] * np.arange(runs)[:, None]
-        sources.append((source[:, None, :] + first).reshape(len(elements), -1))
-        signs.append(np.tile(sign, (1, runs)))
-        start += field.width
-    return np.concatenate(sources, 1), np.concatenate(signs, 1)
-
-
-def rows_permutation(layout: Layout, elements: Sequence[Element], num_agents: int) -> tuple[Indices, Floats]:
-    """Return L_g as a signed permutation: the new number k is sign[k] times the old number source[k].
-
-    The same as `rows_matrix`, whose square grows too large with pictures.
-
-    Returns:
-        source and sign, [G, D] each, or [G, N * D] where agents move.
-
-    Raises:
-        UserError: an item mixes its numbers, as a vector does under other turns than quarters.
-    """
-    within, sign = layout_permutation(layout, elements)
-    places = places_of(elements, num_agents)
-    if places is None:
-        return within, sign
-    joint = (within[:, None, :] + layout.width * np.arange(num_agents)[:, None]).reshape(len(elements), -1)
-    return _reordered(joint, np.tile(sign, (1, num_agents)), joint_sources(layout, places))
-
-
-def _reordered(source: Indices, sign: Floats, order: Indices) -> tuple[Indices, Floats]:
-    """Return a signed permutation [G, D] followed by another order of its results."""
-    return np.take_along_axis(source, order, 1), np.take_along_axis(sign, order, 1)
-
-
-def _signed_permutations(field: Field, elements: Sequence[Element]) -> tuple[Indices, Floats]:
-    """Return source and sign of each run of d numbers of a field, [G, d] each; see `block_matrix`."""
-    if field.parts:
-        source, sign = layout_permutation(Layout(field.parts), [element.in_place for element in elements])
-    else:
-        gathered = zip(*(element.gather(field) for element in elements), strict=True)
-        source, sign = (np.stack(part) for part in gathered)
-    places = item_places(elements, field)
-    if places is None:
-        return source, sign
-    first = field.item_width * np.argsort(places, axis=1)
-    runs = np.arange(0, field.item_width, source.shape[1])
-    item = (source[:, None, :] + runs[:, None]).reshape(len(elements), -1)
-    whole = (first[:, :, None] + item[:, None, :]).reshape(len(elements), -1)
-    return whole, np.tile(sign, (1, field.width // sign.shape[1]))
-
-
-def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
-    """Return L_g of the global state [G, Ds, Ds].
+def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
+    """Return L_g of the global state of Ds numbers.
 
     A state that is `joint_layout` of the observation moves like the joint observation; any other moves its AGENTS
     items.
@@ -138,21 +181,55 @@ def state_matrix(spaces: Spaces, elements: Sequence[Element]) -> Floats:
         UserError: agents move, and a field's items cannot follow them.
     """
     places = places_of(elements, spaces.num_agents)
-    if places is None:
-        return layout_matrix(spaces.state, elements)
-    if spaces.is_joint:
-        return joint_matrix(spaces.observation, elements, places)
-    order = state_sources(spaces.state, places)
-    return np.take_along_axis(layout_matrix(spaces.state, elements), order[:, :, None], axis=1)
-
-
-def state_permutation(spaces: Spaces, elements: Sequence[Element]) -> tuple[Indices, Floats]:
-    """Return `state_matrix` as a signed permutation: source and sign, [G, Ds] each; see `rows_permutation`."""
-    places = places_of(elements, spaces.num_agents)
     if places is not None and spaces.is_joint:
-        return rows_permutation(spaces.observation, elements, spaces.num_agents)
-    source, sign = layout_permutation(spaces.state, elements)
-    return (source, sign) if places is None else _reordered(source, sign, state_sources(spaces.state, places))
+        return rows_operator(spaces.observation, elements, spaces.num_agents)
+    state = layout_operator(spaces.state, elements)
+    return state if places is None else state.ordered(state_sources(spaces.state, places))
+
+
+def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
+    """Return K_g of one number per discrete action, or of a continuous action, of all agents where they move."""
+    if not isinstance(spaces.action, Discrete):
+        return rows_operator(spaces.action.layout, elements, spaces.num_agents)
+    row, places = np.argsort(action_map(spaces.action, elements), axis=1), places_of(elements, spaces.num_agents)
+    each = Operator.reordering(row)
+    if places is None:
+        return each
+    return each.repeated(spaces.num_agents).ordered(_numbers(np.argsort(places, axis=1), spaces.action.count))
+
+
+def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
+    """Return K_g of a discrete action space: entry [g, j] is the action that j becomes.
+
+    It is derived by turning each action's physical meaning and looking for the action that means the result. Of
+    several actions with one meaning the first goes to the first, the second to the second.
+
+    Returns:
+        [G, A].
+
+    Raises:
+        UserError: some action's image is no action.
+    """
+    points = np.array(action.points, dtype=np.float64)
+    turned = item_operator(Field("action", action.kind), elements)
+    images = np.einsum("gvw,jw->gjv", turned.matrix, points)
+    same = np.abs(points[:, None, :] - points).max(axis=-1) <= _MATCH_TOLERANCE
+    place = np.tril(same, -1).sum(axis=1)  # among the actions of its meaning
+    distance = np.abs(images[:, :, None, :] - points).max(axis=-1)
+    distance += np.where(place[:, None] == place, 0.0, np.inf)
+    nearest: Indices = distance.argmin(axis=-1)
+    missed = np.argwhere(distance.min(axis=-1) > _MATCH_TOLERANCE)
+    if len(missed):
+        g, j = missed[0]
+        raise UserError(f"action '{action.names[j]}' {elements[g].participle} is no action")
+    return nearest
+
+
+def field_names(spaces: Spaces) -> list[str]:
+    """Return the names of the fields whose items an order may name: those of the observation and of the action."""
+    seen = [field.name for field in spaces.observation.fields]
+    acted = () if isinstance(spaces.action, Discrete) else spaces.action.layout.fields
+    return list(dict.fromkeys((*seen, *(field.name for field in acted))))
 
 
 def state_sources(layout: Layout, places: Indices) -> Indices:
@@ -178,34 +255,6 @@ def state_sources(layout: Layout, places: Indices) -> Indices:
         sources.append(start + _numbers(slots, field.item_width))
         start += field.width
     return np.concatenate(sources, axis=1)
-
-
-def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
-    """Return K_g of a discrete action space: entry [g, j] is the action that j becomes.
-
-    It is derived by turning each action's physical meaning and looking for the action that means the result. Of
-    several actions with one meaning the first goes to the first, the second to the second.
-
-    Returns:
-        [G, A].
-
-    Raises:
-        UserError: some action's image is no action.
-    """
-    points = np.array(action.points, dtype=np.float64)
-    images = np.einsum(
-        "gvw,jw->gjv", block_matrix(Field("action", action.kind), [e.in_place for e in elements]), points
-    )
-    same = np.abs(points[:, None, :] - points).max(axis=-1) <= _MATCH_TOLERANCE
-    place = np.tril(same, -1).sum(axis=1)  # among the actions of its meaning
-    distance = np.abs(images[:, :, None, :] - points).max(axis=-1)
-    distance += np.where(place[:, None] == place, 0.0, np.inf)
-    nearest: Indices = distance.argmin(axis=-1)
-    missed = np.argwhere(distance.min(axis=-1) > _MATCH_TOLERANCE)
-    if len(missed):
-        g, j = missed[0]
-        raise UserError(f"action '{action.names[j]}' {elements[g].participle} is no action")
-    return nearest
 
 
 def joint_sources(layout: Layout, places: Indices) -> Indices:

@@ -41,7 +41,7 @@ class TransformSet:
         self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
         # Built once where it fits, with the identity at the end: a draw is then a selection.
         stacked = 0 < self.size <= _STACK_LIMIT
-        self._stack = self._build([*self._elements, identity_of(self._elements[0])]) if stacked else None
+        self._stack = self._build([*self._elements, Element()]) if stacked else None
         self._singles: dict[int, Transform] = {}
 
     def draw(self, generators: Sequence[torch.Generator], keep: Sequence[float] = ()) -> Transform:
@@ -58,11 +58,11 @@ class TransformSet:
         """
         if self._group is not None:
             drawn = ((_draw_moving(self._group, g), g) for g in generators)
-            return self._build([e if not keep or _stays(keep[0], g) else identity_of(e) for e, g in drawn])
+            return self._build([e if not keep or _stays(keep[0], g) else Element() for e, g in drawn])
         return self._picked([self._pick(keep, g) for g in generators])
 
     def _pick(self, keep: Sequence[float], generator: torch.Generator) -> int:
-        """Draw the place of an element by rejection, so that equal chances draw as none at all."""
+        """Draw an index by rejection; with equal weights the random stream equals the unweighted one."""
         most = max(keep, default=1.0)
         while most > 0:
             index = int(torch.randint(self.size, (), generator=generator))
@@ -77,7 +77,7 @@ class TransformSet:
     def _picked(self, picks: Sequence[int]) -> Transform:
         """Return the elements at these places, one per seed; the place behind the last is the identity."""
         if self._stack is None:
-            elements = (*self._elements, identity_of(self._elements[0]))
+            elements = (*self._elements, Element())
             return self._build([elements[i] for i in picks])
         return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
 
@@ -119,11 +119,6 @@ def transform_set(
         UserError: the text means nothing, or the task cannot carry what it means.
     """
     return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
-
-
-def identity_of(element: Element) -> Element:
-    """Return the identity of an element's kind."""
-    return element @ element.inverse()
 
 
 def _stays(strength: float, generator: torch.Generator) -> bool:

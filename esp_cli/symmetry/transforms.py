@@ -18,8 +18,15 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry.elements import Element, places_of
-from esp_cli.symmetry.maps import Gather, Map, gather, rows_map, state_map
-from esp_cli.symmetry.representation import action_map
+from esp_cli.symmetry.maps import Gather, Map, gather_of, map_of
+from esp_cli.symmetry.representation import (
+    Operator,
+    action_map,
+    field_names,
+    output_operator,
+    rows_operator,
+    state_operator,
+)
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
@@ -174,25 +181,18 @@ def build_transform(
     """
     if not elements:
         raise UserError("a transform needs one element per seed, got none")
-    chosen, num_agents = tuple(elements), spaces.num_agents
-    seen = spaces.observation.slices()
-    if missing := [name for element in chosen for name, _ in element.items if name not in seen]:
-        raise UserError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {', '.join(seen)}")
-    places = places_of(chosen, num_agents)
-    index: Tensor | None = None
+    chosen = tuple(elements)
+    if missing := [name for element in chosen for name, _ in element.items if name not in field_names(spaces)]:
+        names = ", ".join(field_names(spaces))
+        raise UserError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {names}")
+    places, outputs, image = places_of(chosen, spaces.num_agents), output_operator(spaces, chosen), None
     if isinstance(spaces.action, Discrete):
-        image = action_map(spaces.action, chosen)
-        index = torch.as_tensor(image, device=device)
-        if places is not None:
-            image = (places[:, :, None] * spaces.action.count + image[:, None, :]).reshape(len(chosen), -1)
-        output_map: Map = gather(image, device=device).inverse()
-    else:
-        output_map = rows_map(spaces.action.layout, chosen, num_agents, device, dtype)
+        image = torch.as_tensor(action_map(spaces.action, chosen), device=device)
     return Transform(
         elements=chosen,
-        agents=None if places is None else gather(places, device=device).inverse(),
-        obs_map=rows_map(spaces.observation, chosen, num_agents, device, dtype),
-        state_map=state_map(spaces, chosen, device, dtype),
-        output_map=output_map,
-        action_index=index,
+        agents=None if places is None else gather_of(Operator.reordering(places.argsort(1)), device),
+        obs_map=map_of(rows_operator(spaces.observation, chosen, spaces.num_agents), device, dtype),
+        state_map=map_of(state_operator(spaces, chosen), device, dtype),
+        output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
+        action_index=image,
     )

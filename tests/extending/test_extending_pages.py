@@ -5,44 +5,26 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 
-import numpy as np
 import pytest
-import torch
 
 from esp_cli import load_policy
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
-from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
-from esp_cli.symmetry import Element, FiniteGroup, build_transform, parse, transform_set
 from esp_cli.training.metrics import column, read_metrics
-from esp_envs.spec import Continuous, Field, Kind, Spaces, layout
 from tests.cli.running import esp, refused
 
 PAGES = Path(__file__).parents[2] / "docs"
 
 
-def code_of(page: str) -> ModuleType:
-    """Run all Python blocks of a page, in one module, and return its names."""
-    blocks = re.findall(r"```python\n(.*?)```", (PAGES / page).read_text(encoding="utf-8"), re.S)
-    module = ModuleType(f"extending_{page.removesuffix('.md').replace('-', '_')}")
-    sys.modules[module.__name__] = module  # dataclasses and pydantic look their module up
-    for block in blocks:
-        exec(compile(block, page, "exec"), module.__dict__)  # noqa: S102 - the page is part of the repository
-    return module
-
-
 @pytest.fixture(autouse=True)
 def registries_as_before(monkeypatch):
     """Take what a test registers out again."""
-    readers = parse.READERS.copy()
     monkeypatch.setattr(sys, "path", list(sys.path))
     for table in (ALGORITHMS, NETWORKS):
         monkeypatch.setattr(table, "_registered", {})
     before = set(sys.modules)
     yield
-    parse.READERS[:] = readers
     for name in set(sys.modules) - before:
         if name in ("reinforce", "skip"):
             del sys.modules[name]
@@ -169,83 +151,3 @@ def test_an_unknown_algorithm_and_network_are_refused(tmp_path):
 )
 def test_what_is_no_algorithm_or_network_is_answered_by_a_sentence(saved, words, sentence):
     assert sentence in refused("train", *words, "--out", "no")
-
-
-def walker(kind: Kind) -> Spaces:
-    return Spaces(
-        num_agents=1,
-        observation=layout(Field("speed", Kind.VECTOR), Field("knees", kind, 2)),
-        state=layout(Field("knees", kind)),
-        action=Continuous(layout(Field("torque", kind))),
-        symmetry="legs",
-    )
-
-
-def test_the_symmetry_reaches_transforms_groups_and_the_prior():
-    code = code_of("add-a-symmetry.md")
-    spaces = walker(code.LEGS)
-    transform = transform_set("legs", spaces).each()[0]
-    assert transform.elements[0].name == "swap-legs"
-    assert transform.obs(torch.tensor([[5.0, 6, 1, 2, 3, 4]])).tolist() == [[5, 6, 2, 1, 4, 3]]
-    assert transform.pull_back(torch.tensor([[1.0, 2]])).tolist() == [[2, 1]]
-    batch = SeedBatch(torch.randn(2, 3, 1, 1, 6), torch.randn(2, 3, 1, 2), torch.randn(2, 3, 1, 1, 2))
-    prior = SymmetryPrior(PriorConfig(transforms="swap-legs"), spaces)
-    assert torch.equal(prior.copies(batch, []).rows.state[:, 3:], batch.state.flip(-1))
-    with pytest.raises(ValueError, match="rot90 is no symmetry of its dynamics and reward, which carry legs"):
-        transform_set("rot90", spaces)
-    with pytest.raises(ValueError, match="several kinds"):
-        transform_set("rot90*swap-legs", spaces)
-
-
-def test_without_its_line_the_symmetry_is_unknown():
-    code = code_of("add-a-symmetry.md")
-    parse.READERS.remove(code.read_legs)
-    with pytest.raises(ValueError, match="unknown transform 'legs'"):
-        transform_set("legs", walker(code.LEGS))
-
-
-class SpaceTurn(Element):
-    """A quarter turn in space: a signed permutation of the three axes with determinant 1."""
-
-    permutation = None
-
-    def __init__(self, matrix: np.ndarray) -> None:
-        self.rows = tuple(map(tuple, np.rint(matrix).astype(int).tolist()))
-
-    name = property(lambda self: f"turn{self.rows}")
-    order = property(lambda self: (self.rows != ((1, 0, 0), (0, 1, 0), (0, 0, 1)), self.rows))
-    in_place = property(lambda self: self)
-    is_identity = property(lambda self: not self.order[0])
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, SpaceTurn) and self.rows == other.rows
-
-    def __hash__(self) -> int:
-        return hash(self.rows)
-
-    def __matmul__(self, other: SpaceTurn) -> SpaceTurn:
-        return SpaceTurn(np.array(self.rows) @ np.array(other.rows))
-
-    def inverse(self) -> SpaceTurn:
-        return SpaceTurn(np.array(self.rows).T)
-
-    def block(self, field: Field) -> np.ndarray:
-        return np.array(self.rows, dtype=float) if field.kind.width == 3 else np.eye(field.item_width)
-
-
-def test_turns_in_space_need_no_more_than_an_element():
-    about_z, about_x = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    cube = FiniteGroup.generated_by("cube", [SpaceTurn(about_z), SpaceTurn(about_x)])
-    assert cube.order == 24
-    assert cube.elements[0].is_identity
-    space = Kind("vector3", 3, is_vector=True)
-    row = layout(Field("position", space), Field("mass", Kind.SCALAR))
-    spaces = Spaces(
-        num_agents=1, observation=row, state=row, action=Continuous(layout(Field("force", space))), symmetry="c1"
-    )
-    (first,) = (build_transform([SpaceTurn(about_z)], spaces),)
-    assert first.obs(torch.tensor([[1.0, 2, 3, 7]])).tolist() == [[-2, 1, 3, 7]]
-    g, h = cube.elements[5], cube.elements[17]
-    x = torch.tensor([[0.5, -1.0, 2.0, 1.0]])
-    both = build_transform([g @ h], spaces).obs(x)
-    assert torch.equal(both, build_transform([g], spaces).obs(build_transform([h], spaces).obs(x)))

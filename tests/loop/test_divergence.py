@@ -11,7 +11,7 @@ from torch import distributions as td
 
 from esp_cli import Continuous, Field, Kind, discrete_moves, layout
 from esp_cli.loop.divergence import policy_divergence
-from esp_cli.symmetry import Transform, transform_set
+from esp_cli.symmetry import PlaneElement, Transform, transform_set
 from esp_envs.spec import ActionSpace, Items, Spaces
 
 SEEN = layout(Field("velocity", Kind.VECTOR))
@@ -65,7 +65,7 @@ def test_an_action_that_is_masked_out_leaves_gradients_finite() -> None:
 def test_a_turned_normal_has_the_divergence_of_its_full_covariance(name: str) -> None:
     g = element(name, FORCE)
     there, here = normal(random(5, 2), torch.tensor([0.5, 2.0])), normal(random(5, 2, seed=1), torch.tensor([1.0, 0.7]))
-    planar = torch.as_tensor(g.elements[0].matrix, dtype=torch.float32)  # type: ignore[attr-defined]
+    planar = torch.as_tensor(PlaneElement.of(g.elements[0]).matrix, dtype=torch.float32)  # type: ignore[attr-defined]
     mean, covariance = there.mean @ planar, planar.T @ torch.diag(torch.tensor([0.25, 4.0])) @ planar
     want = td.kl_divergence(
         td.MultivariateNormal(mean, covariance), td.MultivariateNormal(here.mean, here.variance[0].diag())

@@ -12,13 +12,7 @@ from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
 from esp_cli.networks.symmetrised import Symmetrised
-from esp_cli.symmetry import (
-    cyclic,
-    dihedral,
-    network_equivariance_error,
-    parse_group,
-    transform_set,
-)
+from esp_cli.symmetry import PlaneElement, cyclic, dihedral, network_equivariance_error, parse_group, transform_set
 from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -84,8 +78,8 @@ def test_every_layer_of_the_equivariant_message_passing_network_turns_with_the_w
         for block, before, after in zip(convolved, responses, network.encoder.responses(moved), strict=True):
             # a response's place turns as a pixel does, its channels as regular features
             channels = turned(block, g, before)
-            picture = channels.flip(2) if element.mirrored else channels
-            expected = picture.rot90(int(element.turn * 4), (2, 3))
+            picture = channels.flip(2) if PlaneElement.of(element).mirrored else channels
+            expected = picture.rot90(int(PlaneElement.of(element).turn * 4), (2, 3))
             torch.testing.assert_close(after, expected, atol=EXACT, rtol=EXACT)
 
 
@@ -315,9 +309,9 @@ def test_drones_out_of_reach_are_not_heard() -> None:
         ("wildlife", {"mappo.critic_input": "observations"}, "set mappo.critic_input=own"),
         ("wildlife", {"network.name": "equivariant"}, "use empn or mlp"),
         ("wildlife", {"network.name": "gru", "mappo.num_steps": 100}, "may end early"),
-        ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "choose a finite group of the plane"),
+        ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "choose a finite group that moves no agents"),
         ("navigation", {"network.name": "equivariant", "network.group": "c8"}, "no action"),
-        ("navigation", {"network.symmetrise": "agents"}, "choose a finite group of the plane"),
+        ("navigation", {"network.symmetrise": "agents"}, "choose a finite group that moves no agents"),
         ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "the network equivariant has name"),
     ],
 )

@@ -15,6 +15,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry import (
+    Element,
+    PlaneElement,
     Transform,
     build_transform,
     carried_groups,
@@ -74,7 +76,8 @@ def with_turned_prey(env: Environment):
     drawn = env.prey_moves.clone()
 
     def restore(same: Environment, transform: Transform | None) -> None:
-        turn = np.eye(2)[None] if transform is None else np.stack([e.matrix for e in transform.elements])
+        elements = [Element()] if transform is None else transform.elements
+        turn = np.stack([PlaneElement.of(element).matrix for element in elements])
         turned = torch.as_tensor(turn, dtype=torch.float32).expand(same.num_seeds, 2, 2)
         same.prey_moves.copy_(torch.einsum("sij,tsej->tsei", turned, drawn))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from esp_cli.symmetry import cyclic, dihedral
+from esp_cli.symmetry import PlaneElement, cyclic, dihedral
 from esp_cli.symmetry.intertwiners import (
     Block,
     action_blocks,
@@ -79,6 +79,6 @@ def test_actions_transform_as_their_meanings_do() -> None:
             (first, *_) = action_blocks(action, C4)
             if action is FOUR_DIRECTIONS:
                 points = np.array(action.points)
-                np.testing.assert_allclose(first.matrices[g].T @ points, points @ element.matrix.T)
+                np.testing.assert_allclose(first.matrices[g].T @ points, points @ PlaneElement.of(element).matrix.T)
             else:
-                np.testing.assert_array_equal(first.matrices[g], element.matrix)
+                np.testing.assert_array_equal(first.matrices[g], PlaneElement.of(element).matrix)

@@ -10,12 +10,12 @@ import pytest
 from esp_cli.symmetry import Element, PlaneElement, agent_permutations, dihedral, direct_product, mirror, rotation
 from esp_cli.symmetry.representation import (
     action_map,
-    block_matrix,
-    joint_matrix,
-    layout_matrix,
-    rows_matrix,
-    rows_permutation,
-    state_matrix,
+    field_operator,
+    item_operator,
+    joint_sources,
+    layout_operator,
+    rows_operator,
+    state_operator,
 )
 from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
@@ -28,7 +28,9 @@ D4_AGENTS = direct_product(D4, agent_permutations(3))
 def joint(row_layout: Layout, *elements: Element, num_agents: int = 3) -> np.ndarray:
     """Return L_g of all agents' rows, also where none moves."""
     stay = tuple(range(num_agents))
-    return joint_matrix(row_layout, elements, np.array([e.permutation or stay for e in elements]))
+    places = np.array([e.permutation or stay for e in elements])
+    rows = layout_operator(row_layout, elements).repeated(num_agents)
+    return rows.ordered(joint_sources(row_layout, places)).matrix
 
 
 def field_of(name: str, kind: Kind, count: int = 1, items: Items = Items.FIXED) -> Field:
@@ -45,7 +47,7 @@ def test_others_by_hand() -> None:
 def test_kinds_are_orthogonal_homomorphisms(kind: Kind) -> None:
     field = field_of("field", kind)
     group = D4 if kind == Kind.PICTURE else D8
-    matrices = block_matrix(field, group.elements)
+    matrices = item_operator(field, group.elements).matrix
     assert matrices.shape == (group.order, field.width, field.width)
     np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[group.product], atol=1e-15)
     identity = np.tile(np.eye(field.width), (group.order, 1, 1))
@@ -61,7 +63,7 @@ def test_a_row_by_hand() -> None:
         Field("landmarks", Kind.VECTOR, 2),
     )
     row = np.array([1.0, 2.0, 7.0, 3.0, 0.25, 0.5, 1.0, 0.0, 0.0, 1.0])
-    turned, mirrored = layout_matrix(row_layout, [rotation(90), mirror(0)]) @ row
+    turned, mirrored = layout_operator(row_layout, [rotation(90), mirror(0)]).matrix @ row
     np.testing.assert_array_equal(turned, [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0])
     np.testing.assert_array_equal(mirrored, [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1])
 
@@ -71,27 +73,27 @@ MARKED = layout(
     Field("marks", Kind.VECTOR, 3),
     Field("cars", Kind.RECORD, 2, parts=(Field("place", Kind.VECTOR), Field("rate", Kind.PSEUDOSCALAR))),
 )
-ROUND = PlaneElement(items=(("marks", (1, 2, 0)), ("cars", (1, 0))))
+ROUND = Element(items=(("marks", (1, 2, 0)), ("cars", (1, 0))))
 
 
 def test_items_change_places_by_hand() -> None:
     # Mark 0 goes to place 1, 1 to 2, 2 to 0; the two cars change places, each with its rate.
     row = np.array([1, 2, 10, 11, 20, 21, 30, 31, 5, 6, 7, -5, -6, -7], dtype=float)
-    moved, both = layout_matrix(MARKED, [ROUND, mirror(0) @ ROUND]) @ row
+    moved, both = layout_operator(MARKED, [ROUND, mirror(0) @ ROUND]).matrix @ row
     np.testing.assert_array_equal(moved, [1, 2, 30, 31, 10, 11, 20, 21, -5, -6, -7, 5, 6, 7])
     np.testing.assert_array_equal(both, [1, -2, 30, -31, 10, -11, 20, -21, -5, 6, 7, 5, -6, -7])
 
 
 @pytest.mark.parametrize("num_agents", [1, 2])
 def test_orders_of_items_are_homomorphisms_and_signed_permutations(num_agents: int) -> None:
-    swap = PlaneElement(items=(("marks", (1, 0, 2)),), permutation=(1, 0) if num_agents == 2 else None)
+    swap = Element(items=(("marks", (1, 0, 2)),), permutation=(1, 0) if num_agents == 2 else None)
     elements = [swap, rotation(90) @ ROUND, swap @ rotation(90) @ ROUND]
-    first, second, product = rows_matrix(MARKED, elements, num_agents)
+    operator = rows_operator(MARKED, elements, num_agents)
+    first, second, product = operator.matrix
     np.testing.assert_array_equal(first @ second, product)
-    source, sign = rows_permutation(MARKED, elements, num_agents)
-    row = np.arange(1.0, source.shape[1] + 1)
-    whole = rows_matrix(MARKED, elements, num_agents)
-    np.testing.assert_array_equal(row[source] * sign, whole @ np.resize(row, whole.shape[2]))
+    assert operator.terms == 1
+    row = np.arange(1.0, operator.width + 1)
+    np.testing.assert_array_equal(operator.push(row), operator.matrix @ row)
 
 
 def test_a_state_of_all_rows_moves_the_items_of_each() -> None:
@@ -103,15 +105,15 @@ def test_a_state_of_all_rows_moves_the_items_of_each() -> None:
         action=FOUR_DIRECTIONS,
         symmetry="c1*marks-2",
     )
-    swap = PlaneElement(items=(("marks", (1, 0)),))
-    np.testing.assert_array_equal(state_matrix(spaces, [swap])[0] @ [1, 2, 3, 4], [2, 1, 4, 3])
+    swap = Element(items=(("marks", (1, 0)),))
+    np.testing.assert_array_equal(state_operator(spaces, [swap]).matrix[0] @ [1, 2, 3, 4], [2, 1, 4, 3])
 
 
 def test_items_that_cannot_change_places_are_refused() -> None:
     with pytest.raises(ValueError, match="field 'marks' has 3 items, not 2"):
-        layout_matrix(MARKED, [PlaneElement(items=(("marks", (1, 0)),))])
+        layout_operator(MARKED, [Element(items=(("marks", (1, 0)),))])
     with pytest.raises(ValueError, match="items of field 'others' cannot be exchanged"):
-        block_matrix(field_of("others", Kind.SCALAR, 2, Items.OTHERS), [PlaneElement(items=(("others", (1, 0)),))])
+        field_operator(field_of("others", Kind.SCALAR, 2, Items.OTHERS), [Element(items=(("others", (1, 0)),))])
 
 
 def test_others_are_reordered_by_hand() -> None:
@@ -119,7 +121,7 @@ def test_others_are_reordered_by_hand() -> None:
     row_layout = layout(Field("own", Kind.SCALAR), Field("others", Kind.SCALAR, 2, items=Items.OTHERS))
     rows = np.array([[10, 11, 12], [11, 10, 12], [12, 10, 11]], dtype=float)
     # Agent 0 goes to place 1, 1 to 2, 2 to 0: the places now hold 12, 10, 11.
-    matrix = joint(row_layout, PlaneElement(permutation=(1, 2, 0)))[0]
+    matrix = joint(row_layout, Element(permutation=(1, 2, 0)))[0]
     np.testing.assert_array_equal((matrix @ rows.ravel()).reshape(3, 3), [[12, 10, 11], [10, 12, 11], [11, 12, 10]])
 
 
@@ -148,8 +150,8 @@ def test_transforming_rows_equals_observing_the_transformed_world() -> None:
         moved = np.empty_like(positions)
         for i in range(3):
             place = i if element.permutation is None else element.permutation[i]
-            moved[place] = element.matrix @ positions[i]
-        expected = observe(moved, element.matrix @ landmark)
+            moved[place] = PlaneElement.of(element).matrix @ positions[i]
+        expected = observe(moved, PlaneElement.of(element).matrix @ landmark)
         np.testing.assert_allclose((matrix @ observe(positions, landmark).ravel()).reshape(3, -1), expected, atol=1e-15)
 
 
@@ -157,7 +159,7 @@ def test_forgetting_that_items_are_others_is_noticed() -> None:
     wrong = replace(WORLD, fields=tuple(replace(f, items=Items.FIXED) for f in WORLD.fields))
     rng = np.random.default_rng(0)
     positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
-    swap = joint(wrong, PlaneElement(permutation=(1, 0, 2)))[0]
+    swap = joint(wrong, Element(permutation=(1, 0, 2)))[0]
     got = (swap @ observe(positions, landmark).ravel()).reshape(3, -1)
     assert np.abs(got - observe(positions[[1, 0, 2]], landmark)).max() > 0.1
 
@@ -188,18 +190,18 @@ def test_joint_matrices_are_homomorphisms_over_random_layouts(seed: int) -> None
 
 
 def test_states_are_homomorphisms_and_a_joint_state_moves_like_the_rows(make_spec) -> None:
-    own = state_matrix(make_spec(), D4_AGENTS.elements)
+    own = state_operator(make_spec(), D4_AGENTS.elements).matrix
     np.testing.assert_array_equal(own[:, None] @ own, own[D4_AGENTS.product])
     spec = make_spec(joint_state=True)
     expected = joint(spec.observation, *D4_AGENTS.elements)
-    np.testing.assert_array_equal(state_matrix(spec, D4_AGENTS.elements), expected)
+    np.testing.assert_array_equal(state_operator(spec, D4_AGENTS.elements).matrix, expected)
 
 
 def test_a_state_by_hand(make_spec) -> None:
     # positions of agents 0, 1, 2; two landmarks; turning rates of agents 0, 1, 2.
     state = np.array([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 0.1, 0.2, 0.3])
-    element = mirror(0) @ PlaneElement(permutation=(1, 2, 0))
-    got = state_matrix(make_spec(), [element])[0] @ state
+    element = mirror(0) @ Element(permutation=(1, 2, 0))
+    got = state_operator(make_spec(), [element]).matrix[0] @ state
     np.testing.assert_array_equal(got, [5, -6, 1, -2, 3, -4, 7, -8, 9, -10, -0.3, -0.1, -0.2])
 
 
@@ -237,11 +239,11 @@ def test_an_action_without_an_image_is_named() -> None:
 
 
 def test_items_that_cannot_follow_are_refused(make_spec) -> None:
-    swap = PlaneElement(permutation=(1, 0, 2))
+    swap = Element(permutation=(1, 0, 2))
     with pytest.raises(ValueError, match="field 'others' has 4 items for 2 other agents"):
         joint(layout(Field("others", Kind.VECTOR, 4, items=Items.OTHERS)), swap)
     with pytest.raises(ValueError, match="field 'tags' has 2 items for 3 agents"):
         joint(layout(Field("tags", Kind.SCALAR, 2, items=Items.AGENTS)), swap)
     odd = replace(make_spec(), state=layout(Field("others", Kind.VECTOR, 2, items=Items.OTHERS)))
     with pytest.raises(ValueError, match="a state has no observer"):
-        state_matrix(odd, [swap])
+        state_operator(odd, [swap])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation
-from esp_cli.symmetry.representation import action_map, rows_matrix, rows_permutation
+from esp_cli.symmetry import PlaneElement, build_transform, mirror, parse_elements, rotation
+from esp_cli.symmetry.representation import action_map, rows_operator
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, layout
 from tests.symmetry.toy_actions import FORCE
 
@@ -29,7 +29,7 @@ def lidar(points: list[tuple[float, float]]) -> torch.Tensor:
 def test_a_ring_shows_what_the_rays_would_see_of_the_turned_scene(make_spec, element) -> None:
     spec = replace(make_spec(action=FORCE), observation=RING, state=RING)
     points = [(1.0, 0.2), (-0.3, 0.7)]
-    turned = [tuple(element.matrix @ np.array(point)) for point in points]
+    turned = [tuple(PlaneElement.of(element).matrix @ np.array(point)) for point in points]
     seen = build_transform([element], spec).obs(lidar(points).view(1, 1, 12))
     torch.testing.assert_close(seen.flatten(), lidar(turned), atol=1e-6, rtol=0)
     assert not torch.allclose(lidar(points), lidar(turned), atol=0.05), "the scene itself must look different"
@@ -37,7 +37,7 @@ def test_a_ring_shows_what_the_rays_would_see_of_the_turned_scene(make_spec, ele
 
 def test_a_ray_between_rays_is_refused() -> None:
     with pytest.raises(ValueError, match="turns by 360 / 12 degrees"):
-        rows_matrix(RING, [rotation(45)], 1)
+        rows_operator(RING, [rotation(45)], 1)
 
 
 def test_a_record_transforms_part_by_part() -> None:
@@ -45,7 +45,8 @@ def test_a_record_transforms_part_by_part() -> None:
     assert record.width == 8
     apart = layout(*(replace(part, name=f"{part.name}{i}") for i in range(2) for part in SEEN))
     for element in (rotation(90), rotation(33), mirror(10)):
-        np.testing.assert_array_equal(rows_matrix(record, [element], 1), rows_matrix(apart, [element], 1))
+        whole, parts = (rows_operator(each, [element], 1).matrix for each in (record, apart))
+        np.testing.assert_array_equal(whole, parts)
 
 
 def test_a_records_items_follow_the_agents() -> None:
@@ -55,8 +56,8 @@ def test_a_records_items_follow_the_agents() -> None:
     order = [0, 1, 4, 5, 2, 6, 3, 7]
     rows = torch.randn(3, 8, dtype=torch.float64)
     for element in parse_elements("agents-2-0-1,rot90*agents-1-0-2,flip22.5*agents-0-2-1", 3):
-        ours = torch.as_tensor(rows_matrix(record, [element], 3)[0]) @ rows.flatten()
-        theirs = torch.as_tensor(rows_matrix(split, [element], 3)[0]) @ rows[:, order].flatten()
+        ours = torch.as_tensor(rows_operator(record, [element], 3).matrix[0]) @ rows.flatten()
+        theirs = torch.as_tensor(rows_operator(split, [element], 3).matrix[0]) @ rows[:, order].flatten()
         torch.testing.assert_close(ours.view(3, 8)[:, order], theirs.view(3, 8))
 
 
@@ -67,10 +68,10 @@ def test_records_and_rings_stand_beside_pictures() -> None:
         Field("others", Kind.RECORD, 2, parts=SEEN, items=Items.OTHERS),
     )
     elements = parse_elements("rot90*agents-2-0-1,flip-x", 3)
-    source, sign = rows_permutation(mixed, elements, 3)
-    rows = torch.randn(mixed.width * 3, dtype=torch.float64)
-    for g, matrix in enumerate(rows_matrix(mixed, elements, 3)):
-        torch.testing.assert_close(torch.as_tensor(matrix) @ rows, rows[source[g]] * torch.as_tensor(sign[g]))
+    operator = rows_operator(mixed, elements, 3)
+    row = np.random.default_rng(0).normal(size=mixed.width * 3)
+    assert operator.terms == 1
+    np.testing.assert_array_equal(operator.push(row), operator.matrix @ row)
 
 
 @pytest.mark.parametrize(

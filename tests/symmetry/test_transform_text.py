@@ -6,6 +6,7 @@ import pytest
 
 from esp_cli.symmetry import FiniteGroup, Group, dihedral, mirror, parse, parse_elements, parse_group
 from esp_cli.symmetry.parse import Factors
+from esp_envs.errors import UserError
 
 
 def names(text: str, num_agents: int = 3) -> list[str]:
@@ -87,10 +88,64 @@ def test_refusals(text: str, message: str) -> None:
     assert message in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["rot90", "agents*d4", "d4*d4", "d4*agents*agents", "d4*rot90"])
-def test_what_is_no_group(text: str) -> None:
-    with pytest.raises(ValueError, match=r"is not a group|not a direct product"):
+@pytest.mark.parametrize(
+    ("text", "order", "same_as"),
+    [
+        ("rot90", 4, "c4"),  # an element stands for the group that it generates
+        ("agents*d4", 48, "d4*agents"),
+        ("d4*d4", 8, "d4"),
+        ("d4*agents*agents", 48, "d4*agents"),
+        ("rot90,flip-x", 8, "d4"),
+        ("flip-y*agents", 12, None),
+        ("flip-x*agents-2-1-0", 2, None),
+        ("flip-x*hips-3-2-1-0", 2, None),
+        ("flip-x*hips-3-2-1-0*agents", 12, None),
+        ("flip-x*hips-3-2-1-0,flip-y*hips-1-0-3-2", 4, None),
+        ("rot90*hips-1-2-3-0", 4, None),
+        ("rot90*marks-1-2-0", 12, None),
+        ("c4*rot90*hips-1-2-3-0", 16, None),
+        ("so2*hips-1-0", None, "so2*hips-2"),
+        ("identity", 1, "c1"),
+    ],
+)
+def test_a_declared_symmetry_is_the_group_that_it_generates(text: str, order: int | None, same_as: str | None) -> None:
+    group = parse_group(text, 3)
+    if order is not None:
+        assert isinstance(group, FiniteGroup)
+        assert group.order == order
+        assert same_as is None or group.elements == parse_group(same_as, 3).elements
+        assert {g @ h for g in group.elements for h in group.elements} == set(group.elements)
+    assert all(g in group for g in parse_group(same_as or text, 3).generators())
+
+
+def test_coupled_generators_hold_together_alone() -> None:
+    coupled = parse_group("flip-x*hips-3-2-1-0,flip-y*hips-1-0-3-2", 1)
+    assert [e.name for e in coupled.elements] == [
+        "identity",
+        "flip-y*hips-1-0-3-2",
+        "rot180*hips-2-3-0-1",
+        "flip-x*hips-3-2-1-0",
+    ]
+    assert mirror() not in coupled
+    assert mirror() @ parse_elements("hips-1-0-3-2", 1)[0] not in coupled, "the other order"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("foo", "unknown transform 'foo'"),
+        ("d4*", "unknown transform '' in 'd4*'"),
+        ("rot0.1*hips-1-0", "rot0.1*hips-1-0 has more than 1024 elements"),
+        ("d360,rot0.45", "'d360,rot0.45' has more than 1024 elements"),
+        ("o2,rot90*hips-1-0", "'o2,rot90*hips-1-0' generates no group that can be listed"),
+        ("flip-x*agents-1-0", "'agents-1-0' is not an order of 3 agents"),
+        ("marks-1-0,marks-1-2-0", "things cannot be composed; give both one length"),
+    ],
+)
+def test_what_generates_no_group(text: str, message: str) -> None:
+    with pytest.raises(UserError, match=r"^[^\n]+$") as caught:
         parse_group(text, 3)
+    assert message in str(caught.value)
 
 
 def test_factors_of_a_product_may_stand_in_any_order_behind_the_plane() -> None:
@@ -101,12 +156,13 @@ def test_factors_of_a_product_may_stand_in_any_order_behind_the_plane() -> None:
 
 def test_what_a_symmetry_moves() -> None:
     factors = Factors.of("d4 * agents*Marks-3*cars-2")
-    assert (factors.plane, factors.agents, factors.items) == ("d4", True, {"Marks": 3, "cars": 2})
-    assert (factors.allow("agents", 5), factors.allow("Marks", 3), factors.allow("cars", 3)) == (True, True, False)
+    assert (factors.scene, factors.agents, factors.items) == ("d4", True, {"Marks": 3, "cars": 2})
     assert Factors.of("flip-y") == Factors("flip-y", False, {})
     assert Factors.of("D4*Agents*Marks-3") == Factors("d4", True, {"Marks": 3})
-    with pytest.raises(ValueError, match="'marks-1-0' is one order of items; declare all of them, as in marks-2"):
-        Factors.of("d4*marks-1-0")
+    assert Factors.of("flip-x*Marks-1-0*agents") == Factors("flip-x*Marks-1-0", True)
+    assert Factors.of("flip-x*marks-1-0,flip-y*agents") == Factors("flip-x*marks-1-0,flip-y*agents")
+    for text in ("d4*agents*marks-3", "flip-x*marks-1-0", "c1*agents"):
+        assert Factors.of(text).name == text
 
 
 def test_a_reader_of_ones_own_comes_before_fields(monkeypatch: pytest.MonkeyPatch) -> None:

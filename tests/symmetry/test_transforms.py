@@ -5,25 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from esp_cli.symmetry import (
-    Element,
-    PlaneElement,
-    Transform,
-    build_transform,
-    mirror,
-    rotation,
-    transform_set,
-)
-from esp_cli.symmetry.maps import Gather, dense
-from esp_cli.symmetry.representation import state_matrix
+from esp_cli.symmetry import Element, Transform, build_transform, mirror, rotation, transform_set
+from esp_cli.symmetry.maps import Dense, Gather
+from esp_cli.symmetry.representation import state_operator
 from esp_envs.spec import Field, Items, Kind, Spaces, joint_layout, layout
 from tests.symmetry.toy_actions import EVERYTHING, FORCE, FOUR_DIRECTIONS, WHEELS
 
 ELEMENTS = [rotation(90), mirror(0), rotation(270)]
 MOVING = [
-    rotation(90) @ PlaneElement(permutation=(1, 2, 0)),
+    rotation(90) @ Element(permutation=(1, 2, 0)),
     mirror(45),
-    PlaneElement(permutation=(0, 2, 1)),
+    Element(permutation=(0, 2, 1)),
 ]
 BATCHES = [(4,), (2, 3), (0,), ()]
 
@@ -72,9 +64,9 @@ def seeing(side: int, joint: bool) -> Spaces:
 @pytest.mark.parametrize("joint", [True, False], ids=["joint", "own"])
 @pytest.mark.parametrize("elements", [ELEMENTS, [*MOVING, rotation(180)]], ids=["plane", "agents"])
 def test_states_with_pictures_are_gathered_and_equal_the_matrix(elements, joint) -> None:
-    spaces = seeing(3, joint)
+    spaces = seeing(7, joint)
     transform = build_transform(elements, spaces)
-    matrix = dense(state_matrix(spaces, elements))
+    matrix = Dense(torch.as_tensor(state_operator(spaces, elements).matrix, dtype=torch.float32))
     state = batch(len(elements), 5, spaces.state.width)
     assert isinstance(transform.state_map, Gather)
     assert torch.equal(transform.state(state), matrix.push(state))
@@ -132,7 +124,7 @@ def test_variances_come_home_as_squares_of_numbers_do(make_spec, elements) -> No
 
 
 def test_continuous_actions_by_hand(make_spec) -> None:
-    transform = build_transform([rotation(90) @ PlaneElement(permutation=(1, 0))], make_spec(2, EVERYTHING))
+    transform = build_transform([rotation(90) @ Element(permutation=(1, 0))], make_spec(2, EVERYTHING))
     x = torch.tensor([[[1.0, 2, 3, 4, 5], [6, 7, 8, 9, 10]]])[None]
     assert transform.action(x)[0, 0].tolist() == [[-7, 6, 8, 9, 10], [-2, 1, 3, 4, 5]]
     flip = build_transform([mirror(0)], make_spec(2, EVERYTHING))
@@ -152,7 +144,7 @@ def test_the_inverse_elements_undo(make_spec, elements) -> None:
 
 
 def test_values(make_spec) -> None:
-    moving = build_transform([PlaneElement(permutation=(1, 2, 0))], make_spec())
+    moving = build_transform([Element(permutation=(1, 2, 0))], make_spec())
     v = torch.tensor([[[10.0, 11, 12]]])
     assert moving.per_agent(v).tolist() == [[[12, 10, 11]]]
     assert moving.values(v).tolist() == [[[11, 12, 10]]]
@@ -250,7 +242,8 @@ def test_a_seed_draws_the_same_alone_and_among_ten(make_spec, text, num_agents, 
 
     together, alone = draws(list(range(10))), draws([7])
     assert [t.elements[7] for t in together] == [t.elements[0] for t in alone]
-    assert torch.equal(together[-1].obs_map.matrix[7], alone[-1].obs_map.matrix[0])
+    row = batch(1, 1, num_agents, spec.observation.width)
+    assert torch.equal(together[-1].obs(row.expand(10, -1, -1, -1))[7], alone[-1].obs(row)[0])
     assert not any(e.is_identity for t in together for e in t.elements)
     assert len({e for t in together for e in t.elements}) > 5
 

@@ -20,15 +20,15 @@ from esp_cli.symmetry import (
     transform_set,
 )
 from esp_cli.symmetry.maps import Gather
-from esp_cli.symmetry.plane import picture_sources
-from esp_cli.symmetry.representation import rows_matrix, rows_permutation
+from esp_cli.symmetry.plane import PlaneElement, picture_sources
+from esp_cli.symmetry.representation import rows_operator
 from esp_envs import Environment, Field, Items, Kind, layout, make
 
 STEPS = 6
 
 
 def turn_picture(picture: Tensor, element) -> Tensor:
-    sources = picture_sources(tuple(picture.shape), element.matrix)
+    sources = picture_sources(tuple(picture.shape), PlaneElement.of(element).matrix)
     return picture.flatten()[torch.as_tensor(sources)].view(picture.shape)
 
 
@@ -44,7 +44,7 @@ def test_a_picture_turns_counter_clockwise() -> None:
 def test_pixels_that_find_no_place_are_refused() -> None:
     for pixels, element in (((3, 3), rotation(45)), ((3, 5), rotation(90))):
         with pytest.raises(ValueError, match="do not come to lie on pixels"):
-            picture_sources(pixels, element.matrix)
+            picture_sources(pixels, PlaneElement.of(element).matrix)
 
 
 def test_only_pictures_have_pixels() -> None:
@@ -62,13 +62,10 @@ def test_the_permutation_is_the_matrix() -> None:
         Field("wheels", Kind.WHEELS),
     )
     for text in ("d4", "d4*agents"):
-        elements = parse_elements(text, 3)
-        source, sign = rows_permutation(row, elements, 3)
-        dense = rows_matrix(row, elements, 3)
-        group, width = source.shape
-        rebuilt = np.zeros((group, width, width))
-        np.put_along_axis(rebuilt, source[..., None], sign[..., None], axis=2)
-        np.testing.assert_array_equal(rebuilt, dense)
+        operator = rows_operator(row, parse_elements(text, 3), 3)
+        numbers = np.arange(1.0, operator.width + 1)
+        assert operator.terms == 1
+        np.testing.assert_array_equal(operator.push(numbers), operator.matrix @ numbers)
 
 
 def worlds(elements: str, seeds: int | None = None, **settings) -> tuple[Environment, Transform]:
@@ -89,7 +86,8 @@ def errors(env: Environment, transform: Transform, turn_chance: bool = True) -> 
         order = list(range(same.settings.num_agents))
         same.plan.copy_(plan)
         if turned is not None and turn_chance:
-            matrix = torch.as_tensor(np.stack([e.matrix for e in turned.elements]), dtype=torch.float32)
+            planar = np.stack([PlaneElement.of(e).matrix for e in turned.elements])
+            matrix = torch.as_tensor(planar, dtype=torch.float32)
             same.plan.copy_(torch.einsum("sij,tsenj->tseni", matrix.expand(same.num_seeds, 2, 2), plan.float()))
             for s, element in enumerate(turned.elements):
                 for i, place in enumerate(element.permutation or order):
