@@ -44,7 +44,7 @@ class IoSpec:
         """
         group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
-            raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents, as c4")
+            raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents")
         admit(name, group, self.spaces, instead="use another network")
         return group
 

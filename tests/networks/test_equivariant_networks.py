@@ -309,7 +309,7 @@ def test_drones_out_of_reach_are_not_heard() -> None:
         ("wildlife", {"mappo.critic_input": "observations"}, "set mappo.critic_input=own"),
         ("wildlife", {"network.name": "equivariant"}, "use empn or mlp"),
         ("wildlife", {"network.name": "gru", "mappo.num_steps": 100}, "may end early"),
-        ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "choose a finite group that moves no agents"),
+        ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "finite group that moves no agents"),
         ("navigation", {"network.name": "equivariant", "network.group": "c8"}, "no action"),
         ("navigation", {"network.symmetrise": "agents"}, "choose a finite group that moves no agents"),
         ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "the network equivariant has name"),
