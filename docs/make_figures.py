@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -16,12 +17,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from esp_cli.policies.curve_statistics import median_steps
-from esp_cli.reporting.page import draw_over_coefficient, draw_over_strength
-from esp_cli.reporting.plots import Group, appearance, dots
-from esp_cli.reporting.results import join, read_results
+from esp_cli.reporting.figures import appearance, dots
+from esp_cli.reporting.results import read_results
+from esp_cli.reporting.study_figures import draw_over_setting
 from esp_cli.reporting.summary import floats
 
 DOCS = Path(__file__).parent
+join = runpy.run_path(str(DOCS / "fill_tables.py"))["join"]
 MEASURED = DOCS / "measured"
 COLOUR = "#0072B2"
 RESULTS = {
@@ -139,28 +141,24 @@ def draw_results() -> None:
         results = read_results(MEASURED / f"{name}.json")
         for panel in dict.fromkeys(cell.panel for cell in results.cells):
             cells = [cell for cell in results.cells if cell.panel == panel]
-            groups = [Group(cell.variant, floats(cell.returns[results.mode])) for cell in cells]
+            groups = {cell.variant: floats(cell.returns[results.mode]) for cell in cells}
             anchors = {key: round(value, 1) for key, value in cells[0].anchors.items()}
             learner = cells[0].name.split("-")[1]
-            _, svg = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
-            svg.unlink()  # the pages show PNGs
+            drawn = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
+            drawn.svg.unlink()  # the pages show PNGs
     for picture, learners in TUNED.items():
         searches = [read_results(MEASURED / f"{picture}-{learner}.json") for learner in learners]
-        groups = [
-            Group(f"{cell.panel.split(', ', 1)[1]}: {cell.variant}", floats(cell.returns[search.mode]))
+        groups = {
+            f"{cell.panel.split(', ', 1)[1]}: {cell.variant}": floats(cell.returns[search.mode])
             for search in searches
             for cell in search.cells
-        ]
+        }
         title = f"{picture.removeprefix('tuned-').capitalize()}, tuned and default settings"
-        _, svg = dots(groups, MEASURED / picture, title, f"{searches[0].mode} return")
-        svg.unlink()
-    weights = MEASURED / "ablate-coefficient"
-    ((_, svg),) = draw_over_coefficient(read_results(weights.with_suffix(".json")), weights)
-    svg.unlink()
-    for picture, parts in BREAKING.items():
+        dots(groups, MEASURED / picture, title, f"{searches[0].mode} return").svg.unlink()
+    for picture, parts in {"ablate-coefficient": ("",), **BREAKING}.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
-        for _, svg in draw_over_strength(whole, MEASURED / picture):
-            svg.unlink()
+        for drawn in draw_over_setting(whole, MEASURED / picture):
+            drawn.svg.unlink()
 
 
 def draw_steps() -> None:

@@ -36,7 +36,7 @@ EPILOG = """Examples:\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --out comparison"""
 
 RunsArgument = Annotated[
-    list[str] | None,
+    list[str],
     typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
 ]
 OutOption = Annotated[
@@ -51,10 +51,6 @@ ResultsOption = Annotated[
         metavar="FILE",
         callback=not_over_a_run,
     ),
-]
-FillOption = Annotated[
-    Path | None,
-    typer.Option("--fill", help="Compute the tables of this Markdown page from its results files.", metavar="PAGE"),
 ]
 AtOption = Annotated[
     list[str] | None,
@@ -87,11 +83,10 @@ PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves
 
 
 def report(
-    runs: RunsArgument = None,
+    runs: RunsArgument,
     out: OutOption = None,
     films: Annotated[bool, typer.Option("--films", help="Draw the trained policies for the page.")] = False,
     results: ResultsOption = None,
-    fill: FillOption = None,
     at: AtOption = None,
     threshold: ThresholdOption = None,
     reference: ReferenceOption = None,
@@ -105,58 +100,72 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
-    from esp_cli.reporting import collect, curves, loose
-    from esp_cli.reporting.csv_file import write_csv
+    from esp_cli.reporting.collect import collect
     from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuning import TUNING_FORMAT
-    from esp_cli.training.folder_names import FRESH, TUNING
 
     register_named(task, algo, network)
-    of_the_picture = reference or y_limits
-    of_runs = any((out, films, results, at, threshold, of_the_picture, mode, plot, csv, json))
-    if not runs and (of_runs or fill is None):
-        raise UserError("there is nothing to report; name a study folder or run folders")
-    if fill is not None:
-        _fill(fill)
-    if not runs:
-        return
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
     _check_limits(y_limits)
-    if TUNING_FORMAT.is_one(Path(runs[0]) / TUNING):  # the report of a tuning has a file of this name too
-        fresh = shlex.quote(str(Path(runs[0]) / FRESH))
-        raise UserError(f"{runs[0]} is a tuning with a report of its own; report its study by: esp report {fresh}")
-    is_study = StudyFolder.is_one(Path(runs[0]))
-    if is_study:
+    _refuse_tuning(runs[0])
+    if StudyFolder.is_one(Path(runs[0])):
         if len(runs) > 1 or at or reference or plot or y_limits:
             raise UserError(
                 "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
             )
         out = out or Path(runs[0]) / "report"
-        material = collect.collect(StudyFolder.open(Path(runs[0])), mode, limits)
-        document, folders = material.results.document(), material.runs
+        material = collect(StudyFolder.open(Path(runs[0])), mode, limits)
     else:
-        _refuse_idle(films and out is None, plot is None and bool(of_the_picture))
-        steps, asked = [parse_count(text) for text in at or []], mode or "greedy"
-        places = [_labelled(text) for text in runs]
-        found = [curves.read_curve(path, label, asked) for label, path in places]
-        first, *others = (curve.config for curve in found)
-        command = _command(runs, at or [], limits, mode, out, first.own_words(*others))
-        folders = {curve.label: path for curve, (_, path) in zip(found, places, strict=True)}
-        material = loose.put_together(found, [path for _, path in places], command, asked, steps, limits)
-        document = loose.comparison(material, limits)
+        _refuse_idle(films and out is None, plot is None and bool(reference or y_limits))
+        material = _side_by_side(runs, at or [], limits, mode, out)
 
     def show() -> None:
         with console.paged():
             print_tables(material.results)
 
-    console.result(json, document, show)
-    if csv is not None:
-        console.note(f"{write_csv(csv, folders)} rows -> {csv}")
+    console.result(json, material.results.document(statistics=True), show)
+    _write(material, out, films, results, csv)
     if plot is not None:
-        for file in loose.plot(material, plot, lines, y_limits):
+        from esp_cli.reporting.study_figures import draw_curves
+
+        picture, _ = draw_curves(material, plot, lines, y_limits)
+        for file in (picture.png, picture.svg):
             console.note(f"curves -> {file}")
-    _write(material, out, films, results)
+
+
+def print_tables(results: Results) -> None:
+    """Print every table of results."""
+    from esp_cli.reporting.tables import all_tables
+
+    for table in all_tables(results):
+        console.table(table.headings, table.rows, title=table.title, caption=table.caption)
+
+
+def _side_by_side(
+    runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: Mode | None, out: Path | None
+) -> Material:
+    """Read runs that are given by hand, each as PATH or LABEL=PATH."""
+    from esp_cli.reporting.collect import put_together
+    from esp_cli.reporting.curves import read_curve
+
+    steps, found = [parse_count(text) for text in at], []
+    for text in runs:
+        label, path = _labelled(text)
+        found.append(read_curve(path, label, mode or "greedy"))
+    first, *others = (curve.config for curve in found)
+    words = ["esp", "report", *runs, *first.own_words(*others), *(word for text in at for word in ("--at", text))]
+    words += [*threshold_words(thresholds), *(["--mode", mode] if mode else []), *(["--out", str(out)] if out else [])]
+    return put_together(found, shlex.join(words), mode or "greedy", steps, thresholds)
+
+
+def _refuse_tuning(path: str) -> None:
+    """Refuse the folder of a tuning; that of its report has a file of this name too."""
+    from esp_cli.studies.tuning import TUNING_FORMAT
+    from esp_cli.training.folder_names import FRESH, TUNING
+
+    if TUNING_FORMAT.is_one(Path(path) / TUNING):
+        fresh = shlex.quote(str(Path(path) / FRESH))
+        raise UserError(f"{path} is a tuning with a report of its own; report its study by: esp report {fresh}")
 
 
 def _refuse_idle(films: bool, of_the_picture: bool) -> None:
@@ -183,25 +192,13 @@ def threshold_words(thresholds: Sequence[float]) -> list[str]:
     return [word for limit in thresholds for word in ("--threshold", repr(limit).removesuffix(".0"))]
 
 
-def _command(
-    runs: Sequence[str],
-    at: Sequence[str],
-    thresholds: Sequence[float],
-    mode: str | None,
-    out: Path | None,
-    own: Sequence[str],
-) -> str:
-    """Return the command line that gives the same report of the same runs."""
-    words = ["esp", "report", *runs, *own, *(word for text in at for word in ("--at", text))]
-    words += threshold_words(thresholds)
-    words += ["--mode", mode] if mode else []
-    return shlex.join(words + (["--out", str(out)] if out else []))
-
-
-def _write(material: Material, out: Path | None, films: bool, small: Path | None) -> None:
+def _write(material: Material, out: Path | None, films: bool, small: Path | None, csv: Path | None) -> None:
     """Write what was asked for beside the tables."""
+    from esp_cli.reporting.exports import write_csv
     from esp_cli.reporting.page import draw_films, write_report
 
+    if csv is not None:
+        console.note(f"{write_csv(csv, material)} rows -> {csv}")
     if films:
         with console.TrainingProgress(len(material.runs), description="draw") as progress:
             draw_films(material.runs, progress.update)
@@ -213,22 +210,6 @@ def _write(material: Material, out: Path | None, films: bool, small: Path | None
     if small is not None:
         console.write_json(small, material.results.document())
         console.note(f"results -> {small}")
-
-
-def _fill(page: Path) -> None:
-    from esp_cli.files.writing import write_file
-    from esp_cli.reporting.pages import filled
-
-    write_file(page, filled(page).encode())
-    console.note(f"tables -> {page}")
-
-
-def print_tables(results: Results) -> None:
-    """Print every table of a study's results."""
-    from esp_cli.reporting.tables import all_tables
-
-    for table in all_tables(results):
-        console.table(table.headings, table.rows, title=table.title, caption=table.caption)
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:

@@ -187,7 +187,7 @@ def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thres
     from esp_cli.reporting.collect import collect
 
     results = collect(folder, mode, thresholds).results
-    console.result(json, results.document(), lambda: print_tables(results))
+    console.result(json, results.document(statistics=True), lambda: print_tables(results))
     first, *others = (cell.config for cell in folder.study.cells)
     words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")

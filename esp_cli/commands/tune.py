@@ -182,13 +182,12 @@ def _tune(
 
 def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path], quiet: bool) -> None:
     """Write the page of the search and say what to do next; print what it found, unless standard output is for JSON."""
-    from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
+    from esp_cli.reporting.tuning_page import budget_table, settings_table, write_page
 
     if not quiet:
-        headings, rows = budget_table(outcomes)
-        console.table(headings, rows, title=trials.folder.study.title, caption=budget_sentence(trials.tuning))
-        if any(found.settings for found in outcomes):
-            console.table(*settings_table(outcomes), title="Best settings")
+        for table in (budget_table(trials.tuning, outcomes, trials.folder.study.title), settings_table(outcomes)):
+            if table.rows:
+                console.table(table.headings, table.rows, title=table.title, caption=table.caption)
     refused = [reason for found in outcomes for reason in found.refused]
     if refused:
         console.note(f"{len(refused)} trials had settings that do not go together, the first: {refused[0]}")

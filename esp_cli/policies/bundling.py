@@ -14,7 +14,7 @@ from esp_cli.files.locking import taking_turns
 from esp_cli.policies.evaluation import play_batches
 from esp_cli.policies.loading import TrainedPolicy, single_seed
 from esp_cli.policies.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
-from esp_cli.policies.spread import spread_over_episodes
+from esp_cli.policies.statistics import spread_over_episodes
 from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.play import Episodes, PolicyController
 from esp_cli.training.policy_file import describe_policy, write_policy

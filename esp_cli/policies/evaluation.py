@@ -7,12 +7,14 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
 from esp_cli.defaults import Mode, __version__
+from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.spread import EpisodeSpread, spread_over_episodes
-from esp_cli.policies.statistics import SeedSummary, summarise
+from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
 from esp_cli.training.build import build_environment
+from esp_cli.training.config import RunConfig
 from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
 from esp_envs.errors import UserError
@@ -44,6 +46,8 @@ class FinalEvaluation(BaseModel):
         metrics: the task's measures of the greedy policy.
         metrics_per_seed: the same by seed.
         anchor_metrics: the same of each reference policy.
+        parameters: weights of one seed's networks by name, which is "policy".
+        flops_per_action: operations of the matrix products behind one agent's action.
         over_episodes: error of the mean over episodes, of each reference policy, and of "greedy" and "stochastic" where
             the run has one seed.
     """
@@ -66,6 +70,8 @@ class FinalEvaluation(BaseModel):
     metrics: Metrics
     metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
     anchor_metrics: dict[str, Metrics] = {}
+    parameters: dict[str, int] = {}
+    flops_per_action: float | None = None
     over_episodes: dict[str, EpisodeSpread] = {}
 
     def returns(self, mode: Mode) -> SeedSummary:
@@ -115,8 +121,33 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         metrics=_means(greedy),
         metrics_per_seed={name: summarise_returns(value).per_seed for name, value in greedy.metrics.items()},
         anchor_metrics={name: _means(played) for name, played in anchors.items()},
+        parameters={"policy": sum(p.numel() for p in trained.policy.parameters()) // len(seeds)},
+        flops_per_action=flops_per_action(trained.policy, trained.config),
         over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
     )
+
+
+@torch.no_grad()
+def flops_per_action(policy: Policy, config: RunConfig) -> float:
+    """Count the floating-point operations of matrix products by which a policy chooses one agent's action.
+
+    What is done once for any number of observations, such as putting constrained weights together, does not count; nor
+    does it count that equal pictures need to be encoded only once.
+
+    Args:
+        policy: S policies.
+        config: of their run.
+    """
+    worlds = 16  # many pictures, so that no odd number is rounded up
+    counts = []
+    for number in (worlds, 2 * worlds):
+        shown = build_environment(config, number, "shape").reset().obs
+        drawn = torch.randn(shown.shape, generator=torch.Generator().manual_seed(0))
+        obs = drawn.to(shown.device, shown.dtype)
+        with FlopCounterMode(display=False) as counter:
+            policy.act(obs, policy.initial_memory(number, obs))
+        counts.append(counter.get_total_flops())
+    return (counts[1] - counts[0]) / (worlds * policy.num_agents * len(config.seeds))
 
 
 def summarise_returns(returns: Tensor) -> SeedSummary:

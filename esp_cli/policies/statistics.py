@@ -1,10 +1,11 @@
 """Statistics over seeds: means with intervals, comparisons of two groups of seeds.
 
 A sample is one number per seed, never one per episode: episodes of one seed share its policy and say nothing about how
-another seed would turn out. Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so
-that the same numbers give the same interval; with few seeds they are a little too narrow (of ten seeds drawn from a
-normal distribution, 90 % of the intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or
-resamples that all agree.
+another seed would turn out (`spread_over_episodes` is for a policy without other seeds). Intervals are 95 % percentile
+bootstrap intervals over seeds with a fixed generator, so that the same numbers give the same interval; with few seeds
+they are a little too narrow (of ten seeds drawn from a normal distribution, 90 % of the intervals hold its mean). They
+are None where the bootstrap cannot tell: one seed, or resamples that all agree. A sample without a value, or with one
+that is not finite, raises a UserError.
 
 Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
 (interquartile mean, stratified bootstrap, probability of improvement).
@@ -24,7 +25,8 @@ from esp_envs.errors import UserError
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-_GENERATOR_SEED = 0
+MOST_RESAMPLED = 512
+"""More episodes than this have the interval of the normal distribution, from which the bootstrap's hardly differs."""
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -60,6 +62,19 @@ class SeedSummary:
     per_seed: tuple[float | None, ...]
 
 
+@dataclass(frozen=True)
+class EpisodeSpread:
+    """How far the mean return of one policy can be trusted by its episodes; other seeds are another question.
+
+    Attributes:
+        sem: standard error of the mean over episodes; None for one episode.
+        ci95: 95 % interval of the mean over episodes; None for one episode, or where all episodes are alike.
+    """
+
+    sem: float | None
+    ci95: Interval | None
+
+
 def summarise(values: ArrayLike) -> SeedSummary:
     """Summarise one number per seed [S], NaN where a seed stopped."""
     numbers = np.asarray(values, dtype=np.float64)
@@ -69,14 +84,23 @@ def summarise(values: ArrayLike) -> SeedSummary:
     return SeedSummary(mean, sem, bootstrap_interval(good) if good.size else None, per_seed)
 
 
+def spread_over_episodes(returns: ArrayLike) -> EpisodeSpread:
+    """Return standard error and 95 % interval of the mean over the episodes of one policy."""
+    sample = np.asarray(returns, dtype=np.float64)
+    mean, sem = mean_and_sem(sample)
+    if not sem:
+        return EpisodeSpread(sem, None)
+    if sample.size <= MOST_RESAMPLED:
+        return EpisodeSpread(sem, bootstrap_interval(sample))
+    reach = float(scipy.stats.norm.ppf((1 + CONFIDENCE) / 2)) * sem
+    return EpisodeSpread(sem, (mean - reach, mean + reach))
+
+
 def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
     """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed.
 
     Args:
         values: one finite number per seed [S].
-
-    Raises:
-        UserError: no value, or one that is not finite.
     """
     sample = _sample(values)
     return float(sample.mean()), float(scipy.stats.sem(sample)) if sample.size > 1 else None
@@ -87,9 +111,6 @@ def bootstrap_interval(values: ArrayLike) -> Interval | None:
 
     Args:
         values: one finite number per seed [S].
-
-    Raises:
-        UserError: no value, or one that is not finite.
     """
     return _interval((_sample(values),), np.mean)
 
@@ -99,9 +120,6 @@ def interquartile_mean(values: ArrayLike) -> Estimate:
 
     Args:
         values: one finite number per seed [S].
-
-    Raises:
-        UserError: no value, or one that is not finite.
     """
     sample = _sample(values)
     return Estimate(float(_iqm(sample)), _interval((sample,), _iqm))
@@ -115,7 +133,7 @@ def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"]
         statistic: of all seeds of all tasks together.
 
     Raises:
-        UserError: no task, no value, or one that is not finite.
+        UserError: no task.
     """
     if not scores:
         raise UserError("there is no task to aggregate over")
@@ -137,7 +155,7 @@ def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
         paired: seed k of x and seed k of y belong together (S = S'), as where they share their worlds.
 
     Raises:
-        UserError: no value, one that is not finite, or paired groups that differ in size.
+        UserError: paired groups that differ in size.
     """
     first, second = _pair(x, y, paired)
     value = float(first.mean() - second.mean())
@@ -157,7 +175,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
         paired: as in difference().
 
     Raises:
-        UserError: no value, one that is not finite, or paired groups that differ in size.
+        UserError: paired groups that differ in size.
     """
     first, second = _pair(x, y, paired)
     if paired:
@@ -175,7 +193,7 @@ def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Est
             alike.
 
     Raises:
-        UserError: no task, no value, one that is not finite, or groups that differ in size.
+        UserError: no task, or groups that differ in size.
     """
     wins = {task: _wins(*_pair(x, y, True)) for task, (x, y) in pairs.items()}
     if len({group.size for group in wins.values()}) > 1:
@@ -244,7 +262,7 @@ def bootstrap(samples: tuple[Floats, ...], statistic: Callable[..., Any], resamp
         axis=-1,
         confidence_level=CONFIDENCE,
         method="percentile",
-        rng=np.random.default_rng(_GENERATOR_SEED),
+        rng=np.random.default_rng(0),
     ).confidence_interval
 
 

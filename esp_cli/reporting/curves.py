@@ -1,10 +1,12 @@
-"""The evaluations of a run on the way, read from its folder."""
+"""The evaluations of a run on the way, read from its metrics."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from esp_cli.defaults import Mode
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
+from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import MetricsError, column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
@@ -29,8 +32,9 @@ class RunCurve:
         steps: [K] environment steps per seed.
         values: [K, S] returns; NaN where a seed stopped.
         seconds: training time so far.
+        path: the run folder.
         trained: environment steps per seed so far, where they are more than those of the last evaluation.
-        task_version: of the task that it was trained on; None where its folder does not say, which is that of today.
+        task_version: of the task that it was trained on; None where it is not known, which is that of today.
     """
 
     label: str
@@ -38,6 +42,7 @@ class RunCurve:
     steps: NDArray[np.int64]
     values: NDArray[np.float64]
     seconds: float
+    path: Path
     trained: int = 0
     task_version: int | None = None
 
@@ -67,17 +72,27 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
         UserError: no run folder, or no evaluation in it yet.
     """
     folder = RunFolder.open(path)
+    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
     rows = read_metrics(folder.metrics_path)
+    curve = curve_of(rows, mode, path, label or name, parse_config(folder.config, path))
+    return replace(curve, task_version=folder.task_version())
+
+
+def curve_of(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
+    """Return the evaluations among rows of metrics.
+
+    Raises:
+        NoMetricError: there is no evaluation yet.
+        UserError: the evaluations are damaged, or of other seeds than the configuration.
+    """
     try:
         steps, values = column(rows, f"eval/return_{mode}")
     except MetricsError as error:
-        raise type(error)(f"{folder.metrics_path}: {error}") from None
-    config = parse_config(folder.config, path)
+        raise type(error)(f"{run / METRICS}: {error}") from None
     if values.shape[1] != len(config.seeds):
         raise UserError(
-            f"{path} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
+            f"{run} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
         )
     seconds = max(map(elapsed_s, rows), default=0.0)
-    trained = max((row["step"] for row in rows if isinstance(row.get("step"), int)), default=0)
-    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
-    return RunCurve(label or name, config, steps, values, seconds, trained, folder.task_version())
+    trained = max((row["step"] for row in rows), default=0)
+    return RunCurve(label, config, steps, values, seconds, run, trained)

@@ -1,23 +1,25 @@
-"""The results of a study as one small JSON document: every seed's numbers, the configuration and version behind them.
+"""The results of a study or of runs as one typed document: every seed's numbers, configuration and version behind them.
 
-Everything that tables state is computed from this document by `summary`, so the file alone gives the tables again.
+Everything that tables state is computed from these numbers by `summary.summarised`, so a small file without it gives
+the tables again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
-from esp_envs.errors import UserError
+from esp_cli.policies.statistics import Estimate, SeedSummary
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
 Numbers = tuple[float | None, ...]
 """One number per seed; None where the seed stopped."""
+Side = Literal["ahead", "behind", "level"]
 
 
 class Passing(BaseModel):
@@ -28,6 +30,61 @@ class Passing(BaseModel):
     threshold: float
     of_mean: int | None
     per_seed: tuple[int | None, ...]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A run beside its reference.
+
+    Attributes:
+        difference: of the means.
+        paired: whether both have the same seeds, which are compared one by one.
+        probability: of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds.
+        over_all_pairs: the same with every seed against every seed, as Agarwal et al. define it.
+        ahead: by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval.
+    """
+
+    difference: Estimate
+    paired: bool
+    probability: Estimate | None
+    over_all_pairs: Estimate | None
+    ahead: Side | None
+
+
+@dataclass(frozen=True)
+class CellSummary:
+    """Everything that tables say about one cell; what cannot be said is None.
+
+    Attributes:
+        returns: over seeds.
+        iqm: interquartile mean.
+        normalised: 0 is the random policy, 1 the best of the task's heuristics.
+        area: mean height of the learning curve.
+        gap: to the cell's reference.
+        leader: "first" where our mean is higher than the paper's, "second" where the paper's is.
+    """
+
+    returns: SeedSummary
+    iqm: Estimate | None = None
+    normalised: SeedSummary | None = None
+    area: SeedSummary | None = None
+    gap: Gap | None = None
+    leader: Literal["first", "second", "neither"] | None = None
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """Numbers of one variant over all panels, of normalised returns.
+
+    Attributes:
+        iqm: interquartile mean.
+        mean: of all seeds of all panels.
+        improvement: mean probability of improvement over the panel's reference, where every panel has one.
+    """
+
+    iqm: Estimate
+    mean: Estimate
+    improvement: Estimate | None
 
 
 class CellResult(BaseModel):
@@ -55,6 +112,7 @@ class CellResult(BaseModel):
         steps_to: first steps at thresholds.
         parameters: weights by network, of one seed.
         flops_per_action: of the policy.
+        summary: statistics of these numbers; None before `summary.summarised`, or where there are no returns yet.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -84,6 +142,7 @@ class CellResult(BaseModel):
     steps_to: tuple[Passing, ...] = ()
     parameters: dict[str, int] = {}
     flops_per_action: float | None = None
+    summary: CellSummary | None = None
 
 
 class Results(BaseModel):
@@ -95,6 +154,7 @@ class Results(BaseModel):
         mode: which evaluations tables state.
         config: settings by dotted name that all cells share.
         cells: in the study's order.
+        aggregates: statistics over all panels by variant, where there are several panels.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -108,18 +168,20 @@ class Results(BaseModel):
     episodes: int
     config: dict[str, JsonValue]
     cells: tuple[CellResult, ...] = Field(min_length=1)
+    aggregates: dict[str, Aggregate] = {}
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
         """Return the cell that one is compared with."""
         return next((other for other in self.cells if other.name == cell.reference), None)
 
-    def content(self) -> dict[str, JsonValue]:
-        """Return the content of the document."""
-        return self.model_dump(mode="json", exclude_defaults=True)
+    def content(self, statistics: bool = False) -> dict[str, Any]:
+        """Return the content of the document, with its statistics or without what can be computed from it again."""
+        computed: Any = None if statistics else {"aggregates": True, "cells": {"__all__": {"summary"}}}
+        return self.model_dump(mode="json", exclude_defaults=True, exclude=computed)
 
-    def document(self) -> dict[str, JsonValue]:
-        """Return the document as `esp report --json` and `--results` write it."""
-        return RESULTS_FORMAT.document(self.content())
+    def document(self, statistics: bool = False) -> dict[str, Any]:
+        """Return the document as `esp report --json` writes it with statistics, and `--results` without."""
+        return RESULTS_FORMAT.document(self.content(statistics))
 
 
 def read_results(path: Path) -> Results:
@@ -129,28 +191,3 @@ def read_results(path: Path) -> Results:
         UserError: it is missing, damaged, foreign, or of a newer version.
     """
     return RESULTS_FORMAT.parse(path, Results)
-
-
-def join(several: Sequence[Results]) -> Results:
-    """Return the results of studies of one kind as those of one study, the cells in their order.
-
-    A cell that two of them have with the same returns, as a run and its repetition do, counts once; of a cell that one
-    of them has not finished, the other one's returns count.
-
-    Raises:
-        UserError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
-    """
-    first = several[0]
-    if any((r.kind, r.mode, r.rows) != (first.kind, first.mode, first.rows) for r in several):
-        raise UserError("results of studies of different kinds, or of different evaluations, have no table in common")
-    cells: dict[str, CellResult] = {}
-    for results in several:
-        for cell in results.cells:
-            there = cells.get(cell.name)
-            if there is None or (cell.returns and not there.returns):
-                whole = {"config": results.config | cell.config, "episodes": cell.episodes or results.episodes}
-                cells[cell.name] = cell.model_copy(update=whole)
-            elif cell.returns and (there.returns, there.seeds, there.step) != (cell.returns, cell.seeds, cell.step):
-                raise UserError(f"{cell.name} stands in two of the results files, with different returns")
-    command = "\n".join(dict.fromkeys(results.command for results in several))
-    return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells.values())})

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from esp_cli.defaults import Mode
 from esp_cli.policies.statistics import (
-    Estimate,
     Floats,
-    SeedSummary,
     aggregate,
     average_improvement,
     difference,
@@ -23,67 +19,17 @@ from esp_cli.policies.statistics import (
     probability_of_improvement,
     summarise,
 )
-from esp_cli.reporting.results import CellResult, Results
+from esp_cli.reporting.results import Aggregate, CellResult, CellSummary, Gap, Results, Side
 from esp_cli.studies.paper import NUM_SEEDS
 
-Side = Literal["ahead", "behind", "level"]
 MIN_SEEDS_TO_RANK = 3
 """Of either side; a probability of improvement of fewer seeds says nothing."""
 
 
-@dataclass(frozen=True)
-class Gap:
-    """A run beside its reference.
-
-    Attributes:
-        difference: of the means.
-        paired: whether both have the same seeds, which are compared one by one.
-        probability: of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds.
-        over_all_pairs: the same with every seed against every seed, as Agarwal et al. define it.
-        ahead: by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval.
-    """
-
-    difference: Estimate
-    paired: bool
-    probability: Estimate | None
-    over_all_pairs: Estimate | None
-    ahead: Side | None
-
-
-@dataclass(frozen=True)
-class CellSummary:
-    """Everything that tables say about one cell; what cannot be said is None.
-
-    Attributes:
-        returns: over seeds.
-        iqm: interquartile mean.
-        normalised: 0 is the random policy, 1 the best of the task's heuristics.
-        area: mean height of the learning curve.
-        gap: to the cell's reference.
-        leader: "first" where our mean is higher than the paper's, "second" where the paper's is.
-    """
-
-    returns: SeedSummary
-    iqm: Estimate | None = None
-    normalised: SeedSummary | None = None
-    area: SeedSummary | None = None
-    gap: Gap | None = None
-    leader: Literal["first", "second", "neither"] | None = None
-
-
-@dataclass(frozen=True)
-class Aggregate:
-    """Numbers of one variant over all panels, of normalised returns.
-
-    Attributes:
-        iqm: interquartile mean.
-        mean: of all seeds of all panels.
-        improvement: mean probability of improvement over the panel's reference, where every panel has one.
-    """
-
-    iqm: Estimate
-    mean: Estimate
-    improvement: Estimate | None
+def summarised(results: Results) -> Results:
+    """Return results with everything that tables say about each cell and over all panels, computed from its numbers."""
+    cells = tuple(cell.model_copy(update={"summary": summarise_cell(results, cell)}) for cell in results.cells)
+    return results.model_copy(update={"cells": cells, "aggregates": aggregates(results)})
 
 
 def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:

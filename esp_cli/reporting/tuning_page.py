@@ -17,11 +17,10 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
 from esp_cli.files.formatting import format_count, format_duration
 from esp_cli.files.writing import replace_file
-from esp_cli.reporting.tables import markdown_rows
+from esp_cli.reporting.tables import Table
 from esp_cli.studies.tuner import Outcome, Trials
 from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
 
-Rows = list[tuple[str, ...]]
 _MEANING = {
     "return": "mean of the last three greedy evaluations",
     "steps": "environment steps to the return {reach:g}, as a negative number",
@@ -29,10 +28,10 @@ _MEANING = {
 }
 
 
-def budget_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
-    """Return headings and rows: what each prior was given, and what its best trial scored on the trials' seeds."""
+def budget_table(tuning: Tuning, outcomes: Sequence[Outcome], title: str = "Budgets and scores") -> Table:
+    """Return what each prior was given, and what its best trial scored on the trials' seeds."""
     headings = ("prior", "trials>", "complete>", "pruned>", "steps>", "time>", "default>", "best>", "trial>")
-    rows: Rows = [
+    rows = [
         (
             NAMES[found.prior],
             str(found.trials),
@@ -46,15 +45,15 @@ def budget_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
         )
         for found in outcomes
     ]
-    return headings, rows
+    return Table(title, headings, tuple(rows), budget_sentence(tuning))
 
 
-def settings_table(outcomes: Sequence[Outcome]) -> tuple[tuple[str, ...], Rows]:
-    """Return headings and rows: the best settings of each prior."""
+def settings_table(outcomes: Sequence[Outcome]) -> Table:
+    """Return the best settings of each prior; no rows where no trial has a score."""
     names = list(dict.fromkeys(name for found in outcomes for name in found.settings))
     headings = ("setting", *(f"{NAMES[found.prior]}>" for found in outcomes))
-    rows: Rows = [(name, *(_setting(found.settings.get(name)) for found in outcomes)) for name in names]
-    return headings, rows
+    rows = tuple((name, *(_setting(found.settings.get(name)) for found in outcomes)) for name in names)
+    return Table("Best settings", headings, rows)
 
 
 def budget_sentence(tuning: Tuning) -> str:
@@ -87,9 +86,9 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(found) for found in outcomes]}
     replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
-    lines = [f"# {trials.folder.study.title}", "", budget_sentence(tuning), "", f"`{tuning.command}`", ""]
-    lines += ["## Budgets and scores", "", *markdown_rows(*budget_table(outcomes))]
-    lines += ["", "## Best settings", "", *markdown_rows(*settings_table(outcomes))]
+    lines = [f"# {trials.folder.study.title}", "", f"`{tuning.command}`", ""]
+    for table in (budget_table(tuning, outcomes), settings_table(outcomes)):
+        lines += [f"## {table.title}", "", table.markdown(), ""]
     lines += _refused_lines(outcomes)
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` evaluates them on others."]
     for prior, study in trials.studies.items():

@@ -207,7 +207,7 @@ def test_help_imports_neither_torch_nor_numpy() -> None:
 def test_scipy_s_statistics_are_imported_only_where_they_are_asked_for() -> None:
     done = _python(
         "import sys\n"
-        "from esp_cli.policies.spread import mean_and_sem\n"
+        "from esp_cli.policies.statistics import mean_and_sem\n"
         "for sample in ([], [1.0], [1.0, 2.0]):\n"
         "    sample and mean_and_sem(sample)\n"
         "    print('scipy.stats' in sys.modules)\n"

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.reporting.network_cost import flops_per_action
+from esp_cli.policies.evaluation import flops_per_action
 from esp_cli.studies.catalogue import Request, plan
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import reported
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from tests.cli.running import esp, refused
 
@@ -99,15 +100,18 @@ def test_methods_differ_in_network_and_prior_alone() -> None:
     assert (turned.cells[0].config.network.group, turned.cells[1].config.prior.transforms) == ("d4", "d4")
 
 
-def test_flops_by_hand() -> None:
-    perceptron = resolve_config("navigation", overrides={"network.hidden": [10]})
-    assert flops_per_action(perceptron) == 2 * (14 * 10 + 10 * 5)
-    ensemble = resolve_config("navigation", overrides={"network.hidden": [10], "network.symmetrise": "c4"})
+@pytest.mark.parametrize("seeds", [(0,), (3, 5)])
+def test_flops_by_hand(seeds: tuple[int, ...]) -> None:
+    def flops(task: str, overrides: dict[str, object]) -> float:
+        config = resolve_config(task, seeds=seeds, overrides=overrides)
+        return flops_per_action(build_learner(config).policy, config)
+
+    assert flops("navigation", {"network.hidden": [10]}) == 2 * (14 * 10 + 10 * 5)
     # each of four images is made by a product of 14 x 14 and brought home by one of 5 x 5
-    assert flops_per_action(ensemble) == 4 * 2 * (14 * 10 + 10 * 5 + 14 * 14 + 5 * 5)
-    messages = resolve_config("wildlife", overrides={"network.hidden": [64]})
+    ensemble = flops("navigation", {"network.hidden": [10], "network.symmetrise": "c4"})
+    assert ensemble == 4 * 2 * (14 * 10 + 10 * 5 + 14 * 14 + 5 * 5)
     convolutions = 8 * 8 * 49 * 16 + 4 * 4 * 16 * 25 * 32
-    assert flops_per_action(messages) == 2 * (convolutions + (2 * 32 + 2) * 64 + 64 * 5)
+    assert flops("wildlife", {"network.hidden": [64]}) == 2 * (convolutions + (2 * 32 + 2) * 64 + 64 * 5)
 
 
 def test_a_run_on_wildlife_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

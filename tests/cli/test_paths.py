@@ -82,7 +82,6 @@ def test_a_place_that_cannot_be_is_one_sentence(
         ("train", "--resume"),
         ("eval",),
         ("report",),
-        ("report", "--fill"),
         ("reproduce", "table1", "--out"),
         ("export", "navigation", "-f", "numpy", "-o"),
     ],
@@ -94,8 +93,6 @@ def test_a_run_a_study_or_a_policy_that_cannot_be_there_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     Path("loop").symlink_to("loop")
     Path("file").write_text("mine")
-    if (command[-1], place) == ("--fill", "file"):
-        return  # a page without tables
     code, sentence = told(*command, place)
     assert code == 2
     assert sentence.splitlines()[-1].startswith("error: ")

@@ -49,36 +49,38 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
     options = ["--at", "100", "--at", "150", "--threshold", "-1000", "--threshold", "-0.5", "--reference", "paper=-110"]
     told = esp("report", plain, f"ESP={finished}", *options, "--json", file, "--plot", picture)
     result = json.loads(file.read_text())
-    assert (result["task"], result["task_version"], result["episodes_per_evaluation"]) == ("navigation", 1, 2)
-    first, second = result["runs"]
-    assert (first["label"], second["label"]) == ("plain", "ESP")
+    assert (result["format"], result["kind"], result["config"]["task"]) == ("esp-results", "runs", "navigation")
+    found = {(cell["variant"], cell["at"]): cell for cell in result["cells"]}
+    assert list(found) == [(label, step) for step in (100, 150) for label in ("plain", "ESP")]
+    first, second = found["plain", 150], found["ESP", 150]
+    assert (first["task_version"], first["episodes"]) == (1, 2)
     assert first["seeds"] == second["seeds"] == [3, 7]
-    assert (first["config"]["prior"]["kind"], second["config"]["prior"]["kind"]) == ("none", "esp")
-    assert list(first["returns"]) == ["100", "150"]
-    for step in ("100", "150"):
-        assert "difference" not in first["returns"][step]
-        gap = second["returns"][step]["difference"]
-        assert gap["paired"] is True
-        assert gap["mean"] == pytest.approx(second["returns"][step]["mean"] - first["returns"][step]["mean"])
-    assert first["steps_to"] == {
-        "-1000.0": {"mean": 0, "per_seed": [0, 0]},
-        "-0.5": {"mean": None, "per_seed": [None, None]},
-    }
+    assert (first["config"]["prior.kind"], second["config"]["prior.kind"]) == ("none", "esp")
+    for step in (100, 150):
+        plain_at, esp_at = found["plain", step]["summary"], found["ESP", step]["summary"]
+        assert "gap" not in plain_at
+        assert esp_at["gap"]["paired"] is True
+        gained = esp_at["returns"]["mean"] - plain_at["returns"]["mean"]
+        assert esp_at["gap"]["difference"]["value"] == pytest.approx(gained)
+    assert first["steps_to"] == [
+        {"threshold": -1000.0, "of_mean": 0, "per_seed": [0, 0]},
+        {"threshold": -0.5, "of_mean": None, "per_seed": [None, None]},
+    ]
     table = [cells(line) for line in told.stdout.splitlines() if line.startswith("│")]
     panels = ["navigation, 100", "navigation, 150"]
     compared = [row for row in table if row[0] in panels and row[2] == "150"]
     assert [row[:2] for row in compared] == [[panel, label] for panel in panels for label in ("plain", "ESP")]
     assert [row[5] for row in compared[::2]] == ["", ""]
-    assert compared[3][5].startswith(f"{second['returns']['150']['difference']['mean']:+.2f} [")
+    assert compared[3][5].startswith(f"{second['summary']['gap']['difference']['value']:+.2f} [")
     assert [row[6] for row in compared[1::2]] == ["-", "-"], "two seeds do not rank"
-    assert [run["step"] for run in result["runs"]] == [150, 150]
+    assert (first["step"], second["step"]) == (150, 150)
     passed = [row[1:] for row in table if {"-1000.00", "-0.50"} & {*row}]
     assert passed == [
         [label, *texts, "" if label == "plain" else "-"]
         for label in ("plain", "ESP")
         for texts in (["-1000.00", "0", "0", "-", "0.00"], ["-0.50", "> 150", "> 150", "-", "-"])
     ]
-    assert result["convention"] in told.stdout
+    assert first["convention"] in told.stdout
     with Image.open(picture) as image:
         assert image.format == "PNG"
     drawing = picture.with_suffix(".svg").read_text()
@@ -91,8 +93,7 @@ def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_
 ) -> None:
     short = train_tiny(tmp_path / "short", "--seed-list", "3,7", steps=100)
     result = json.loads(esp("report", finished, short, plain, "--json", "-").stdout)
-    assert [list(run["returns"]) for run in result["runs"]] == [["100"]] * 3
-    assert [run["step"] for run in result["runs"]] == [150, 100, 150]
+    assert [(cell["at"], cell["step"]) for cell in result["cells"]] == [(100, 150), (100, 100), (100, 150)]
 
 
 def test_page_markdown_results_and_terminal_compare_at_the_same_step(
@@ -105,7 +106,7 @@ def test_page_markdown_results_and_terminal_compare_at_the_same_step(
     cell = json.loads(small.read_text())["cells"][1]
     assert (cell["step"], cell["at"], cell["panel"]) == (150, 100, "navigation, 100")
     shown = format_mean(*mean_and_sem(cell["returns"]["greedy"]))
-    longer = json.loads(esp("report", finished, "--json", "-").stdout)["runs"][0]["returns"]["150"]
+    longer = json.loads(esp("report", finished, "--json", "-").stdout)["cells"][0]["summary"]["returns"]
     assert shown != format_mean(longer["mean"], longer["sem"])
     for text in (told.stdout, page, markdown):
         assert shown in text
@@ -135,31 +136,24 @@ def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Pa
     assert rows[0][4] == "-"
     assert rows[2] == ["navigation, 9k", "one", "50", "at 50", "-", "-", "-", "-", "-"]
     assert ["runs finished", "2 of 2"] in [cells(line) for line in told.stdout.splitlines()], "not of four columns"
-    first, second = json.loads((tmp_path / "report.json").read_text())["runs"]
-    assert (first["returns"]["50"]["sem"], first["returns"]["50"]["ci95"], first["returns"]["9000"]) == (
-        None,
-        None,
-        None,
-    )
-    assert second["returns"]["50"]["difference"]["paired"] is False, "other seeds"
+    one, _, ahead = json.loads((tmp_path / "report.json").read_text())["cells"][:3]
+    assert (one["summary"]["returns"]["sem"], one["summary"]["returns"]["ci95"]) == (None, None)
+    assert "summary" not in ahead, "it did not get there"
+    second = json.loads((tmp_path / "report.json").read_text())["cells"][1]
+    assert second["summary"]["gap"]["paired"] is False, "other seeds"
 
 
-def test_options_of_what_is_not_written_are_refused(finished: Path, tmp_path: Path) -> None:
+def test_options_of_what_is_not_written_are_refused(finished: Path) -> None:
     for option in (("--reference", "paper=1"), ("--y-limits", "-200", "-100")):
         assert "are of the picture that --plot draws" in refused("report", finished, *option)
     assert "add --out FOLDER" in refused("report", finished, "--films")
-    page = tmp_path / "page.md"
-    page.write_text("No comments.\n")
-    assert "there is nothing to report" in refused("report", "--fill", page, "--results", tmp_path / "results.json")
-    assert "has no table to compute" in refused("report", "--fill", page)
-    assert page.read_text() == "No comments.\n"
 
 
 def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Path) -> None:
     renamed = copied.rename(copied.with_name("rate=1e-3"))
     for argument, label in ((renamed, "rate=1e-3"), (f"new={renamed}", "new"), (f"c=0.5={renamed}", "c=0.5")):
         result = json.loads(esp("report", argument, "--json", "-").stdout)
-        assert result["runs"][0]["label"] == label
+        assert result["cells"][0]["variant"] == label
 
 
 def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) -> None:
@@ -232,7 +226,7 @@ def test_the_document_of_a_tuning_is_not_overwritten_either(tmp_path: Path) -> N
 def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(finished: Path, copied: Path) -> None:
     policy = DAMAGE["a policy of another version"][0](copied)
     assert "were trained on versions 0 and 1 of navigation" in refused("report", finished, copied)
-    assert json.loads(esp("report", copied, "--json", "-").stdout)["task_version"] == 0
+    assert json.loads(esp("report", copied, "--json", "-").stdout)["cells"][0]["task_version"] == 0
     policy.unlink()
     checkpoint = next((copied / "checkpoints").iterdir())
     tensors, meta = load_checkpoint(checkpoint)

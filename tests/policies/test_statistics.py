@@ -16,8 +16,9 @@ from esp_cli.policies.curve_statistics import (
     median_steps,
     steps_to_threshold,
 )
-from esp_cli.policies.spread import MOST_RESAMPLED, EpisodeSpread, spread_over_episodes
 from esp_cli.policies.statistics import (
+    MOST_RESAMPLED,
+    EpisodeSpread,
     Estimate,
     aggregate,
     bootstrap_interval,
@@ -26,6 +27,7 @@ from esp_cli.policies.statistics import (
     mean_and_sem,
     normalise,
     probability_of_improvement,
+    spread_over_episodes,
 )
 
 TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]

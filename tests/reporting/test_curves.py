@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from esp_cli.reporting.collect import put_together
 from esp_cli.reporting.curves import RunCurve, read_curve
-from esp_cli.reporting.loose import comparison, plot, put_together
+from esp_cli.reporting.study_figures import draw_curves
 from esp_cli.reporting.tables import TABLES
 from esp_cli.training.run_folder import RunFolder
 from tests.training.runs import tiny_config, tiny_folder
@@ -25,18 +26,23 @@ ESP = [[-9.0, -8.0, -10.0], [-5.0, -4.0, -6.0], [-3.0, -1.0, -5.0], [-1.0, -2.0,
 
 
 def curve(values, label="run", steps=STEPS, seeds=SEEDS, **choice) -> RunCurve:
-    return RunCurve(label, tiny_config(seeds=seeds, **choice), np.array(steps), np.array(values, dtype=float), 12.5)
+    numbers = np.array(values, dtype=float)
+    return RunCurve(label, tiny_config(seeds=seeds, **choice), np.array(steps), numbers, 12.5, Path(label))
 
 
 def gathered(curves, at=(), thresholds=()):
     """What a report of these runs is made from."""
-    return put_together(curves, [Path(c.label) for c in curves], "esp report", "greedy", at, thresholds)
+    return put_together(curves, "esp report", "greedy", at, thresholds)
 
 
-def compare(curves, at, thresholds) -> dict:
-    """The document that `esp report RUN... --json` writes."""
+def compare(curves, at, thresholds) -> dict[str, dict[int, dict]]:
+    """The cells of the document that `esp report RUN... --json` writes, by label and step."""
     named = [c if c.label != "run" else replace(c, label=f"run {k}") for k, c in enumerate(curves)]
-    return comparison(gathered(named, at, thresholds), thresholds)
+    found: dict[str, dict[int, dict]] = {}
+    for cell in gathered(named, at, thresholds).results.document(statistics=True)["cells"]:
+        found.setdefault(cell["variant"], {})[cell["at"]] = cell
+    json.dumps(found, allow_nan=False)
+    return found
 
 
 def written(folder: Path, rows: list[dict], **choice) -> RunFolder:
@@ -92,91 +98,78 @@ def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there(
     assert further.last_step == 1600
 
 
-def test_the_fewest_episodes_of_all_runs_are_stated():
+def test_each_run_says_how_many_episodes_are_behind_its_returns():
     few, many = curve(PLAIN, "plain"), curve(ESP, "ESP")
     evaluation = many.config.evaluation.model_copy(update={"episodes": 40})
     many = replace(many, config=many.config.model_copy(update={"evaluation": evaluation}))
-    assert compare([many, few], [], [])["episodes_per_evaluation"] == 2
+    found = compare([many, few], [], [])
+    assert [found[label][300]["episodes"] for label in ("ESP", "plain")] == [40, 2]
 
 
 def test_returns_differences_thresholds_and_areas_by_hand():
-    result = compare([curve(PLAIN, "plain"), curve(ESP, "ESP")], [100, 210], [-5.0, -2.0, 0.0])
-    assert (result["task"], result["task_version"], result["episodes_per_evaluation"]) == ("navigation", 1, 2)
-    plain, esp = result["runs"]
-    assert (plain["label"], plain["seeds"], plain["seconds"]) == ("plain", [0, 1, 2], 12.5)
+    found = compare([curve(PLAIN, "plain"), curve(ESP, "ESP")], [100, 210], [-5.0, -2.0, 0.0])
+    plain, esp = found["plain"], found["ESP"]
+    assert (plain[100]["task_version"], plain[100]["seeds"], plain[100]["seconds"]) == (1, [0, 1, 2], 12.5)
+    assert "gap" not in plain[100]["summary"], "the reference has no difference from itself"
     # -6 -7 -8: mean -7, deviations 1 0 -1, variance 1, s.e.m. 1 / sqrt(3)
-    at = plain["returns"]["100"]
-    assert (at["mean"], at["sem"], at["per_seed"]) == (
-        -7.0,
-        pytest.approx(1 / math.sqrt(3), abs=1e-4),
-        [-6.0, -7.0, -8.0],
-    )
+    at = plain[100]["summary"]["returns"]
+    assert (at["mean"], at["sem"]) == (-7.0, pytest.approx(1 / math.sqrt(3), abs=1e-4))
+    assert at["per_seed"] == plain[100]["returns"]["greedy"] == [-6.0, -7.0, -8.0]
     assert -8.0 <= at["ci95"][0] < -7.0 < at["ci95"][1] <= -6.0
-    assert plain["returns"]["210"]["mean"] == -5.0
+    assert plain[210]["summary"]["returns"]["mean"] == -5.0
     # -5 -4 -6 less -6 -7 -8, seed by seed: 1 3 2
-    gap = esp["returns"]["100"]["difference"]
-    assert (gap["mean"], gap["paired"]) == (2.0, True)
-    assert (gap["ci95"][0], gap["ci95"][1]) == (pytest.approx(1.0, abs=0.34), pytest.approx(3.0, abs=0.34))
-    assert esp["returns"]["100"]["probability_of_improvement"] == 1.0
+    gap = esp[100]["summary"]["gap"]
+    assert (gap["difference"]["value"], gap["paired"]) == (2.0, True)
+    assert gap["difference"]["ci95"] == [pytest.approx(1.0, abs=0.34), pytest.approx(3.0, abs=0.34)]
+    assert gap["probability"]["value"] == 1.0
     # at 200: -3 -1 -5 against -4 -6 -5: a win, a win, a tie
-    assert esp["returns"]["210"]["probability_of_improvement"] == pytest.approx(5 / 6)
-    assert esp["returns"]["210"]["difference"]["mean"] == 2.0
+    assert esp[210]["summary"]["gap"]["probability"]["value"] == pytest.approx(5 / 6)
+    assert esp[210]["summary"]["gap"]["difference"]["value"] == 2.0
     # means of plain: -9 -7 -5 -4; of ESP: -9 -5 -3 -2
-    assert plain["steps_to"] == {
-        "-5.0": {"mean": 200, "per_seed": [200, 300, 200]},
-        "-2.0": {"mean": None, "per_seed": [None, None, None]},
-        "0.0": {"mean": None, "per_seed": [None, None, None]},
-    }
-    assert esp["steps_to"]["-5.0"] == {"mean": 100, "per_seed": [100, 100, 200]}
-    assert esp["steps_to"]["-2.0"] == {"mean": 300, "per_seed": [300, 200, None]}
+    passed = [(p["threshold"], p["of_mean"], p["per_seed"]) for p in plain[210]["steps_to"]]
+    assert passed == [(-5.0, 200, [200, 300, 200]), (-2.0, None, [None] * 3), (0.0, None, [None] * 3)]
+    passed = [(p["threshold"], p["of_mean"], p["per_seed"]) for p in esp[210]["steps_to"]]
+    assert passed[:2] == [(-5.0, 100, [100, 100, 200]), (-2.0, 300, [300, 200, None])]
     # seed 0 up to the last step compared: trapezoids (-9 - 6) / 2 and (-6 - 4) / 2, over two intervals
-    assert plain["area_under_curve"]["per_seed"][0] == pytest.approx(-6.25)
-    assert json.loads(json.dumps(result, allow_nan=False))["runs"][1]["label"] == "ESP"
-
-
-def test_the_reference_has_no_difference_from_itself():
-    (only,) = compare([curve(PLAIN)], [100], [])["runs"]
-    assert "difference" not in only["returns"]["100"]
-    assert only["steps_to"] == {}
+    assert plain[210]["area_under_curve"][0] == pytest.approx(-6.25)
 
 
 def test_the_default_is_the_last_step_that_all_runs_reached():
-    result = compare([curve(PLAIN), curve(ESP[:3], steps=STEPS[:3])], [], [])
-    assert [list(run["returns"]) for run in result["runs"]] == [["200"], ["200"]]
+    found = compare([curve(PLAIN), curve(ESP[:3], steps=STEPS[:3])], [], [])
+    assert [list(cells) for cells in found.values()] == [[200], [200]]
 
 
 def test_runs_of_other_seeds_are_not_paired():
     other = curve([[x + 1 for x in row] for row in PLAIN], seeds=(3, 4, 5))
-    _, second = compare([curve(PLAIN), other], [100], [])["runs"]
-    assert second["returns"]["100"]["difference"]["paired"] is False
-    assert second["returns"]["100"]["difference"]["mean"] == 1.0
+    gap = compare([curve(PLAIN), other], [100], [])["run 1"][100]["summary"]["gap"]
+    assert (gap["paired"], gap["difference"]["value"]) == (False, 1.0)
     # pairs of -5 -6 -7 against -6 -7 -8: 6 wins and 2 ties of 9
-    assert second["returns"]["100"]["probability_of_improvement"] == pytest.approx(7 / 9)
+    assert gap["probability"]["value"] == pytest.approx(7 / 9)
 
 
 def test_a_stopped_seed_is_left_out_and_shown():
     stopped = [row.copy() for row in ESP]
     stopped[2][1] = stopped[3][1] = NAN
-    _, second = compare([curve(PLAIN), curve(stopped)], [100, 300], [-3.0])["runs"]
-    at = second["returns"]["300"]
+    second = compare([curve(PLAIN), curve(stopped)], [100, 300], [-3.0])["run 1"]
+    at = second[300]["summary"]["returns"]
     # -1 and -3: mean -2, s.e.m. |(-1) - (-3)| / 2
     assert (at["mean"], at["sem"], at["per_seed"]) == (-2.0, pytest.approx(1.0), [-1.0, None, -3.0])
-    assert "difference" not in at, "other seeds than the reference's"
-    assert second["returns"]["100"]["difference"]["mean"] == 2.0, "before it stopped"
-    assert second["steps_to"]["-3.0"] == {"mean": None, "per_seed": [200, None, 300]}
-    assert second["area_under_curve"]["per_seed"][1] is None
+    assert "gap" not in second[300]["summary"], "other seeds than the reference's"
+    assert second[100]["summary"]["gap"]["difference"]["value"] == 2.0, "before it stopped"
+    assert second[300]["steps_to"] == [{"threshold": -3.0, "of_mean": None, "per_seed": [200, None, 300]}]
+    assert second[300]["area_under_curve"][1] is None
 
 
 def test_a_run_whose_seeds_all_stopped_has_no_numbers():
     broken = [PLAIN[0], [NAN] * 3]
-    (run,) = compare([curve(broken, steps=(0, 100))], [100], [])["runs"]
-    assert run["returns"]["100"] == {"mean": None, "sem": None, "ci95": None, "per_seed": [None, None, None]}
+    cell = compare([curve(broken, steps=(0, 100))], [100], [])["run 0"][100]
+    assert cell["summary"]["returns"] == {"mean": None, "sem": None, "ci95": None, "per_seed": [None, None, None]}
 
 
 def test_one_seed_leaves_no_error_to_state_and_one_evaluation_no_area():
-    (run,) = compare([curve([[-9.0]], steps=(0,), seeds=(4,))], [], [])["runs"]
-    assert run["returns"]["0"] == {"mean": -9.0, "sem": None, "ci95": None, "per_seed": [-9.0]}
-    assert run["area_under_curve"] is None
+    cell = compare([curve([[-9.0]], steps=(0,), seeds=(4,))], [], [])["run 0"][0]
+    assert cell["summary"]["returns"] == {"mean": -9.0, "sem": None, "ci95": None, "per_seed": [-9.0]}
+    assert "area_under_curve" not in cell
 
 
 @pytest.mark.parametrize(
@@ -188,22 +181,22 @@ def test_other_tasks_settings_or_conventions_do_not_compare(choice):
 
 
 def test_other_learners_do_compare():
-    result = compare([curve(PLAIN), curve(ESP, prior__kind="none", network__name="gru", mappo__num_envs=3)], [], [])
-    assert [run["config"]["network"]["name"] for run in result["runs"]] == ["mlp", "gru"]
+    found = compare([curve(PLAIN), curve(ESP, prior__kind="none", network__name="gru", mappo__num_envs=3)], [], [])
+    assert [cells[300]["config"]["network.name"] for cells in found.values()] == ["mlp", "gru"]
 
 
 def test_a_run_of_a_gpu_is_compared_where_there_is_none():
-    there = curve(PLAIN)
-    there = RunCurve("gpu", there.config.model_copy(update={"device": "cuda"}), there.steps, there.values, 1.0)
-    assert compare([there, curve(ESP)], [100], [])["runs"][1]["returns"]["100"]["difference"]["mean"] == 2.0
+    there = curve(PLAIN, "gpu")
+    there = replace(there, config=there.config.model_copy(update={"device": "cuda"}))
+    assert compare([there, curve(ESP)], [100], [])["run 1"][100]["summary"]["gap"]["difference"]["value"] == 2.0
 
 
 def test_the_picture_shows_the_curves_and_somebody_elses_number(tmp_path):
     curves = [curve(PLAIN, "plain"), curve(ESP, "ESP")]
-    png, svg = plot(gathered(curves, [100, 200]), tmp_path / "curves.png", {"the paper": -2.5})
-    with Image.open(png) as image:
+    picture, _ = draw_curves(gathered(curves, [100, 200]), tmp_path / "curves.png", {"the paper": -2.5})
+    with Image.open(picture.png) as image:
         assert image.format == "PNG"
-    text = svg.read_text()
+    text = picture.svg.read_text()
     assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (esp: team sum", "navigation"))
     assert text.count("<!-- plain") == 1, "one curve, whatever the number of steps"
 
@@ -245,8 +238,8 @@ def test_a_run_has_the_name_of_its_folder_from_inside_it_too(tmp_path, monkeypat
 
 def test_a_threshold_that_was_passed_counts_in_a_run_that_ended_before_the_comparison():
     short, whole = curve(PLAIN[:3], "short", STEPS[:3]), curve(ESP, "whole")
-    runs = compare([short, whole], [300], [-5.0])["runs"]
-    assert [run["steps_to"]["-5.0"]["mean"] for run in runs] == [200, 100]
+    found = compare([short, whole], [300], [-5.0])
+    assert [cells[300]["steps_to"][0]["of_mean"] for cells in found.values()] == [200, 100]
 
 
 def test_a_run_reaches_what_it_ended_with_however_that_is_rounded():

@@ -9,10 +9,9 @@ import pytest
 
 from esp_cli.policies.statistics import average_improvement, leader
 from esp_cli.reporting.collect import collect
-from esp_cli.reporting.results import Passing, join, read_results
-from esp_cli.reporting.summary import aggregates, summarise_cell
+from esp_cli.reporting.results import Passing, read_results
+from esp_cli.reporting.summary import aggregates, summarise_cell, summarised
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
-from esp_cli.studies.paper import reported
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.folder_names import POLICY
 from tests.studies.small_studies import small_study, write_study
@@ -25,7 +24,7 @@ EMPTY |= {"mode": "greedy", "rows": "panels", "episodes": 4, "config": {}, "cell
 
 def column(results, name, heading):
     """Return one column of a table as texts."""
-    table = TABLES[name](results)
+    table = TABLES[name](summarised(results))
     return [row[table.headings.index(heading)] for row in table.rows]
 
 
@@ -61,21 +60,10 @@ def test_returns_are_normalised_by_the_best_heuristic(results):
     assert summarise_cell(results, poor).normalised is None, "a worse run would have the higher score"
 
 
-def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(results):
-    first, second = results.cells
-    begun = second.model_copy(update={"status": "not run", "returns": {}, "step": 0})
-    early = results.model_copy(update={"cells": (first, begun)})
-    for several in ([early, results], [results, early]):
-        assert [cell.returns for cell in join(several).cells] == [first.returns, second.returns]
-    other = second.model_copy(update={"returns": first.returns})
-    with pytest.raises(ValueError, match="stands in two of the results files, with different returns"):
-        join([results, results.model_copy(update={"cells": (first, other)})])
-
-
 def test_the_study_says_how_many_seeds_stopped(results):
     first, second = results.cells
     stopped = second.model_copy(update={"returns": {"greedy": (-20.0, -21.0, None)}})
-    shown = returns_table(results.model_copy(update={"cells": (first, stopped)}))
+    shown = returns_table(summarised(results.model_copy(update={"cells": (first, stopped)})))
     assert "-20.50 ± 0.50 (1 stopped)" in [text for row in shown.rows for text in row]
 
 
@@ -87,15 +75,15 @@ def test_steps_to_where_the_reference_ended(results):
     assert column(results, "steps", "return>") == ["-150.00", "-150.00"]
     assert column(results, "steps", "mean>") == ["200", "100"]
     assert column(results, "steps", "median seed>") == ["200", "100"]
-    assert column(results, "steps", "of the run>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
-    assert column(results, "steps", "of its steps>") == ["", "0.50"], "100 of 200 steps"
+    assert column(results, "steps", "share of reference run>") == [f"{200 / plain.step:.2f}", f"{100 / plain.step:.2f}"]
+    assert column(results, "steps", "ratio of median steps>") == ["", "0.50"], "100 of 200 steps"
 
 
 def test_a_reference_that_has_only_begun_has_no_share(results):
     plain, esp = results.cells
     begun = plain.model_copy(update={"step": 0})
     found = results.model_copy(update={"cells": (begun, esp)})
-    assert column(found, "steps", "of the run>") == ["-", "-"]
+    assert column(found, "steps", "share of reference run>") == ["-", "-"]
 
 
 def test_two_seeds_give_no_verdict(tmp_path):
@@ -115,7 +103,7 @@ def test_seeds_that_never_get_there_count_as_infinitely_late(results):
     slower = slow.model_copy(update={"per_seed": (100, None, None)})
     never = results.model_copy(update={"cells": (plain, esp.model_copy(update={"steps_to": (slower,), "step": 200}))})
     assert column(never, "steps", "median seed>")[1] == "> 200"
-    assert column(never, "steps", "of its steps>")[1] == "-"
+    assert column(never, "steps", "ratio of median steps>")[1] == "-"
 
 
 @pytest.mark.parametrize(("seeds", "shown"), [((0, 1), "-"), ((0, 1, 2), "1.00")])
@@ -178,7 +166,7 @@ def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     assert over["MAPPO"].improvement is None
     one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     assert aggregates(one) == {}
-    assert TABLES["aggregates"](one) is None
+    assert TABLES["aggregates"](one).rows == ()
 
 
 def test_a_variant_that_has_not_finished_every_panel_has_no_numbers_over_all(tmp_path):
@@ -241,32 +229,24 @@ def test_an_evaluation_beside_which_no_trained_policy_lies_does_not_count(tmp_pa
     assert collect(folder).results.cells[0].status == "unfinished"
 
 
-def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
+def test_the_paper_stands_below_ours(tmp_path):
     study = small_study(steps=((None, 500_000),))
     found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
-    short, whole = returns_table(found), returns_table(found, whole=True)
-    assert short.rows == (
+    assert returns_table(found).rows == (
         ("navigation, 500k", "ours", "-150.00 ± 5.77", "-130.00 ± 5.77"),
         ("", "paper", "-132.65 ± 2.89", "-122.25 ± 1.62"),
     )
-    assert len(whole.rows) == 12
-    assert whole.headings[2:] == ("MADDPG>", "MADDPG-ESP>", "QMIX>", "QMIX-ESP>", "MAPPO>", "MAPPO-ESP>")
-    place = next(k for k, row in enumerate(whole.rows) if row[0] == "navigation, 500k")
-    assert whole.rows[place][2:] == ("not run",) * 4 + ("-150.00 ± 5.77", "-130.00 ± 5.77")
-    number = reported(("table1", "navigation", "500000", "qmix", "esp"))
-    assert whole.rows[place + 1][5] == f"{number.mean:.2f} ± {number.sem:.2f}"
 
 
 def test_a_results_file_holds_configuration_version_and_every_seed(results, tmp_path):
     file = tmp_path / "results.json"
     file.write_text(json.dumps(results.document()))
     again = read_results(file)
-    assert again == results
+    assert summarised(again) == results
     assert again.config["task"] == "navigation"
     assert [cell.config["prior.kind"] for cell in again.cells] == ["none", "esp"]
     assert {cell.esp_version for cell in again.cells} == {"0.0.1"}
     assert again.cells[1].returns["greedy"] == tuple(ESP)
-    assert [table.rows for table in all_tables(again)] == [table.rows for table in all_tables(results)]
 
 
 def test_the_document_has_the_fields_that_it_always_had(results):
@@ -290,6 +270,10 @@ def test_the_document_has_the_fields_that_it_always_had(results):
     fields += ("esp_version", "task_version", "convention", "returns", "anchors", "metrics", "evaluations", "steps_to")
     assert set(cell) == {*fields, "area_under_curve"}
     assert (cell["reference"], cell["paper"]) == (None, None)
+    whole = results.document(statistics=True)["cells"][1]
+    assert set(whole) == {*cell, "summary"}
+    assert whole["summary"]["gap"]["difference"] == {"value": 20.0, "ci95": [0.0, 40.0]}
+    json.dumps(whole, allow_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -352,3 +336,16 @@ def test_damaged_metrics_are_not_taken_for_a_run_that_has_only_begun(tmp_path):
         assert collect(folder).results.cells[0].step <= 50
     metrics.unlink()
     assert collect(folder).results.cells[0].step == 0
+
+
+def test_runs_of_other_seeds_than_the_study_are_told(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
+    document = json.loads((folder.path / "study.json").read_text())
+    document["cells"][0]["config"]["seeds"] = [0, 1, 2, -1]
+    (folder.path / "study.json").write_text(json.dumps(document))
+    more = StudyFolder.open(folder.path)
+    with pytest.raises(ValueError, match="its final evaluation has not the 4 seeds of the run"):
+        collect(more)
+    folder.evaluation_path(folder.study.cells[0]).unlink()
+    with pytest.raises(ValueError, match="its metrics have 3 seeds, its configuration 4"):
+        collect(more)

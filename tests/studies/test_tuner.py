@@ -293,8 +293,8 @@ def test_a_score_is_called_that_of_the_default_settings_only_where_trial_0_had_t
     assert plan.config("none", {}).algorithm_settings["gae_lambda"] == 0.95
     found = search(tmp_path / "t", plan).trials.outcome("none")
     assert (found.default_score is not None) == holds
-    headings, rows = budget_table([found])
-    assert (rows[0][headings.index("default>")] == "-") != holds
+    table = budget_table(plan, [found])
+    assert (table.rows[0][table.headings.index("default>")] == "-") != holds
     assert found.best_score is not None, "the trial has a score all the same"
 
 
@@ -318,9 +318,9 @@ def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budge
     page = write_page(trials, outcomes, tmp_path / "t" / "report").read_text()
     assert budget_sentence(trials.tuning) in page
     assert "Budget: 16 trials each of 2 seeds and at most 900 steps per seed" in page
-    _, rows = budget_table(outcomes)
+    rows = budget_table(trials.tuning, outcomes).rows
     assert [row[1] for row in rows] == ["16", "16"]
-    assert all(f"| {' | '.join(row)} |" in page for row in (*rows, *settings_table(outcomes)[1]))
+    assert all(f"| {' | '.join(row)} |" in page for row in (*rows, *settings_table(outcomes).rows))
     pictures = {line.split("(")[1].rstrip(")") for line in page.splitlines() if line.startswith("![")}
     assert {"esp-optimization-history.png", "none-importances.png"} <= pictures
     assert all((tmp_path / "t" / "report" / name).stat().st_size > 1000 for name in pictures)

@@ -23,9 +23,6 @@ from esp_cli.checking.logs import read_transitions
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.loading import load_policy
 from esp_cli.policies.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
-from esp_cli.reporting.pages import filled
-from esp_cli.reporting.results import read_results
-from esp_cli.reporting.tables import all_tables
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
@@ -179,9 +176,6 @@ def _make_sound_files(scratch: Path) -> None:
         with run.lock():
             Trainer(cell.config, run).run(lambda news: True)
         _run_command(["eval", str(run.path), "--episodes", "4", "--json", str(study.evaluation_path(cell))])
-    (scratch / "results").mkdir()
-    _run_command(["report", str(study.path), "--results", str(scratch / KINDS["results"].path), "--json", "-"])
-    (scratch / "results" / "page.md").write_text("<!-- results: results.json returns -->\n<!-- end of results -->\n")
     recorded = collect(make("navigation", 64, [0]), 64, 2)
     arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
     np.savez(scratch / "transitions.npz", **arrays)
@@ -275,13 +269,6 @@ def _evaluation(path: Path) -> str | None:
     return None if _agrees(parse_object(path.read_bytes(), "text"), taken) else "something else was taken"
 
 
-def _results(path: Path) -> str | None:
-    results = read_results(path)
-    all_tables(results)
-    filled(path.parent / "page.md")
-    return None
-
-
 def _manifest(path: Path) -> str | None:
     return _document(MANIFEST_FORMAT, path, MANIFEST_FORMAT.parse(path, Manifest).model_dump(mode="json"))
 
@@ -306,7 +293,6 @@ _ALL = (
     (f"{RUN}/metrics.jsonl", _metrics, "report {scratch}/run", spoil_json),
     (f"{STUDY}/study.json", _study, "report {scratch}/study --json -", spoil_json),
     ("evaluation/final-evaluation.json", _evaluation, "report {scratch}/study", spoil_json),
-    ("results/results.json", _results, "report --fill {scratch}/results/page.md", spoil_json),
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
     ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
     ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
@@ -318,7 +304,6 @@ _NAMES = (
     "metrics",
     "study",
     "evaluation",
-    "results",
     "manifest",
     "prey",
     "transitions",

@@ -1,0 +1,219 @@
+"""Figures: how one is written, and those of returns, as means with every seed or over a setting.
+
+Each is written as PNG and as SVG, the same bytes for the same numbers. Colours are those of Okabe and Ito, which
+people with any common colour blindness can tell apart; curves differ in their line style too.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from esp_cli.files.failures import attempting
+from esp_cli.files.formatting import format_span
+from esp_cli.files.writing import write_file
+from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
+from esp_envs.errors import UserError
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+"""Okabe and Ito, "Color Universal Design", 2008, without the yellow, too light for lines on white, and a grey."""
+
+LineStyle = str | tuple[int, tuple[int, ...]]
+
+_LINE_STYLES: tuple[LineStyle, ...] = ("-", "--", "-.", (0, (5, 1, 1, 1, 1, 1)))
+_STYLE: dict[Any, Any] = {
+    "figure.dpi": 100,
+    "savefig.dpi": 150,
+    "font.family": ["DejaVu Sans"],
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E5E5E5",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    # names are not mathematics: a dollar sign stays one
+    "text.parse_math": False,
+    # identifiers in SVG files are drawn at random unless salted
+    "svg.hashsalt": "esp",
+}
+_JITTER = 0.08
+"""Horizontal distance of the lines of `over_setting`, so that intervals do not lie upon each other."""
+_WIDEST = 0.4
+"""All lines together, at one value."""
+POINTS_PER_INCH = 72
+"""Of an SVG by matplotlib."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure that was written.
+
+    Attributes:
+        png: its file as PNG.
+        svg: its file as SVG.
+        size: width and height of the SVG, points.
+    """
+
+    png: Path
+    svg: Path
+    size: tuple[float, float]
+
+
+def dots(
+    groups: Mapping[str, ArrayLike],
+    path: str | os.PathLike[str],
+    title: str,
+    xlabel: str,
+    anchors: Mapping[str, float] | None = None,
+) -> Picture:
+    """Draw the mean of each group as a dot with its interval, and every seed as a small one.
+
+    The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise.
+
+    Args:
+        groups: name -> one number per seed [S]; at least one, drawn from top to bottom.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        title: heading.
+        xlabel: what is plotted, with its convention.
+        anchors: lines where they are in view: name -> value; the legend names the others.
+
+    Raises:
+        UserError: no group, a value that is not finite, or a file that cannot be written.
+    """
+    if not groups:
+        raise UserError("there is no group to draw")
+    with written_figure(path, (7.2, 2.1 + 0.5 * len(groups))) as (figure, picture):
+        axes = _titled(figure, title)
+        for index, group in enumerate(groups.values()):
+            colour, values = PALETTE[index % len(PALETTE)], np.asarray(group, dtype=np.float64)
+            mean, _ = mean_and_sem(values)
+            # a fixed spread instead of a random one keeps the seeds apart and the file the same
+            spread = np.linspace(-0.18, 0.18, values.size) if values.size > 1 else np.zeros(1)
+            axes.plot(values, index + spread, "o", color=colour, markersize=3.5, markeredgewidth=0, alpha=0.45)
+            interval = bootstrap_interval(values)
+            if interval is not None:
+                axes.plot(interval, [index, index], color=colour, linewidth=1.8, marker="|", markersize=10)
+            axes.plot([mean], [index], "o", color=colour, markersize=8)
+        counts = [np.size(group) for group in groups.values()]
+        names = [f"{label}\n({_seeds([count])})" for label, count in zip(groups, counts, strict=True)]
+        axes.set_yticks(range(len(groups)), names)
+        axes.set_ylim(len(groups) - 0.4, -0.6)
+        axes.grid(visible=False, axis="y")
+        low, high = axes.get_xlim()
+        for index, (name, value) in enumerate((anchors or {}).items()):
+            if low <= value <= high:
+                style = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
+                axes.axvline(value, linestyle=style, color="#777777", linewidth=1.2, label=f"{name} {value:g}")
+            else:
+                axes.plot([], [], " ", label=f"{name} {value:g} (out of view)")
+        axes.set_xlim(low, high)
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8))
+        axes.set_xlabel("\n".join(filter(None, (xlabel, caption(counts)))))
+        if anchors:
+            figure.legend(loc="outside lower center", ncols=2)
+    return picture
+
+
+def over_setting(
+    lines: Mapping[str, Mapping[str, ArrayLike]],
+    path: str | os.PathLike[str],
+    title: str,
+    labels: tuple[str, str],
+    order: Iterable[str] = (),
+    paper: Mapping[str, Mapping[str, float]] | None = None,
+) -> Picture:
+    """Draw returns over a setting as lines with intervals, and the paper's means as crosses.
+
+    Args:
+        lines: at least one: name -> value of the setting, of which there is at least one -> one number per seed [S].
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        title: heading.
+        labels: of the axes: the setting, whose values stand at equal distances as in figure 5c, and what is plotted.
+        order: the setting's values from left to right, where not every line has all of them.
+        paper: the paper's means: name -> value of the setting -> mean.
+
+    Raises:
+        UserError: nothing to draw, or a file that cannot be written.
+    """
+    if not lines or not all(lines.values()):
+        raise UserError("there is no line to draw")
+    known = dict.fromkeys(value for line in lines.values() for value in line)
+    places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}
+    apart = min(_JITTER, _WIDEST / len(lines))
+    with written_figure(path, (6.4, 4.4)) as (figure, picture):
+        axes = _titled(figure, title)
+        for index, (name, line) in enumerate(lines.items()):
+            colour, style = appearance(index)
+            at = [places[value] + apart * (index - (len(lines) - 1) / 2) for value in line]
+            means = [mean_and_sem(values)[0] for values in line.values()]
+            axes.plot(at, means, color=colour, linestyle=style, marker="o", label=name)
+            for x, values in zip(at, line.values(), strict=True):
+                if (interval := bootstrap_interval(values)) is not None:
+                    axes.plot([x, x], interval, color=colour, linewidth=1.6)
+            theirs = {places[value]: mean for value, mean in (paper or {}).get(name, {}).items() if value in places}
+            if theirs:
+                axes.plot([*theirs], [*theirs.values()], "x", color=colour, markersize=8, label=f"paper, {name}")
+        axes.set_xticks(range(len(places)), list(places))
+        counts = [np.size(values) for line in lines.values() for values in line.values()]
+        axes.set_xlabel("\n".join(filter(None, (labels[0], caption(counts)))))
+        axes.set_ylabel(labels[1])
+        figure.legend(loc="outside lower center", ncols=2)
+    return picture
+
+
+def appearance(index: int) -> tuple[str, LineStyle]:
+    """Return the colour and the line style of the curve with this index."""
+    return PALETTE[index % len(PALETTE)], _LINE_STYLES[index % len(_LINE_STYLES)]
+
+
+@contextmanager
+def written_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[tuple[Figure, Picture]]:
+    """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched.
+
+    Args:
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        size: width and height, inches.
+
+    Raises:
+        UserError: the files cannot be written.
+    """
+    path = Path(path)
+    stem = path.stem if path.suffix in {".png", ".svg"} else path.name
+    png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        yield figure, Picture(png, svg, (size[0] * POINTS_PER_INCH, size[1] * POINTS_PER_INCH))
+        # dates and versions would make every file differ from the last
+        for file, metadata in ((png, {"Software": None}), (svg, {"Date": None, "Creator": None})):
+            content = BytesIO()
+            figure.savefig(content, format=file.suffix[1:], metadata=metadata)
+            with attempting("write the figure", file, UserError):
+                write_file(file, content.getvalue())
+
+
+def _titled(figure: Figure, title: str) -> Axes:
+    axes = figure.add_subplot()
+    axes.set_title(title, loc="left", fontweight="bold")
+    return axes
+
+
+def _seeds(counts: Sequence[int]) -> str:
+    return "1 seed" if max(counts) == 1 else f"{format_span(counts)} seeds"
+
+
+def caption(counts: Sequence[int]) -> str | None:
+    """Say what the bands and lines are; None where every run has one seed, and so none of them."""
+    return f"mean and 95 % bootstrap interval over {_seeds(counts)}" if max(counts) > 1 else None

@@ -1,0 +1,259 @@
+"""The script that fills the pages: tables from results files and nothing else, and verdicts on broken symmetry."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+from pathlib import Path
+
+import pytest
+
+from esp_cli.reporting.collect import collect
+from esp_cli.reporting.study_figures import series_of
+from esp_cli.studies.paper import reported
+from esp_cli.studies.study import StudyFolder
+from tests.reporting.test_breaking import BASE, BROKEN, METHODS, NOISE, material, study
+from tests.studies.small_studies import small_study, write_run, write_study
+
+FILL = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "fill_tables.py"))
+Verdict, filled, files_of, join, leaders = (FILL[n] for n in ("Verdict", "filled", "files_of", "join", "leaders"))
+methods_table, paper_table, side, verdicts = (FILL[n] for n in ("methods_table", "paper_table", "side", "verdicts"))
+verdicts_table = FILL["verdicts_table"]
+__all__ = ["material"]  # a fixture
+BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
+
+
+@pytest.fixture
+def page(tmp_path):
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
+    found = collect(write_study(tmp_path / "s", small_study(), ends)).results.document()
+    (tmp_path / "measured").mkdir()
+    (tmp_path / "measured" / "a.json").write_text(json.dumps(found))
+    page = tmp_path / "page.md"
+    page.write_text(f"# Before\n\n{BLOCK.format('returns')}\n\nbetween\n\n{BLOCK.format('comparison')}\n\nafter\n")
+    return page
+
+
+def test_what_stands_between_the_marks_is_computed_and_the_rest_stays(page):
+    text = filled(page)
+    assert "stale" not in text
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in text
+    assert text.startswith("# Before\n\n<!-- results: measured/a.json returns -->\n\n| ")
+    assert "\n\nbetween\n\n" in text
+    assert text.endswith("<!-- end of results -->\n\nafter\n")
+    assert files_of(page) == ["measured/a.json"]
+
+
+def test_an_indented_example_stays_as_it_is(page):
+    example = "```\n  <!-- results: measured/no.json paper -->\n  <!-- end of results -->\n```\n"
+    page.write_text(example + page.read_text())
+    assert filled(page).startswith(example)
+    assert files_of(page) == ["measured/a.json"]
+
+
+def test_filling_twice_changes_nothing_and_a_changed_number_does(page):
+    page.write_text(filled(page))
+    assert filled(page) == page.read_text()
+    file = page.parent / "measured" / "a.json"
+    found = json.loads(file.read_text())
+    found["cells"][0]["returns"]["greedy"][0] += 30
+    file.write_text(json.dumps(found))
+    assert filled(page) != page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("a.json returns", "a.json wishes", "asks for the table 'wishes'"),
+        ("a.json", "b.json", "cannot read"),
+        ("results:", "result:", "has no table to compute"),
+    ],
+)
+def test_a_table_or_file_that_is_not_there_is_told(page, old, new, sentence):
+    page.write_text(page.read_text().replace(old, new))
+    with pytest.raises(ValueError, match=sentence):
+        filled(page)
+    with pytest.raises(ValueError, match="cannot read"):
+        filled(page.with_name("no.md"))
+
+
+def test_a_table_of_final_returns_takes_those_of_drawn_actions(page):
+    file = page.parent / "measured" / "a.json"
+    found = json.loads(file.read_text())
+    for cell in found["cells"]:
+        cell["returns"]["stochastic"] = [value - 7 for value in cell["returns"]["greedy"]]
+    file.write_text(json.dumps(found))
+    page.write_text(page.read_text().replace("comparison -->", "comparison stochastic -->"))
+    greedy, _, drawn = filled(page).partition("between")
+    assert "-150.00 ± 5.77" in greedy
+    assert "of the greedy return" in greedy
+    assert "| MAPPO | -157.00 ± 5.77 |" in drawn
+    assert "Returns are those of drawn actions." in drawn
+    page.write_text(page.read_text().replace("comparison stochastic", "steps stochastic"))
+    with pytest.raises(
+        ValueError, match=r"asks for the table 'steps stochastic'; .*; returns, paper, comparison take a mode"
+    ):
+        filled(page)
+
+
+def longer(page, seeds=(0, 1), **change):
+    """Write the results of a second study, of more steps and fewer seeds, beside those of the page."""
+    study = small_study(steps=((None, 400),), seeds=seeds)
+    found = collect(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})).results.document() | change
+    (page.parent / "measured" / "b.json").write_text(json.dumps(found))
+    page.write_text("<!-- results: measured/a.json measured/b.json returns -->\n<!-- end of results -->\n")
+
+
+def test_studies_of_one_kind_stand_in_one_table_and_fewer_seeds_are_told(page):
+    longer(page)
+    text = filled(page)
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in text
+    assert "| navigation, 400 | -111.00 ± 1.00 (n = 2) | not run |" in text
+    assert "over 2 to 3 seeds" in text
+    assert files_of(page) == ["measured/a.json", "measured/b.json"]
+
+
+def test_studies_that_do_not_go_together_are_refused(page):
+    longer(page, kind="agents")
+    with pytest.raises(ValueError, match="different kinds"):
+        filled(page)
+    page.write_text(page.read_text().replace("b.json", "a.json"))
+    assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in filled(page), "what is the same counts once"
+    first, second = (page.parent / "measured" / name for name in ("a.json", "b.json"))
+    second.write_text(first.read_text().replace("-130.0", "-131.0"))
+    page.write_text(page.read_text().replace("a.json", "b.json", 1))
+    with pytest.raises(ValueError, match="navigation-200-mappo-esp stands in two of the results files, with different"):
+        filled(page)
+
+
+def test_a_page_that_is_none_is_told_in_one_sentence(tmp_path):
+    (tmp_path / "weights.md").write_bytes(b"\xf8\x00")
+    with pytest.raises(ValueError, match=r"cannot read .*weights.md: 'utf-8' codec"):
+        filled(tmp_path / "weights.md")
+    os.mkfifo(tmp_path / "pipe.md")
+    with pytest.raises(ValueError, match=r"cannot read .*pipe.md: .*regular file"):
+        filled(tmp_path / "pipe.md")
+
+
+@pytest.mark.parametrize("fewer", ["MAPPO", "MAPPO-ESP"])
+def test_one_seed_proves_nothing_on_either_side(tmp_path: Path, fewer: str):
+    ends = {"MAPPO": [-119.5, -119.5, -119.5], "MAPPO-ESP": [-119.0, -118.0, -119.0]}
+    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    plain, esp = results.cells
+    assert side(results, esp, plain) == "ahead"
+    cut = {cell.variant: cell for cell in results.cells}
+    one = cut[fewer]
+    cut[fewer] = one.model_copy(update={"seeds": one.seeds[:1], "returns": {"greedy": one.returns["greedy"][:1]}})
+    assert side(results, cut["MAPPO-ESP"], cut["MAPPO"]) is None
+
+
+def test_each_method_gets_its_verdict(material):
+    """Fading: within an error of ESP, then level with plain. Gate: 1 below ESP. Measured: as ESP, then ahead."""
+    results = material.results
+    (one,) = series_of(results)
+    assert (one.name, one.setting, list(one.cells)) == ("navigation, MAPPO, 200", "wind", [0.0, 0.3, 0.6])
+    assert verdicts(results) == [
+        Verdict("ESP that fades", True, True, True),
+        Verdict("auto", True, True, True),
+        Verdict("measured weights", True, True, True),
+        Verdict("gate", False, True, True),
+        Verdict("compass", False, True, True),
+        Verdict("relaxed weights", True, False, False),
+    ]
+    assert verdicts_table(results).rows[4] == ("compass", "no", "yes", "yes")
+
+
+def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
+    worse = StudyFolder.create(tmp_path / "study", study())
+    for cell in worse.study.cells:
+        wind = cell.config.task_settings["wind"]
+        mean = (BASE if wind == 0 else BROKEN)[cell.variant] - (60 if wind == 0.6 and cell.variant == "compass" else 0)
+        mean -= 60 if wind == 0.3 and cell.variant == "measured weights" else 0
+        mean += 30 if wind == 0 and cell.variant == "relaxed weights" else 0
+        ends = [mean + x for x in NOISE]
+        write_run(worse, cell, [ends, ends, ends], ends)
+    found = {verdict.method: verdict for verdict in verdicts(collect(worse).results)}
+    assert found["compass"].largest is False
+    assert found["relaxed weights"].unbroken is True, "ahead of ESP is not behind it"
+    assert found["measured weights"] == Verdict("measured weights", True, True, False)
+
+
+def test_a_method_may_be_behind_by_the_larger_of_both_errors(material):
+    """Behind by 1, with an error of 3 / sqrt(3) instead of 1 / sqrt(3)."""
+    results = material.results
+    wide = tuple(
+        cell.model_copy(update={"returns": {"greedy": (-124.0, -121.0, -118.0)}})
+        if cell.variant == "gate" and "unbroken" in cell.panel
+        else cell
+        for cell in results.cells
+    )
+    both = (results, results.model_copy(update={"cells": wide}))
+    assert [{v.method: v.unbroken for v in verdicts(one)}["gate"] for one in both] == [False, True]
+
+
+def test_a_page_has_one_column_for_each_method_and_marks_the_best(material):
+    """Seeds of all methods differ by the same noise, so methods are level only where their means are equal."""
+    results = material.results
+    end, early = methods_table(results), methods_table(results, early=True)
+    assert end.headings == ("navigation, MAPPO, 200", *(f"{method}>" for method in METHODS))
+    assert [row[0] for row in end.rows] == ["unbroken", "wind 0.3", "wind 0.6"]
+    best = [{method for method, text in zip(METHODS, row[1:], strict=True) if "(*)" in text} for row in end.rows]
+    assert best == [{name for name, mean in BASE.items() if mean == -120.0}, {"compass"}, {"compass"}]
+    assert end.rows[1][1:3] == ("-150.00 ± 0.58", "-180.00 ± 0.58")
+    assert early.rows[1][1].startswith("-170.00")
+    twice = [cell.model_copy(update={"panel": cell.panel.replace("MAPPO", "QMIX")}) for cell in results.cells]
+    both = methods_table(results.model_copy(update={"cells": (*results.cells, *twice)}))
+    assert (both.headings[0], both.rows[3][0]) == ("run", "navigation, QMIX, 200, unbroken")
+    cells = {name: cell.model_copy(update={"early": None}) for name, cell in series_of(results)[0].cells[0.3].items()}
+    assert leaders(results, cells, early=True) == set()
+
+
+def test_who_leads_early_is_told_by_the_early_returns(tmp_path: Path):
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-110.0, -120.0, -130.0]}
+    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    cells = {cell.variant: cell.model_copy(update={"early": (-180.0, -190.0, -170.0)}) for cell in results.cells}
+    assert leaders(results, cells, early=True) == {"MAPPO", "MAPPO-ESP"}
+    assert leaders(results, cells, early=False) == {"MAPPO-ESP"}
+
+
+def test_equal_runs_are_level_and_one_seed_says_nothing(material):
+    results = material.results
+    cells = series_of(results)[0].cells[0.0]
+    assert side(results, cells["measured weights"], cells["ESP"]) == "level"
+    assert side(results, cells["plain"], cells["ESP"]) == "behind"
+    alone = {name: cell.model_copy(update={"returns": {"greedy": (-1.0,)}}) for name, cell in cells.items()}
+    assert side(results, alone["plain"], alone["ESP"]) is None
+
+
+def test_without_runs_nothing_is_said_and_other_studies_have_no_such_table(tmp_path: Path):
+    empty = StudyFolder.create(tmp_path / "empty", study())
+    assert {(v.unbroken, v.largest, v.between) for v in verdicts(collect(empty).results)} == {(None, None, None)}
+    other = write_study(tmp_path / "other", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
+    results = collect(other).results
+    assert methods_table(results).rows == verdicts_table(results).rows == ()
+
+
+def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(tmp_path):
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
+    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    first, second = results.cells
+    begun = second.model_copy(update={"status": "not run", "returns": {}, "step": 0})
+    early = results.model_copy(update={"cells": (first, begun)})
+    for several in ([early, results], [results, early]):
+        assert [cell.returns for cell in join(several).cells] == [first.returns, second.returns]
+    other = second.model_copy(update={"returns": first.returns})
+    with pytest.raises(ValueError, match="stands in two of the results files, with different returns"):
+        join([results, results.model_copy(update={"cells": (first, other)})])
+
+
+def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
+    study = small_study(steps=((None, 500_000),))
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
+    whole = paper_table(collect(write_study(tmp_path / "s", study, ends)).results)
+    assert len(whole.rows) == 12
+    assert whole.headings[2:] == ("MADDPG>", "MADDPG-ESP>", "QMIX>", "QMIX-ESP>", "MAPPO>", "MAPPO-ESP>")
+    place = next(k for k, row in enumerate(whole.rows) if row[0] == "navigation, 500k")
+    assert whole.rows[place][2:] == ("not run",) * 4 + ("-150.00 ± 5.77", "-130.00 ± 5.77")
+    number = reported(("table1", "navigation", "500000", "qmix", "esp"))
+    assert whole.rows[place + 1][5] == f"{number.mean:.2f} ± {number.sem:.2f}"
