@@ -123,11 +123,11 @@ def test_a_damaged_policy_file_is_refused(tmp_path: Path) -> None:
 
 def test_old_runs_are_compared(resumed: dict[str, Path], tmp_path: Path) -> None:
     esp("report", *resumed.values(), "--at", 200, "--json", tmp_path / "report.json")
-    first, second = json.loads((tmp_path / "report.json").read_text())["runs"]
+    first, second = json.loads((tmp_path / "report.json").read_text())["cells"]
     for run, name in ((first, "mappo"), (second, "maddpg")):
         rows = map(json.loads, (OLD / f"{name}-half-way" / "metrics.jsonl").read_text().splitlines())
         returns = next(row["eval/return_greedy"] for row in rows if row["step"] == 200)
-        assert run["returns"]["200"]["per_seed"] == [round(value, 4) for value in returns]
+        assert run["returns"]["greedy"] == [round(value, 4) for value in returns]
 
 
 def test_a_half_done_study_is_planned_and_reported(tmp_path: Path) -> None:
