@@ -1,7 +1,5 @@
 """ESP: symmetry priors for multi-agent reinforcement learning."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -16,27 +14,9 @@ if TYPE_CHECKING:
     from esp_envs.moves import discrete_moves
     from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, layout
 
-__all__ = [
-    "Continuous",
-    "Discrete",
-    "Field",
-    "Items",
-    "Kind",
-    "Layout",
-    "LoadedPolicy",
-    "Metrics",
-    "Progress",
-    "Run",
-    "Symmetry",
-    "Transitions",
-    "__version__",
-    "discrete_moves",
-    "layout",
-    "load_policy",
-    "train",
-]
-
-_HOMES = {
+__all__ = ["Continuous", "Discrete", "Field", "Items", "Kind", "Layout", "LoadedPolicy", "Metrics", "Progress", "Run"]
+__all__ += ["Symmetry", "Transitions", "__version__", "discrete_moves", "layout", "load_policy", "train"]
+_HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
     "LoadedPolicy": "esp_cli.policies.loaded",
     "Metrics": "esp_cli.training.metrics_table",
     "Progress": "esp_cli.training.trainer",
@@ -48,15 +28,11 @@ _HOMES = {
     "load_policy": "esp_cli.policies.loaded",
     "train": "esp_cli.run",
 }
-"""Where a public name is defined; the others describe spaces."""
+__dir__ = __all__.copy
 
 
 def __getattr__(name: str) -> Any:
     """Import what other programs use when they ask for it: torch takes a second, `esp --help` a sixth of one."""
-    if name in __all__:
-        return getattr(import_module(_HOMES.get(name, "esp_envs.spec")), name)
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

@@ -26,12 +26,11 @@ from esp_cli.defaults import EPISODES, STEPS
 from esp_cli.files.formatting import file_name
 from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.policies.bundled import open_policy
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.evaluation import evaluate as evaluate_policy
 from esp_cli.policies.initial import describe, matching_weights
-from esp_cli.policies.loaded import LoadedPolicy, register_own
-from esp_cli.policies.loading import TrainedPolicy, load_policy, transfer
+from esp_cli.policies.loaded import LoadedPolicy
+from esp_cli.policies.loading import TrainedPolicy, open_policy, register_own
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.config_file import parse_config
@@ -45,12 +44,15 @@ from esp_envs.errors import UserError
 from esp_envs.registry import register
 
 if TYPE_CHECKING:
-    from esp_cli.drawing.draw import Drawing
-    from esp_cli.drawing.rendering import View
+    from esp_cli.drawing.draw import Drawing, View
 
 
 class Run:
     """A run in its folder: S seeds of one task, algorithm, network and prior.
+
+    Example:
+        run = Run("runs/cn")
+        print(run.evaluate(64).greedy.mean)
 
     Args:
         path: of the run folder.
@@ -86,7 +88,7 @@ class Run:
     @property
     def policy(self) -> LoadedPolicy:
         """The newest policy of the first seed, numpy in and out; `load_policy(run.path, seed=k)` gives another's."""
-        return LoadedPolicy(load_policy(self.path))
+        return LoadedPolicy(TrainedPolicy.read(self.path))
 
     @property
     def is_complete(self) -> bool:
@@ -162,13 +164,13 @@ class Run:
         Raises:
             UserError: another ending, no checkpoint yet, no such seed or view.
         """
-        from esp_cli.drawing.draw import draw  # noqa: PLC0415 - training needs no plotting
+        from esp_cli.drawing.draw import Request, draw  # noqa: PLC0415 - training needs no plotting
 
-        trained = self._trained(settings)
-        return draw(trained, Path(out), seed=seed, episodes=episodes, view=view, size=size, speed=speed, greedy=greedy)
+        request = Request(Path(out), seed, episodes, view, size, speed, greedy=greedy)
+        return draw(request, [self._trained(settings)])
 
     def _trained(self, settings: Mapping[str, object] | None) -> TrainedPolicy:
-        return transfer(load_policy(self.path), settings or {})
+        return TrainedPolicy.read(self.path).transfer(settings or {})
 
 
 def plan(

@@ -105,7 +105,7 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
     report = check_symmetry(make_worlds, transforms)
     measured: list[PolicyVerdict] = []
     if policy is not None:
-        from esp_cli.policies.bundled import open_policy
+        from esp_cli.policies.loading import open_policy
 
         measured = check_policy(open_policy(policy), make_worlds, transforms)
     found = {"report": report, "holds": report.holds, "policy": measured}

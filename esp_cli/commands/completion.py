@@ -67,7 +67,7 @@ def trackers(_: typer.Context, incomplete: str) -> list[str]:
 
 def policies(_: typer.Context, incomplete: str) -> list[str]:
     """Offer the bundled policies by task and by name, and the files and folders here."""
-    from esp_cli.policies.manifest import read_bundled
+    from esp_cli.policies.bundled import read_bundled
 
     bundled = read_bundled()
     names = [*(entry.task for entry in bundled), *(entry.name for entry in bundled)]

@@ -46,12 +46,11 @@ def evaluate(
 
     The task may have other settings than in training: another physics, more noise.
     """
-    from esp_cli.policies.bundled import open_policy
     from esp_cli.policies.evaluation import evaluate as evaluate_policy
-    from esp_cli.policies.loading import transfer
+    from esp_cli.policies.loading import open_policy
 
     register_named(task, [algo], network)
-    trained = transfer(open_policy(policy, algo, prior), parse_task_settings(settings or [], physics))
+    trained = open_policy(policy, algo, prior).transfer(parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
     result = evaluate_policy(trained, episodes)
@@ -61,7 +60,6 @@ def evaluate(
 
 def _print(result: FinalEvaluation, policy: str) -> None:
     rows = []
-    alone = len(result.seeds) == 1
     for mode in ("greedy", "stochastic"):
         returns = result.returns(mode)
         error = result.over_episodes.get(mode, returns)  # of one seed that stopped there is neither
@@ -77,7 +75,9 @@ def _print(result: FinalEvaluation, policy: str) -> None:
         f"{len(result.seeds)} seed(s) x {result.episodes} episodes"
     )
     over = (
-        f"over {result.episodes} episodes of one seed" if alone else "over seeds, of reference policies over episodes"
+        f"over {result.episodes} episodes of one seed"
+        if len(result.seeds) == 1
+        else "over seeds, of reference policies over episodes"
     )
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
     console.table(("policy", "episode return>", "95 % interval>"), rows, title=title, caption=caption)

@@ -24,8 +24,8 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.export.export import Exported
+    from esp_cli.policies.bundled import Entry
     from esp_cli.policies.loading import TrainedPolicy
-    from esp_cli.policies.manifest import Entry
 
 EPILOG = """Examples:\n
     esp export formation -f c -o formation-c\n
@@ -75,30 +75,35 @@ def export(
 
     Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
     """
-    for unknown in set(formats) - set(FORMATS):
-        raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
+    _check_options(formats, seed, episodes, name)
     from esp_cli.export.export import export as write
-    from esp_cli.policies.bundled import open_policy
     from esp_cli.policies.bundling import bundle
-    from esp_cli.policies.loading import single_seed
+    from esp_cli.policies.loading import open_policy
 
-    if "policy" in formats and len(formats) > 1:
-        raise UserError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
-    if name is not None and "policy" not in formats:
-        raise UserError("--name is for -f policy alone; leave it out")
-    if seed is not None and episodes is not None and "policy" not in formats:
-        raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
     register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
-    if "policy" in formats:
+    if formats == ["policy"]:
         entry = bundle(trained, out, episodes or EPISODES, seed, name, force)
         console.result(json, entry, lambda: _announce(entry, out))
         return
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
-    exported = write(single_seed(trained, chosen), formats, out, force)
+    exported = write(trained.single_seed(chosen), formats, out, force)
     console.result(json, exported, lambda: _print(exported, f"{policy}, seed {chosen}", out))
+
+
+def _check_options(formats: list[str], seed: int | None, episodes: int | None, name: str | None) -> None:
+    """Refuse unknown formats, and options that do not go together."""
+    for unknown in set(formats) - set(FORMATS):
+        raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
+    bundles = "policy" in formats
+    if bundles and len(formats) > 1:
+        raise UserError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
+    if name is not None and not bundles:
+        raise UserError("--name is for -f policy alone; leave it out")
+    if seed is not None and episodes is not None and not bundles:
+        raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
 
 
 def _announce(entry: Entry, out: Path) -> None:
@@ -123,9 +128,9 @@ def _print(exported: Exported, title: str, out: Path) -> None:
     rows = []
     for result in exported.formats:
         numbers = ("-", "-", "-")
-        if (found := result.agreement) is not None:
-            others = "-" if found.other_actions is None else str(found.other_actions)
-            numbers = (str(found.observations), f"{found.max_difference:.1e}", others)
+        if (agreement := result.agreement) is not None:
+            others = "-" if agreement.other_actions is None else str(agreement.other_actions)
+            numbers = (str(agreement.observations), f"{agreement.max_difference:.1e}", others)
         rows.append((result.name, ", ".join(result.files), result.size, *numbers))
         if result.note:
             console.note(result.note)

@@ -12,7 +12,7 @@ from esp_cli.commands.options import JsonOption
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.policies.manifest import Entry
+    from esp_cli.policies.bundled import Entry
 
 EPILOG = """Examples:\n
     esp policies\n
@@ -24,12 +24,12 @@ def policies(
     json: JsonOption = None,
 ) -> None:
     """List the bundled policies, with the score of each and the command that trains such a run."""
-    from esp_cli.policies.manifest import bundled_folder, read_bundled
+    from esp_cli.policies.bundled import bundled_folder, read_bundled
 
-    found = [entry for entry in read_bundled() if task in (None, entry.task)]
-    if not found:
+    entries = [entry for entry in read_bundled() if task in (None, entry.task)]
+    if not entries:
         raise UserError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
-    console.result(json, found, lambda: _print(found, commands=task is not None))
+    console.result(json, entries, lambda: _print(entries, commands=task is not None))
 
 
 def _print(entries: Sequence[Entry], commands: bool) -> None:

@@ -92,35 +92,21 @@ def render(
 
     The picture shows paths; of navigation also who covers which landmark when, of wildlife the last steps.
     """
-    from esp_cli.drawing.draw import check_target, draw
-    from esp_cli.policies.bundled import open_policy
-    from esp_cli.policies.loading import transfer
+    from esp_cli.drawing.draw import PICTURE, Request, draw
+    from esp_cli.policies.loading import open_policy
 
-    kind = check_target(out, episodes, fps)
+    request = Request(out, seed, episodes, view, size, speed, fps, not stochastic)
     register_named(task, [algo], network)
     changed = parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
-    opened = [transfer(open_policy(where, algo, prior), changed) for where in named]
+    opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
     with _progress() as watch:
-        drawing = draw(
-            opened[0],
-            out,
-            other=opened[1] if len(opened) > 1 else None,
-            names=(named[0].name, named[-1].name),
-            seed=seed,
-            episodes=episodes,
-            view=view,
-            size=size,
-            speed=speed,
-            fps=fps,
-            greedy=not stochastic,
-            watch=watch,
-        )
+        drawing = draw(request, opened, [where.name for where in named], watch)
     if drawing.note:
         console.note(drawing.note)
-    if kind == ".png":
+    if request.kind == PICTURE:
         console.note(f"episode of {drawing.steps} steps -> {out}")
     else:
         console.note(f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
@@ -129,12 +115,12 @@ def render(
 @contextmanager
 def _progress() -> Iterator[Callable[[int, int], None]]:
     """Yield what shows how many frames of how many are drawn, from the first one on."""
-    with ExitStack() as showing:
-        shown: list[console.TrainingProgress] = []
+    with ExitStack() as stack:
+        bars: list[console.TrainingProgress] = []
 
         def watch(done: int, total: int) -> None:
-            if not shown:
-                shown.append(showing.enter_context(console.TrainingProgress(total, description="draw")))
-            shown[0].update(done)
+            if not bars:
+                bars.append(stack.enter_context(console.TrainingProgress(total, description="draw")))
+            bars[0].update(done)
 
         yield watch

@@ -89,8 +89,8 @@ def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
     Raises:
         UserError: there is neither.
     """
-    from esp_cli.policies.bundled import open_policy
     from esp_cli.policies.initial import OwnCopy, is_start_of
+    from esp_cli.policies.loading import open_policy
 
     if path.is_dir() and (own := OwnCopy.find(path, config)) is not None:
         return own

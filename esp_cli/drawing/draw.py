@@ -5,16 +5,19 @@ from __future__ import annotations
 import errno
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
 from esp_cli.defaults import SLOWEST
-from esp_cli.drawing import films, rendering
 from esp_cli.drawing.figures import summary
-from esp_cli.drawing.recording import Episode, framed, record, record_both
+from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, write_gif, write_mp4, write_png
+from esp_cli.drawing.frames import frame
+from esp_cli.drawing.recording import HOLD_SECONDS, Episode, Moment, framed, record
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
@@ -22,7 +25,69 @@ from esp_envs.drawing import TopPainter
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter
 
+View = Literal["auto", "top", "3d"]
+
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
+FRAMES_PER_SECOND = 25
+"""Most frames per second of a film, unless more are asked for."""
+_SAMPLED_FRAMES = 8
+"""Frames that the palette of a GIF is made for."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """How a policy is drawn, and into what.
+
+    Attributes:
+        out: a .gif or .mp4 for a film, a .png for a picture of one episode.
+        seed: whose policy acts; by default the first.
+        episodes: of a film; by default as many as last about 8 s.
+        view: see `open_painter`.
+        size: of the longer side of a scene, pixels; caption, axes and legend come on top.
+        speed: times real time, 0.01 or more.
+        fps: most frames per second; by default 25.
+        greedy: whether the policy takes its most probable actions, or draws them.
+
+    Raises:
+        UserError: another ending, no such view, no episodes, no speed, or what a picture does not have.
+        OSError: the file is a folder.
+    """
+
+    out: Path
+    seed: int | None = None
+    episodes: int | None = None
+    view: View = "auto"
+    size: int = 480
+    speed: float = 1.0
+    fps: float | None = None
+    greedy: bool = True
+
+    def __post_init__(self) -> None:
+        if self.kind not in (*FILMS, PICTURE):
+            raise UserError(f"cannot write {self.out}: name a .gif, .mp4 or .png file")
+        if self.episodes is not None and self.episodes < 1:
+            raise UserError(f"episodes is {self.episodes}; a film has at least one")
+        if self.kind == PICTURE and self.episodes is not None and self.episodes > 1:
+            raise UserError(f"{self.out} holds one episode; leave out --episodes {self.episodes} or name a .gif file")
+        if self.kind == PICTURE and self.fps is not None:
+            raise UserError(f"{self.out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
+        if not SLOWEST <= self.speed < math.inf:  # false for what is no number
+            raise UserError(f"speed is {self.speed}; give times real time, {SLOWEST:g} or more")
+        if self.view not in get_args(View):
+            raise UserError(f"there is no view '{self.view}'; choose {', '.join(get_args(View))}")
+        if self.out.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(self.out))
+
+    @property
+    def kind(self) -> str:
+        """The ending of the file."""
+        return self.out.suffix.lower()
+
+    @property
+    def rate(self) -> float:
+        """Most frames per second."""
+        rate = self.fps or FRAMES_PER_SECOND
+        return min(rate, GIF_FRAMES_PER_SECOND) if self.kind == ".gif" else rate
 
 
 @dataclass(frozen=True)
@@ -42,128 +107,171 @@ class Drawing:
     note: str | None
 
 
-def check_target(out: Path, episodes: int | None, fps: float | None = None) -> str:
-    """Return the ending of a file that can be drawn into.
-
-    Raises:
-        UserError: another ending, or what a picture does not have: more episodes, or frames per second.
-        OSError: the file is a folder.
-    """
-    kind = out.suffix.lower()
-    if kind not in (*FILMS, PICTURE):
-        raise UserError(f"cannot write {out}: name a .gif, .mp4 or .png file")
-    if kind == PICTURE and episodes is not None and episodes > 1:
-        raise UserError(f"{out} holds one episode; leave out --episodes {episodes} or name a .gif file")
-    if kind == PICTURE and fps is not None:
-        raise UserError(f"{out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
-    if out.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(out))
-    return kind
-
-
 def draw(
-    trained: TrainedPolicy,
-    out: Path,
-    *,
-    other: TrainedPolicy | None = None,
-    names: tuple[str, str] = ("first", "second"),
-    seed: int | None = None,
-    episodes: int | None = None,
-    view: rendering.View = "auto",
-    size: int = 480,
-    speed: float = 1.0,
-    fps: float | None = None,
-    greedy: bool = True,
+    request: Request,
+    policies: Sequence[TrainedPolicy],
+    names: Sequence[str] = (),
     watch: Callable[[int, int], None] | None = None,
 ) -> Drawing:
     """Play episodes of one seed's policy and draw them off-screen, alone or beside those of another policy.
 
     Args:
-        trained: the policies of a run.
-        out: a .gif or .mp4 for a film, a .png for a picture of one episode.
-        other: a policy of the same task that plays the same episodes.
-        names: of the two policies, where there are two.
-        seed: whose policy acts; by default the first.
-        episodes: of a film; by default as many as last about 8 s.
-        view: see `open_painter`.
-        size: of the longer side of a scene, pixels; caption, axes and legend come on top.
-        speed: times real time, 0.01 or more.
-        fps: most frames per second; by default 25.
-        greedy: whether the policy takes its most probable actions, or draws them.
+        request: what is drawn, and into which file.
+        policies: one run, or two of the same task that play the same episodes.
+        names: of the policies, where there are two.
         watch: told how many frames of how many are drawn.
 
     Raises:
-        UserError: another ending, no such seed, a view that cannot be drawn, no episodes, no speed, or policies that
-            cannot be compared.
+        UserError: no such seed, a view that cannot be drawn, or policies that cannot be compared.
     """
-    kind = check_target(out, episodes)
-    if episodes is not None and episodes < 1:
-        raise UserError(f"episodes is {episodes}; a film has at least one")
-    if not SLOWEST <= speed < math.inf:  # false for what is no number
-        raise UserError(f"speed is {speed}; give times real time, {SLOWEST:g} or more")
-    count = 1 if kind == PICTURE else episodes
-    env = build_environment(trained.config, 1, "film")
-    recorded = _recorded(trained, other, env, seed, count, greedy)
-    called = [None] if other is None else list(names)
-    period = trained.spec.control_period_s
-    with rendering.open_painter(env, view, size) as painter:
-        if isinstance(painter, TopPainter):
-            episodes_of = len(recorded[0])
-            together = framed([episode for own in recorded for episode in own])
-            recorded = [together[k : k + episodes_of] for k in range(0, len(together), episodes_of)]
-        steps = sum(episode.steps for episode in recorded[0])
-        rate = fps or rendering.FRAMES_PER_SECOND
-        if kind == ".gif":
-            rate = min(rate, films.GIF_FRAMES_PER_SECOND)
-        taken = rendering.shots(recorded, rendering.stride(period, speed, rate), period, trained.spec.name, called)
-        if kind == PICTURE:
-            films.write_png(out, _picture(trained, recorded, called, painter, taken[-1], size))
-            return Drawing(out, 1, steps, painter.note)
-
-        def drawn(done: int) -> None:
-            if watch is not None:
-                watch(done, len(taken))
-
-        rendering.write_film(out, painter, taken, period / speed, drawn)
-        return Drawing(out, len(taken), steps, painter.note)
+    acting, spec = _acting(request, policies), policies[0].spec
+    titles = names if len(policies) > 1 else [None]
+    env = build_environment(acting[0].config, 1, "film")
+    with open_painter(env, request.view, request.size) as painter:
+        flat = isinstance(painter, TopPainter)
+        recorded = record(acting, 1 if request.kind == PICTURE else request.episodes, request.greedy)
+        recorded = framed(recorded) if flat else recorded
+        every = stride(spec.control_period_s, request.speed, request.rate)
+        taken = shots(recorded, every, spec.control_period_s, spec.name, titles)
+        if request.kind != PICTURE:
+            report = watch or (lambda *_: None)
+            step_s = spec.control_period_s / request.speed
+            write_film(request.out, painter, taken, step_s, lambda done: report(done, len(taken)))
+        elif flat:
+            shown = zip(recorded, titles, strict=True)
+            figures = [summary(own[0], title or spec.name, request.size, spec.control_period_s) for own, title in shown]
+            write_png(request.out, _beside(figures))
+        else:
+            write_png(request.out, taken[-1].draw(painter))
+    steps = sum(episode.steps for episode in recorded[0])
+    return Drawing(request.out, 1 if request.kind == PICTURE else len(taken), steps, painter.note)
 
 
-def _recorded(
-    trained: TrainedPolicy,
-    other: TrainedPolicy | None,
-    env: Environment,
-    seed: int | None,
-    count: int | None,
-    greedy: bool,
-) -> list[list[Episode]]:
-    """Play one policy, or both."""
-    own = trained.config.seeds[0] if seed is None else seed
-    if other is None:
-        return [record(trained, env, own, count, greedy)]
-    if other.config.task != trained.config.task:
-        raise UserError(
-            f"{trained.source} is a policy of {trained.config.task}, {other.source} of {other.config.task}; "
-            "compare two policies of one task"
-        )
-    theirs = other.config.seeds[0] if seed is None or len(other.config.seeds) == 1 else seed
-    return list(record_both(trained, other, (own, theirs), count, greedy))
+def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:
+    """Return the policies that act, of one seed each."""
+    first, *others = policies
+    for other in others:
+        if other.config.task != first.config.task:
+            raise UserError(
+                f"{first.source} is a policy of {first.config.task}, {other.source} of {other.config.task}; "
+                "compare two policies of one task"
+            )
+    seeds = [request.seed, *(None if len(other.config.seeds) == 1 else request.seed for other in others)]
+    return [policy.single_seed(seed) for policy, seed in zip(policies, seeds, strict=True)]
 
 
-def _picture(
-    trained: TrainedPolicy,
-    recorded: Sequence[Sequence[Episode]],
-    names: Sequence[str | None],
-    painter: Painter,
-    last: rendering.Shot,
-    size: int,
-) -> films.Frame:
-    """Draw an episode: from above a figure, in space its end with the trails."""
-    if not isinstance(painter, TopPainter):
-        return last.draw(painter)
-    figures = [
-        summary(own[0], name or trained.spec.name, size, trained.spec.control_period_s)
-        for own, name in zip(recorded, names, strict=True)
-    ]
-    height = max(map(len, figures))  # a strip is as high as its episode is long
+def _beside(figures: Sequence[Frame]) -> Frame:
+    """Put figures side by side; a strip is as high as its episode is long."""
+    height = max(map(len, figures))
     padded = [np.pad(f, ((0, height - len(f)), (0, 0), (0, 0)), constant_values=255) for f in figures]
     return np.concatenate(padded, axis=1)
+
+
+@contextmanager
+def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
+    """Open what draws this task.
+
+    Args:
+        env: the task.
+        view: "top" is the view from above, "3d" the task's own view in space, "auto" the latter where there is one and
+            the machine can draw it (else the painter's note says why not).
+        size: of the longer side, pixels.
+
+    Raises:
+        UserError: "3d", and the task has no view in space or the machine cannot draw it.
+    """
+    own = None if view == "top" else env.painter(size)
+    if own is None and view == "3d":
+        raise UserError(f"{env.spec.name} is a flat task without a view in space; leave out --view 3d")
+    with ExitStack() as stack:
+        painter: Painter = TopPainter(size)
+        if own is not None:
+            try:
+                painter = stack.enter_context(own)
+            except UserError as error:
+                if view == "3d":
+                    raise
+                painter = TopPainter(size, note=f"{error}; so the view is from above")
+        yield painter
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame to draw.
+
+    Attributes:
+        moments: what is side by side.
+        caption: what stands before the time.
+        time_s: since the episode began, s.
+        steps: how many it stays in view.
+    """
+
+    moments: tuple[Moment, ...]
+    caption: str
+    time_s: float
+    steps: int
+
+    def draw(self, painter: Painter) -> Frame:
+        """Draw the moments with caption, axes and legend."""
+        return frame(painter, self.moments, self.caption, self.time_s)
+
+
+def stride(control_period_s: float, speed: float, frames_per_second: float) -> int:
+    """Return the number of steps from one frame to the next: the smallest that keeps to the frame rate."""
+    return max(1, math.ceil(speed / (control_period_s * frames_per_second) - 1e-9))
+
+
+def shots(
+    recorded: Sequence[Sequence[Episode]],
+    every: int,
+    period_s: float,
+    title: str,
+    names: Sequence[str | None] = (None,),
+) -> list[Shot]:
+    """Choose every so-many-th scene of each episode, its first and its last among them.
+
+    Args:
+        recorded: episodes of each policy that is shown; the one that ends first waits for the other.
+        every: steps from one frame to the next.
+        period_s: of a step, s.
+        title: the task.
+        names: of the policies.
+    """
+    chosen = []
+    for k, together in enumerate(zip(*recorded, strict=True), start=1):
+        caption = f"{title}, episode {k} of {len(recorded[0])}"
+        end = max(episode.steps for episode in together)
+        shown = sorted({*range(0, end + 1, every), end})
+        for step, following in zip(shown, [*shown[1:], end + 1], strict=True):
+            moments = tuple(episode.moment(step, name) for episode, name in zip(together, names, strict=True))
+            chosen.append(Shot(moments, caption, step * period_s, following - step))
+    return chosen
+
+
+def write_film(
+    path: Path, painter: Painter, taken: Sequence[Shot], step_s: float, watch: Callable[[int], None]
+) -> None:
+    """Draw a film and write it as an MP4 where the file is named so, else as a GIF.
+
+    Args:
+        path: where to.
+        painter: draws the shots.
+        taken: the shots, in their order.
+        step_s: how long one step is in view, s; the last of an episode is in view for longer.
+        watch: told how many frames are drawn, after each.
+    """
+    ends = [*(after.time_s == 0 for after in taken[1:]), True]
+    seconds = [shot.steps * step_s + HOLD_SECONDS * end for shot, end in zip(taken, ends, strict=True)]
+    usual = taken[0].steps * step_s
+
+    def draw(repeated: bool) -> Iterator[Frame]:
+        for done, (shot, shown) in enumerate(zip(taken, seconds, strict=True), 1):
+            drawn = shot.draw(painter)
+            yield from [drawn] * (max(1, round(shown / usual)) if repeated else 1)
+            watch(done)
+
+    if path.suffix.lower() == ".mp4":
+        write_mp4(path, draw(repeated=True), 1 / usual)
+    else:
+        sample = [shot.draw(painter) for shot in taken[:: math.ceil(len(taken) / _SAMPLED_FRAMES)]]
+        write_gif(path, draw(repeated=False), seconds, sample)

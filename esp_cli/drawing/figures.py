@@ -22,7 +22,7 @@ from esp_envs.scene import Body, Scene
 
 _INCHES = 4.8
 _OPACITY = (0.15, 1.0)
-"""Of a path at its beginning and at its end."""
+"""Opacity of a path at its beginning and at its end."""
 _PANELS, _COLUMNS = 6, 3
 """Steps that a strip shows, and how many of them in a row."""
 _NUMBER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}

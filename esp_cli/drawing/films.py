@@ -27,7 +27,7 @@ GIF_FRAMES_PER_SECOND = 50
 """Players slow down a GIF that is faster."""
 _GIF_TICK_S = 0.01
 _COLORS = 255
-"""Of a GIF; one more marks what has not changed since the frame before."""
+"""Colours of a GIF; one more marks what has not changed since the frame before."""
 _EXACT_COLORS = 64
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from esp_cli.drawing.films import Frame
+from esp_cli.drawing.recording import Moment
 from esp_envs.drawing import TopPainter
 from esp_envs.scene import Painter, Scene
 
@@ -26,26 +27,6 @@ _GAP = 8
 
 
 @dataclass(frozen=True)
-class Moment:
-    """One world at one time: a scene after those that its trails come from, and what it is called.
-
-    Attributes:
-        scenes: of the episode until now.
-        total: return until now.
-        name: of the policy where two are compared, else None.
-    """
-
-    scenes: Sequence[Scene]
-    total: float
-    name: str | None = None
-
-    @property
-    def scene(self) -> Scene:
-        """What there is now."""
-        return self.scenes[-1]
-
-
-@dataclass(frozen=True)
 class Mark:
     """An entry of a legend; bodies of several colours have two of them in their mark."""
 
@@ -56,13 +37,13 @@ class Mark:
 
 def marks(scene: Scene) -> tuple[Mark, ...]:
     """Return what the bodies of a scene are called, in their order."""
-    found: dict[str, Mark] = {}
+    by_label: dict[str, Mark] = {}
     for body in scene.bodies:
         if body.label is not None:
-            known = found.get(body.label, Mark(body.label, body.shape, (body.color,)))
+            known = by_label.get(body.label, Mark(body.label, body.shape, (body.color,)))
             colors = tuple(dict.fromkeys((*known.colors, body.color)))[:2]
-            found[body.label] = Mark(body.label, known.shape, colors)
-    return tuple(found.values())
+            by_label[body.label] = Mark(body.label, known.shape, colors)
+    return tuple(by_label.values())
 
 
 def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float) -> Frame:

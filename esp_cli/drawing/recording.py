@@ -1,4 +1,4 @@
-"""What a policy does in some episodes, kept for drawing: scenes and returns."""
+"""Episodes of policies, kept for drawing: scenes and returns."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from esp_cli.policies.loading import TrainedPolicy, single_seed
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_cli.training.play import PolicyController
 from esp_cli.training.streams import generators
@@ -24,12 +24,32 @@ _MARGIN = 0.02
 
 
 @dataclass(frozen=True)
+class Moment:
+    """One world at one time: a scene after those that its trails come from.
+
+    Attributes:
+        scenes: of the episode until now.
+        total: return until now.
+        name: of the policy where two are compared, else None.
+    """
+
+    scenes: Sequence[Scene]
+    total: float
+    name: str | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene now."""
+        return self.scenes[-1]
+
+
+@dataclass(frozen=True)
 class Episode:
     """An episode to draw.
 
     Attributes:
         scenes: its start and every step, up to the one that ends it.
-        returns: what the agents got until each scene, their mean.
+        returns: mean return of the agents until each scene.
     """
 
     scenes: Sequence[Scene]
@@ -40,30 +60,39 @@ class Episode:
         """Steps from the start to the end."""
         return len(self.scenes) - 1
 
+    def moment(self, step: int, name: str | None = None) -> Moment:
+        """Return the episode until a step, or until its end where that comes first."""
+        step = min(step, self.steps)
+        return Moment(self.scenes[: step + 1], self.returns[step], name)
 
-def record(
-    trained: TrainedPolicy, env: Environment, seed: int, episodes: int | None = None, greedy: bool = True
-) -> list[Episode]:
-    """Play episodes of one seed's policy, one after the other.
+
+def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greedy: bool = True) -> list[list[Episode]]:
+    """Play the same episodes, one after the other, with each policy.
 
     Args:
-        trained: the policies of a run.
-        env: one world per seed of the run.
-        seed: which of the run's seeds acts.
+        policies: of one task and one seed each; the first one's seed decides how episodes begin.
         episodes: how many; by default as many as last about `FILM_SECONDS`, at least one.
         greedy: act greedily, or draw actions.
 
     Raises:
-        UserError: the run has no such seed.
+        UserError: episodes do not begin alike, since the policies' tasks have other settings.
     """
-    seeds = trained.config.seeds
-    if seed not in seeds:
-        raise UserError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-    noise = None if greedy else generators(seeds, "film", "noise")
-    controller = PolicyController(trained.policy, noise)
-    recorded: list[Episode] = []
-    while len(recorded) < episodes if episodes is not None else not _long_enough(recorded, env.spec.control_period_s):
-        recorded.append(_play(controller, env, (seeds.index(seed), 0)))
+    seeds, recorded = policies[0].config.seeds, list[list[Episode]]()
+    for trained in policies:
+        env = build_environment(trained.config.model_copy(update={"seeds": seeds}), 1, "film")
+        controller = PolicyController(trained.policy, None if greedy else generators(seeds, "film", "noise"))
+        own: list[Episode] = []
+        while len(own) < episodes if episodes is not None else not _long_enough(own, env.spec.control_period_s):
+            own.append(_play(controller, env))
+        recorded.append(own)
+        episodes = len(own)
+    for together in zip(*recorded, strict=True):
+        starts = [[body.position for body in episode.scenes[0].bodies] for episode in together]
+        if starts[0] != starts[-1]:
+            raise UserError(
+                f"the episodes of {policies[0].source} and {policies[-1].source} begin differently; "
+                "compare policies whose task has the same settings"
+            )
     return recorded
 
 
@@ -76,67 +105,34 @@ def _long_enough(recorded: Sequence[Episode], period_s: float) -> bool:
 
 
 @torch.no_grad()
-def _play(controller: PolicyController, env: Environment, world: tuple[int, int]) -> Episode:
+def _play(controller: PolicyController, env: Environment) -> Episode:
     observation = env.reset()
     controller.begin(env, observation)
-    scenes, returns = [env.scene(world)], [0.0]
+    scenes, returns = [env.scene()], [0.0]
     for _ in range(env.spec.horizon):
         step = env.step(controller.act(env, observation))
         observation = step.next
-        ended = bool(step.ended[world])
+        ended = bool(step.ended[0, 0])
         if ended and step.final is not None and env.has("set_state"):
             put_back(env, step.final)  # the world has reset itself; show how the episode ended
-        scenes.append(scenes[-1] if ended and not env.has("set_state") else env.scene(world))
-        returns.append(returns[-1] + float(step.reward.mean(-1)[world]))
+        scenes.append(scenes[-1] if ended and not env.has("set_state") else env.scene())
+        returns.append(returns[-1] + float(step.reward.mean(-1)[0, 0]))
         if ended:
             break
     return Episode(scenes, returns)
 
 
-def record_both(
-    first: TrainedPolicy, second: TrainedPolicy, seeds: tuple[int, int], episodes: int | None, greedy: bool
-) -> tuple[list[Episode], list[Episode]]:
-    """Play the same episodes with two policies.
-
-    Args:
-        first: of its episodes there are as many as `record` chooses.
-        second: of the same task.
-        seeds: whose policy acts, of each; the first one's decides how episodes begin.
-        episodes: see `record`.
-        greedy: act greedily, or draw actions.
-
-    Raises:
-        UserError: the tasks differ, or episodes do not begin alike.
-    """
-    recorded: list[list[Episode]] = []
-    for trained, seed in zip((first, second), seeds, strict=True):
-        alone = single_seed(trained, seed)
-        config = alone.config.model_copy(update={"seeds": (seeds[0],)})
-        env = build_environment(config, 1, "film")
-        count = len(recorded[0]) if recorded else episodes
-        recorded.append(record(replace(alone, config=config), env, seeds[0], count, greedy))
-    for one, other in zip(*recorded, strict=True):
-        places = [[body.position for body in episode.scenes[0].bodies] for episode in (one, other)]
-        if places[0] != places[1]:
-            raise UserError(
-                f"the episodes of {first.source} and {second.source} begin differently; "
-                "compare policies whose task has the same settings"
-            )
-    return recorded[0], recorded[1]
-
-
-def framed(recorded: Sequence[Episode]) -> list[Episode]:
+def framed(recorded: Sequence[Sequence[Episode]]) -> list[list[Episode]]:
     """Return the episodes in one window that everything stays in."""
-    scenes = [scene for episode in recorded for scene in episode.scenes]
+    scenes = [scene for episodes in recorded for episode in episodes for scene in episode.scenes]
     x_min, x_max, y_min, y_max = scenes[0].window
-    slack = _MARGIN * max(x_max - x_min, y_max - y_min)
     bodies = {(*body.position, body.radius) for scene in scenes for body in scene.bodies}
-    out = (
-        max(max(x_min - (x - r), x + r - x_max, y_min - (y - r), y + r - y_max, 0.0) for x, y, r in bodies)
-        if bodies
-        else 0.0
-    )
-    if out <= slack:
-        return list(recorded)
+    beyond = (max(x_min - (x - r), x + r - x_max, y_min - (y - r), y + r - y_max) for x, y, r in bodies)
+    out = max(beyond, default=0.0)
+    if out <= _MARGIN * max(x_max - x_min, y_max - y_min):
+        return [list(episodes) for episodes in recorded]
     window = (x_min - out, x_max + out, y_min - out, y_max + out)
-    return [replace(e, scenes=[replace(scene, window=window) for scene in e.scenes]) for e in recorded]
+    return [
+        [replace(episode, scenes=[replace(scene, window=window) for scene in episode.scenes]) for episode in episodes]
+        for episodes in recorded
+    ]

@@ -1,36 +1,61 @@
-"""A program as C99: float32, no allocation, no library but libm; weights in constant arrays, scratch in static ones."""
+"""A program as C99: float32, no allocation, no library but libm; weights in constant arrays, scratch in static ones.
+
+The functions of the layers are in runtime/layers.c, of which a source has those that it calls.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from esp_cli.export import c_parts, layers
-from esp_cli.export.c_act import act_function, seen, signature
-from esp_cli.export.c_parts import array, numbers
-from esp_cli.export.program import Program
+from esp_cli.export import layers
+from esp_cli.export.layers import Program
+from esp_cli.export.templates import RUNTIME, filled
 from esp_envs.errors import UserError
 
-FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
-"""The source compiles without warnings under these."""
+_LAYERS: dict[type[layers.Layer], str] = {
+    layers.Affine: "EACH affine(w{k}_0, w{k}_1, {0.inputs}, {0.outputs}, X, Y);",
+    layers.Activation: "EACH apply_{0.kind}(X, {0.width});",
+    layers.Norm: "EACH normalise(w{k}_0, w{k}_1, {0.outputs}, X);",
+    layers.Recurrent: (
+        "affine(w{k}_0, w{k}_1, {0.input.inputs}, 3 * {0.hidden}, X, into);\n"
+        "affine(w{k}_2, w{k}_3, {0.hidden}, 3 * {0.hidden}, memory, back);\n"
+        "recur({0.hidden}, into, back, memory);\n"
+        "memcpy(X, memory, sizeof(float) * {0.hidden});"
+    ),
+    layers.Slice: "EACH memmove(X, X + {0.begin}, sizeof(float) * ({0.end} - {0.begin}));",
+    layers.Convolution: (
+        "EACH convolve(w{k}_0, w{k}_1, {0.channels}, {0.rows}, {0.columns}, {0.side}, {0.stride}, {0.outputs}, X, Y);"
+    ),
+    layers.GlobalMaxPool: "EACH global_max_pool({0.channels}, {0.places}, X, Y);",
+    layers.MessageAggregation: (
+        "aggregate(observation + {0.begin}, {0.width}, {reach_squared}, {reach}, all_X, all_Y);"
+    ),
+}
+"""The lines of a layer: X is an agent's row of inputs, Y that of outputs; EACH repeats a line for every agent."""
 
 
 @dataclass(frozen=True)
-class CSource:
-    """The two files, and the memory that they need on a microcontroller.
+class Cost:
+    """The memory that a program in C needs on a microcontroller.
 
     Attributes:
         flash_bytes: of the weights; the code comes on top (about 1 kB without libm).
         ram_bytes: of the scratch and of one agent's memory; the stack needs some 100 more.
     """
 
-    header: str
-    source: str
     flash_bytes: int
     ram_bytes: int
 
 
-def c_source(program: Program, comment: str) -> CSource:
+def cost(program: Program) -> Cost:
+    """Return what a program in C needs."""
+    scratch = 2 * program.team * _row_width(program) + 6 * program.hidden
+    return Cost(len(program.weights), 4 * (scratch + program.memory_width))
+
+
+def c_source(program: Program, comment: str) -> dict[str, bytes]:
     """Write a program as a header and a source.
 
     Args:
@@ -44,13 +69,68 @@ def c_source(program: Program, comment: str) -> CSource:
         raise UserError(
             "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
         )
-    scratch = 2 * program.team * _row_width(program) + 6 * program.hidden
-    return CSource(
-        header=_header(program, comment),
-        source=_source(program),
-        flash_bytes=len(program.weights),
-        ram_bytes=4 * (scratch + program.memory_width),
+    body = _body(program)
+    variables = [name for name in ("i", "k", "best") if re.search(rf"\b{name} = ", body)]
+    values = {
+        **_shape(program),
+        "comment": "\n".join(f" * {line}".rstrip() for line in _plain(comment).splitlines()),
+        "act": _signature(program),
+        "outputs": f"const float *esp_policy_outputs({'int agent' if program.team > 1 else 'void'})",
+        "arrays": [
+            (f"w{k}_{i}", array.size, numbers(array.ravel().tolist()))
+            for k, layer in enumerate(program.layers)
+            for i, array in enumerate(layer.arrays)
+        ],
+        "row": _row_width(program),
+        "functions": "\n".join(_functions(body)),
+        "variables": ", ".join(variables),
+        "body": body,
+    }
+    return {name: filled(name, **values) for name in ("policy.h", "policy.c")}
+
+
+def example_source(program: Program, observation: list[float], action: list[float], allowed: list[bool]) -> bytes:
+    """Return a program that acts on the worked example and says whether the action is the right one.
+
+    Args:
+        program: the policy.
+        observation: of the example; of a team all of them.
+        action: that it should take.
+        allowed: actions of the example; empty where there are no masks.
+    """
+    choose = program.head == "choose"
+    return filled(
+        "policy_example.c",
+        **_shape(program),
+        kind="int" if choose else "float",
+        count=len(action),
+        observation=numbers(observation),
+        expected=", ".join(str(int(x)) if choose else literal(x) for x in action),
+        allowed=", ".join(str(int(flag)) for flag in allowed),
+        given=", ".join(["observation", *["allowed"] * program.masked, *["memory"] * (program.memory_width > 0)]),
     )
+
+
+def _shape(program: Program) -> dict[str, object]:
+    names = ("num_inputs", "num_outputs", "hidden", "memory_width", "head", "team", "masked")
+    return {name: getattr(program, name) for name in names}
+
+
+def _plain(comment: str) -> str:
+    """Return text that ends no comment in C."""
+    return comment.replace("*/", "* /").replace("/*", "/ *")
+
+
+def literal(value: float) -> str:
+    """Return a float32 in full: nine digits tell every one apart."""
+    text = f"{value:.9g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+
+
+def numbers(values: Iterable[float]) -> str:
+    """Return the items of an array, eight a line."""
+    literals = [literal(value) for value in values]
+    return "".join(f"    {', '.join(literals[k : k + 8])},\n" for k in range(0, len(literals), 8))
 
 
 def _row_width(program: Program) -> int:
@@ -58,146 +138,83 @@ def _row_width(program: Program) -> int:
     widths = [program.num_inputs + program.previous, program.num_outputs, program.hidden]
     for layer in program.layers:
         if isinstance(layer, layers.Affine):
-            widths += layer.weight.shape
+            widths += [layer.inputs, layer.outputs]
         elif isinstance(layer, layers.Convolution):
             widths.append(layer.width)
     return max(widths)
 
 
-def example_source(
-    program: Program, observation: Iterable[float], action: Iterable[float], allowed: Iterable[int] = ()
-) -> str:
-    """Return a program that acts on the worked example and says whether the action is the right one."""
-    choose, remembers, team = program.head == "choose", program.memory_width > 0, program.team > 1
-    memory = "    float memory[ESP_POLICY_MEMORY];\n" if remembers else ""
-    reset = "    esp_policy_reset(memory);\n" if remembers else ""
-    masked = ", ".join(str(int(flag)) for flag in allowed)
-    mask = f"    const unsigned char allowed[] = {{{masked}}};\n" if program.masked else ""
-    given = ", ".join(["observation", *["allowed"] * program.masked, *["memory"] * remembers])
-    head = f"""/* Acts on the worked example: cc policy_example.c policy.c -lm && ./a.out */
-#include "policy.h"
-
-#include <math.h>
-#include <stdio.h>
-
-int main(void)
-{{
-    const float observation[{seen(program)}] = {{
-{numbers(observation)}    }};
-{mask}"""
-    if team:
-        indices = ", ".join(str(int(index)) for index in action)
-        return f"""{head}    const int expected[ESP_POLICY_AGENTS] = {{{indices}}};
-    int action[ESP_POLICY_AGENTS];
-    int i, wrong = 0;
-
-    esp_policy_act({given}, action);
-    for (i = 0; i < ESP_POLICY_AGENTS; i++) {{
-        printf("action %d, expected %d\\n", action[i], expected[i]);
-        wrong |= action[i] != expected[i];
-    }}
-    return wrong;
-}}
-"""
-    if choose:
-        (index,) = action
-        return f"""{head}    const int expected = {int(index)};
-{memory}    int action;
-
-{reset}    action = esp_policy_act({given});
-    printf("action %d, expected %d\\n", action, expected);
-    return action == expected ? 0 : 1;
-}}
-"""
-    return f"""{head}    const float expected[ESP_POLICY_ACTION] = {{
-{numbers(action)}    }};
-{memory}    float action[ESP_POLICY_ACTION];
-    int k, wrong = 0;
-
-{reset}    esp_policy_act({given}, action);
-    for (k = 0; k < ESP_POLICY_ACTION; k++) {{
-        printf("action %.6f, expected %.6f\\n", (double)action[k], (double)expected[k]);
-        wrong |= fabsf(action[k] - expected[k]) > 1e-4f;
-    }}
-    return wrong;
-}}
-"""
+def _signature(program: Program) -> str:
+    """Return the declaration of the function that acts, without a semicolon."""
+    agents = "ESP_POLICY_AGENTS * " if program.team > 1 else ""
+    parameters = [f"const float observation[{agents}ESP_POLICY_OBSERVATION]"]
+    parameters += [f"const unsigned char allowed[{agents}ESP_POLICY_ACTION]"] if program.masked else []
+    parameters += ["float memory[ESP_POLICY_MEMORY]"] if program.memory_width else []
+    parameters += ["float action[ESP_POLICY_ACTION]"] if program.head == "squash" else []
+    parameters += ["int action[ESP_POLICY_AGENTS]"] if program.team > 1 else []
+    returned = "int" if program.head == "choose" and program.team == 1 else "void"
+    return f"{returned} esp_policy_act({', '.join(parameters)})"
 
 
-def _header(program: Program, comment: str) -> str:
-    told = "\n".join(f" * {line}".rstrip() for line in comment.replace("*/", "* /").replace("/*", "/ *").splitlines())
+def _functions(code: str) -> list[str]:
+    """Return the functions of layers.c that a piece of code calls, and those that they call."""
+    called: list[str] = []
+    for function in reversed((RUNTIME / "layers.c").read_text().split("}\n\n")):
+        name = re.findall(r"(\w+)\(", function)[0]
+        if any(re.search(rf"\b{name}\(", text) for text in (code, *called)):
+            called.insert(0, function.rstrip().removesuffix("\n}") + "\n}\n")
+    return called
+
+
+def _body(program: Program) -> str:
+    """Write the statements of the function that acts."""
+    lines = ["EACH memcpy(X, observation + i * ESP_POLICY_OBSERVATION, sizeof(float) * ESP_POLICY_OBSERVATION);"]
+    if program.previous:
+        copied = f"memory + {program.hidden}, sizeof(float) * {program.previous}"
+        lines.append(f"memcpy(X + ESP_POLICY_OBSERVATION, {copied});")
+    x, y = "row_a", "row_b"
+    lines = [_placed(line, x, y, program.team) for line in lines]
+    for k, layer in enumerate(program.layers):
+        ranges = isinstance(layer, layers.MessageAggregation)
+        reach = {name: literal(getattr(layer, name)) for name in ("reach", "reach_squared")} if ranges else {}
+        text = _LAYERS[type(layer)].format(layer, k=k, **reach)
+        lines += [_placed(line, x, y, program.team) for line in text.splitlines()]
+        if "Y" in text:
+            x, y = y, x
+    lines.append(f"last = {x};")
+    head = _choose(program) if program.head == "choose" else _squash(program)
+    return "\n".join(f"    {line}" for line in [*lines, *(_placed(line, x, y, program.team) for line in head)])
+
+
+def _placed(line: str, x: str, y: str, team: int) -> str:
+    """Put the rows that hold inputs and outputs into a line, and repeat it for every agent of a team."""
+    repeated = line.startswith("EACH ") and team > 1
+    line = line.removeprefix("EACH ")
+    for name, row in {"X": x, "Y": y}.items():
+        line = re.sub(rf"\ball_{name}\b", row, line)
+        line = re.sub(rf"\b{name}\b", f"{row} + i * ROW" if repeated else row, line)
+    if repeated:
+        return f"for (i = 0; i < AGENTS; i++) {line}"
+    return re.sub(r" \+ i \* \w+", "", line)
+
+
+def _choose(program: Program) -> list[str]:
+    call = "choose_allowed(X, allowed + i * ESP_POLICY_ACTION)" if program.masked else "choose(X)"
     if program.team > 1:
-        returns = "Writes the index of each agent's best action; the observations stand side by side."
-    elif program.head == "choose":
-        returns = "Returns the index of the best action."
-    else:
-        returns = "Writes the action, within its bounds."
-    if program.masked:
-        returns += " `allowed` is 1 for each action that may be taken, else 0."
-    agents = f"#define ESP_POLICY_AGENTS {program.team}\n" if program.team > 1 else ""
-    memory = (
-        f"#define ESP_POLICY_MEMORY {program.memory_width}\n\n"
-        "/* Begins an episode of one agent, whose memory the caller keeps. */\n"
-        "void esp_policy_reset(float memory[ESP_POLICY_MEMORY]);\n"
-        if program.memory_width
-        else ""
-    )
-    return f"""/*
-{told}
- */
-#ifndef ESP_POLICY_H
-#define ESP_POLICY_H
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-{agents}#define ESP_POLICY_OBSERVATION {program.num_inputs}
-#define ESP_POLICY_ACTION {program.num_outputs}
-{memory}
-/* {returns} Not reentrant: the scratch is static. */
-{signature(program)};
-
-/* What the last layer said in the last call: logits, values or the action before its bounds. */
-{_outputs(program)};
-
-#ifdef __cplusplus
-}}
-#endif
-
-#endif
-"""
+        return [f"EACH action[i] = {call};"]
+    lines = [f"best = {call};"]
+    if program.previous:
+        lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = k == best ? 1.0f : 0.0f;")
+    return [*lines, "return best;"]
 
 
-def _outputs(program: Program) -> str:
-    return f"const float *esp_policy_outputs({'int agent' if program.team > 1 else 'void'})"
-
-
-def _source(program: Program) -> str:
-    kinds = {type(layer) for layer in program.layers}
-    names = {layer.name for layer in program.layers if isinstance(layer, layers.Activation)}
-    parts = ['#include "policy.h"\n\n#include <math.h>\n#include <string.h>\n']
-    parts += [array(f"w{k}_{i}", a) for k, layer in enumerate(program.layers) for i, a in enumerate(layer.arrays)]
-    row = str(_row_width(program))
-    if program.team > 1:
-        parts.append(f"#define ROW {row}")
-        row = "ESP_POLICY_AGENTS * ROW"
-    parts.append(f"static float row_a[{row}], row_b[{row}];")
-    if program.hidden:
-        parts.append(f"static float into[{3 * program.hidden}], back[{3 * program.hidden}];")
-    parts.append("static const float *last = row_a;\n")
-    parts.append(c_parts.AFFINE)
-    parts += [c_parts.ACTIVATIONS[name] for name in sorted(names)]
-    parts += [code for kind, code in c_parts.LAYERS.items() if kind in kinds]
-    parts += [c_parts.aggregate(layer) for layer in program.layers if isinstance(layer, layers.MessageAggregation)][:1]
-    parts += [c_parts.RECUR.replace("HIDDEN", str(program.hidden))] if program.hidden else []
-    choose = c_parts.CHOOSE_ALLOWED if program.masked else c_parts.CHOOSE
-    parts += [choose] if program.head == "choose" else []
-    parts.append(act_function(program))
-    parts.append(f"{_outputs(program)}\n{{\n    return last{' + agent * ROW' if program.team > 1 else ''};\n}}")
-    if program.memory_width:
-        parts.append(
-            "void esp_policy_reset(float memory[ESP_POLICY_MEMORY])\n"
-            "{\n    int k;\n    for (k = 0; k < ESP_POLICY_MEMORY; k++) memory[k] = 0.0f;\n}"
-        )
-    return "\n".join(parts) + "\n"
+def _squash(program: Program) -> list[str]:
+    lines, start = [], 0
+    for width in program.groups:
+        squares = " + ".join(f"X[{i}] * X[{i}]" for i in range(start, start + width))
+        lines.append(f"length = sqrtf({squares} + {literal(layers.SQUASH_EPSILON)});")
+        lines.append(f"for (k = {start}; k < {start + width}; k++) action[k] = X[k] * (tanhf(length) / length);")
+        start += width
+    if program.previous:
+        lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = action[k];")
+    return lines

@@ -1,4 +1,4 @@
-"""What surrounds an exported policy on an e-puck: from poses to observations, checked against the task; controllers."""
+"""Whether what builds an e-puck's observation from poses agrees with the task, in thousands of states."""
 
 from __future__ import annotations
 
@@ -11,25 +11,22 @@ from typing import Any
 import numpy as np
 import torch
 
-from esp_cli.export.check import compiled
+from esp_cli.export.c_check import compiled
 from esp_cli.export.layers import Floats
-from esp_cli.export.ros2_package import ROS2_PACKAGE, package_files
 from esp_cli.export.runtime.esp_epuck import Pilot
-from esp_cli.export.webots_world import world_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
 
-RUNTIME = Path(__file__).parent / "runtime"
 STATES = 10_000
-"""On which the observations built from poses are compared with the task's."""
+"""States on which the observations built from poses are compared with the task\'s."""
 TOLERANCE = 1e-5
 """Largest difference of an observation's number; float32 in metres gives 1e-6."""
 Observer = Callable[[Floats, Floats, Floats], Floats]
 """(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
 _WORLDS = 100
 _JITTER_M = 0.001
-"""Of positions that are met in the task: in a perfect square two robots are equally near."""
+"""Noise on the task\'s positions: in a perfect square two robots are equally near."""
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}
 """The noise of a robot's sensors in training, which poses do not show."""
 _UNSEEN = ("heading_offset_rad", "blind_sector_rad")
@@ -44,13 +41,13 @@ class Scenes:
         poses: [W, N, 3] x, y, heading.
         goals: [W, N, 2].
         pillars: [W, M, 2].
-        seen: [W, N, D] observations of the task, without its noise.
+        observations: [W, N, D] observations of the task, without its noise.
     """
 
     poses: Floats
     goals: Floats
     pillars: Floats
-    seen: Floats
+    observations: Floats
 
 
 def builds_observations(settings: Mapping[str, object]) -> bool:
@@ -59,23 +56,23 @@ def builds_observations(settings: Mapping[str, object]) -> bool:
 
 
 @torch.no_grad()
-def take_scenes(alone: TrainedPolicy, count: int = STATES) -> Scenes:
+def take_scenes(trained: TrainedPolicy, count: int = STATES) -> Scenes:
     """Put the task into states: one half that the policy meets, one half drawn anywhere in the arena."""
     worlds = min(-(-count // 2), _WORLDS)
-    exact = alone.config.model_copy(update={"task_settings": dict(alone.config.task_settings) | _EXACT})
-    played, probe = build_environment(alone.config, worlds, "export"), build_environment(exact, worlds, "shape")
+    exact = trained.config.model_copy(update={"task_settings": dict(trained.config.task_settings) | _EXACT})
+    played, probe = build_environment(trained.config, worlds, "export"), build_environment(exact, worlds, "shape")
     observation, rng, parts = played.reset(), np.random.default_rng(0), []
-    memory = alone.policy.initial_memory(worlds, observation.obs)
+    memory = trained.policy.initial_memory(worlds, observation.obs)
     for _ in range(-(-count // (2 * worlds))):
-        parts += [_probe(probe, observation.state[0].numpy(), rng, met) for met in (True, False)]
+        parts += [_probe(probe, observation.state[0].numpy(), rng, near) for near in (True, False)]
         for _ in range(5):
-            action, memory = alone.policy.act(observation.obs, memory)
+            action, memory = trained.policy.act(observation.obs, memory)
             observation = played.step(action).next
     stacked = (np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True))
     return Scenes(*stacked)
 
 
-def _probe(env: Environment, state: Floats, rng: np.random.Generator, met: bool) -> tuple[Floats, ...]:
+def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool) -> tuple[Floats, ...]:
     """Return poses, goals, pillars and observations of states near the given ones, or drawn anywhere."""
     where, rows = env.spec.state.slices(), state.copy()
     reach = float(str(env.spec.settings["arena_m"])) / 2
@@ -83,19 +80,19 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, met: bool)
         if name in where:
             shape = rows[:, where[name]].shape
             rows[:, where[name]] = (
-                rows[:, where[name]] + rng.normal(0, _JITTER_M, shape) if met else rng.uniform(-reach, reach, shape)
+                rows[:, where[name]] + rng.normal(0, _JITTER_M, shape) if near else rng.uniform(-reach, reach, shape)
             )
-    if not met:
+    if not near:
         turn = rng.uniform(-np.pi, np.pi, (len(rows), env.spec.num_agents))
         rows[:, where["heading"]] = np.stack([np.cos(turn), np.sin(turn)], -1).reshape(len(rows), -1)
-    seen = env.set_state(torch.from_numpy(rows)[None]).obs[0].numpy()
+    obs = env.set_state(torch.from_numpy(rows)[None]).obs[0].numpy()
 
     def items(name: str) -> Floats:
         return rows[:, where[name]].reshape(len(rows), -1, 2) if name in where else np.zeros((len(rows), 0, 2), "f4")
 
     x, y = np.moveaxis(items("heading"), -1, 0)
     poses = np.concatenate([items("position"), np.arctan2(y, x)[..., None]], -1)
-    return poses, items("goals"), items("obstacles"), seen
+    return poses, items("goals"), items("obstacles"), obs
 
 
 def compare_scenes(scenes: Scenes, observe: Observer) -> float:
@@ -109,7 +106,7 @@ def compare_scenes(scenes: Scenes, observe: Observer) -> float:
         RuntimeError: they do not agree, which is a bug.
     """
     built = [observe(*state) for state in zip(scenes.poses, scenes.goals, scenes.pillars, strict=True)]
-    gap = float(np.abs(np.stack(built) - scenes.seen).max())
+    gap = float(np.abs(np.stack(built) - scenes.observations).max())
     if not gap <= TOLERANCE:
         raise RuntimeError(f"an observation built from poses differs from the task's by {gap:g}; this is a bug")
     return gap
@@ -129,57 +126,16 @@ def c_observer(folder: Path, width: int) -> Observer:
     code = compiled(folder / "esp_epuck.c", folder / "policy.c")
 
     def observe(poses: Floats, goals: Floats, pillars: Floats) -> Floats:
-        seen = np.empty((len(poses), width), np.float32)
+        obs = np.empty((len(poses), width), np.float32)
         places, standing = _pointer(poses), _pointer(pillars)
         for own, goal in enumerate(goals):
-            given = (places, len(poses), own, _pointer(goal), standing, len(pillars), _pointer(seen[own]))
-            if not code.esp_epuck_observe(*given):
+            arguments = (places, len(poses), own, _pointer(goal), standing, len(pillars), _pointer(obs[own]))
+            if not code.esp_epuck_observe(*arguments):
                 raise RuntimeError("the exported C refuses a state of the task; this is a bug")
-        return seen
+        return obs
 
     return observe
 
 
 def _pointer(array: Floats) -> Any:
     return np.ascontiguousarray(array, np.float32).ctypes.data_as(ctypes.POINTER(ctypes.c_float))
-
-
-def controller_files(kind: str, policy: Mapping[str, bytes], settings: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return a project of Webots or a package of ROS 2 around a policy in Python.
-
-    Args:
-        kind: "webots" or "ros2".
-        policy: the files of the policy.
-        settings: of the task, as an export describes them.
-    """
-    if kind == "webots":
-        folder, driver, beside = "controllers/esp_epuck_webots", "esp_epuck_webots.py", {}
-        beside["worlds/formation.wbt"] = world_file(settings)
-    else:
-        folder, driver, beside = ROS2_PACKAGE, "esp_epuck_ros2.py", package_files(settings)
-    # Read, not imported: the drivers import what only a robot's machine has.
-    modules = {**policy, **{name: (RUNTIME / name).read_bytes() for name in ("esp_epuck.py", driver)}}
-    return {f"{folder}/{name}": content for name, content in modules.items()} | beside
-
-
-def told(description: Mapping[str, Any]) -> str:
-    """Return the README's section on how poses become an observation."""
-    settings, robot = description["task"]["settings"], description["robot"]
-    body, pillar = robot["body_radius_m"], settings["obstacle_radius_m"]
-    seen = min(settings["neighbours"], settings["num_agents"] - 1)
-    lines = ["## From poses to an observation", ""]
-    lines += ["`heading` is the cosine and sine of the robot's own heading, `goal` its goal minus its position."]
-    ways = {"robots": f"the {seen} nearest other robot(s), nearest first", "obstacle": "the nearest pillar"}
-    names = [field["field"] for field in description["observation"]]
-    if (unit := settings["goal_sight_m"]) is not None:
-        lines.append(f"The goal is seen in units of {unit:g} m; a vector longer than one is cut to one.")
-    lines += [f"`{name}` is {way}." for name, way in ways.items() if name in names]
-    if settings["sight"] == "nearness":
-        lines.append(
-            f"A body is seen as *nearness*: its direction, of length exp(-gap / {robot['fading_m']:g} m). The gap is "
-            f"the distance of the centres less both radii (robot {body:g} m, pillar {pillar:g} m), at least 0."
-        )
-    else:
-        lines.append("A body is seen by the offset of its centre, in metres.")
-    lines += ["", f"`esp_epuck.py` and `esp_epuck.c` build it; they agree with the task on {STATES} states.", ""]
-    return "\n".join(lines)

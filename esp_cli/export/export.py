@@ -1,4 +1,4 @@
-"""Exports of a policy: written, checked against the policy itself, and only then put where they are wanted."""
+"""Exports of a policy: written, checked against the policy itself, and only then put into the user's folder."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from esp_cli.export import check, epuck
-from esp_cli.export.c_source import CSource, c_source
-from esp_cli.export.card import describe, readme
-from esp_cli.export.check import Agreement, take_sample
+from esp_cli.defaults import __version__
+from esp_cli.export import c_check, epuck, epuck_files
+from esp_cli.export.c_source import Cost, cost
+from esp_cli.export.card import describe, shortly, spaces, title
+from esp_cli.export.check import Agreement, compare, take_sample
 from esp_cli.export.formats import FORMATS, Files, Job
-from esp_cli.export.program import Program
+from esp_cli.export.templates import filled
 from esp_cli.export.translate import program_of
 from esp_cli.files.documents import parse_object
 from esp_cli.files.opening import read_regular
@@ -22,7 +23,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
 
 STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
-"""Of the e-puck2's microcontroller, an STM32F407."""
+"""Memory of an STM32F407, the microcontroller of the e-puck2."""
 
 DESCRIPTION = "policy.json"
 MAX_DESCRIPTION_BYTES = 1 << 26
@@ -63,14 +64,14 @@ class Exported:
     formats: tuple[Export, ...]
     parameters: int
     flops: int
-    c: CSource | None
+    c: Cost | None
 
 
-def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
+def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each.
 
     Args:
-        alone: one seed's policy.
+        trained: one seed's policy.
         formats: of `FORMATS`.
         folder: where to; made where it is missing.
         force: replace files of an earlier export.
@@ -82,31 +83,33 @@ def export(alone: TrainedPolicy, formats: Sequence[str], folder: Path, force: bo
     formats = tuple(dict.fromkeys(formats))
     if force:
         _refuse_mixture(formats, folder)
-    program = replace(program_of(alone.policy), masked=alone.spec.masks)
-    sample = take_sample(alone, program)
-    description = describe(alone, program, sample)
+    job = _job(trained, formats)
+    files = {name: FORMATS[name].write(job) for name in formats}
+    results = tuple(_checked(name, own, job) for name, own in files.items())
+    written = {name: content for own in files.values() for name, content in own.items()}
+    written[DESCRIPTION] = (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode()
+    written["README.md"] = _readme(job, results)
+    _write(written, folder, force)
+    program = job.program
+    return Exported(results, program.num_parameters, program.flops, cost(program) if "c" in formats else None)
+
+
+def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
+    program = replace(program_of(trained.policy), masked=trained.spec.masks)
+    sample = take_sample(trained, program)
+    description = describe(trained, program, sample)
     drives = any(FORMATS[name].observer for name in formats) and not program.memory_width
-    robotic = drives and "robot" in description and epuck.builds_observations(alone.spec.settings)
-    job = Job(alone, program, sample, description, epuck.take_scenes(alone) if robotic else None)
-    written = {name: FORMATS[name].write(job) for name in formats}
-    c = c_source(program, "") if "c" in formats else None
-    results = tuple(_checked(name, files, job) for name, files in written.items())
-    sections = [_section(result, job, c) for result in results] + ([epuck.told(description)] if robotic else [])
-    beside = {
-        DESCRIPTION: (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode(),
-        "README.md": readme(alone, job.description, sections).encode(),
-    }
-    _write({name: content for files in written.values() for name, content in files.items()} | beside, folder, force)
-    return Exported(results, program.num_parameters, program.flops, c)
+    robotic = drives and "robot" in description and epuck.builds_observations(trained.spec.settings)
+    return Job(trained, program, sample, description, epuck.take_scenes(trained) if robotic else None)
 
 
 def _refuse_mixture(formats: Sequence[str], folder: Path) -> None:
     """Refuse to leave files of an earlier export beside those of another policy."""
     try:
-        there = parse_object(read_regular(folder / DESCRIPTION, MAX_DESCRIPTION_BYTES) or b"", "a description")
-    except (OSError, ValueError):
+        description = parse_object(read_regular(folder / DESCRIPTION, MAX_DESCRIPTION_BYTES) or b"", "a description")
+    except (OSError, UserError):
         return
-    known = there.get("formats")
+    known = description.get("formats")
     left = [name for name in FORMATS if isinstance(known, list) and name in known and name not in formats]
     if left:
         again = " ".join(f"-f {name}" for name in left)
@@ -131,14 +134,14 @@ def _write(files: Files, folder: Path, force: bool) -> None:
 def _checked(name: str, files: Files, job: Job) -> Export:
     """Run a format's files in a folder of their own beside the policy."""
     size, form = sum(map(len, files.values())), FORMATS[name]
-    if name == "c" and check.compiler() is None:
+    if name == "c" and c_check.compiler() is None:
         return Export(name, tuple(files), size, None, "there is no C compiler cc here, so the source was not run")
     with TemporaryDirectory(prefix="esp-export-") as scratch:
         folder = Path(scratch)
         for file, content in files.items():
             (folder / Path(file).name).write_bytes(content)
-        agreement = check.compare(job.sample, form.run(folder, job.program))
-        if name == "c" and not check.example_runs(folder):
+        agreement = compare(job.sample, form.run(folder, job.program))
+        if name == "c" and not c_check.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
         seen = None
         if job.scenes is not None and form.observer is not None:
@@ -146,37 +149,26 @@ def _checked(name: str, files: Files, job: Job) -> Export:
     return Export(name, tuple(files), size, agreement, seen=seen)
 
 
-def _section(result: Export, job: Job, c: CSource | None) -> str:
-    """Return the README's section on a format."""
-    remembers = job.program.memory_width > 0
-    mask, meaning = FORMATS[result.name].mask if job.program.masked else ("", "")
-    use = FORMATS[result.name].use[remembers].format(mask=mask) + meaning
-    told = [f"## {', '.join(f'`{file}`' for file in result.files)}", "", use, ""]
-    if result.agreement is None:
-        told.append(f"Not compared with the policy: {result.note}.")
-    else:
-        agreement = result.agreement
-        told.append(
-            f"Compared with the policy on {agreement.observations} observations: largest difference "
-            f"{agreement.max_difference:.1e}"
-            + (f", {agreement.other_actions} other choices (ties)." if job.program.head == "choose" else ".")
-        )
-    if result.seen is not None:
-        told.append(
-            f"Observations built from poses were compared with the task's in {epuck.STATES} states: largest difference "
-            f"{result.seen:.1e}."
-        )
-    if result.name == "c" and c is not None:
-        told += ["", *cost_lines(c, job.program)]
-    return "\n".join([*told, ""])
-
-
-def cost_lines(c: CSource, program: Program) -> list[str]:
-    """Return what the C source takes of a microcontroller, as a table."""
-    return [
-        "| of a microcontroller | | e-puck2 (STM32F407) |",
-        "|---|---|---|",
-        f"| flash: weights, and about 1 kB of code | {c.flash_bytes} bytes | {STM32F4_FLASH_BYTES} |",
-        f"| RAM: scratch and one agent's memory | {c.ram_bytes} bytes | {STM32F4_RAM_BYTES} |",
-        f"| operations an action | {program.flops} | |",
-    ]
+def _readme(job: Job, results: Sequence[Export]) -> bytes:
+    description, spec = job.description, job.trained.spec
+    robotic = job.scenes is not None
+    return filled(
+        "README.md",
+        title=title(job.trained),
+        convention=spec.convention,
+        version=__version__,
+        spaces="\n".join(spaces(spec, job.program)),
+        example=[(k, shortly(v)) for k, v in description["example"].items() if not k.startswith("memory")],
+        results=results,
+        remembers=job.program.memory_width > 0,
+        masked=job.program.masked,
+        c=cost(job.program),
+        flash_bytes=STM32F4_FLASH_BYTES,
+        ram_bytes=STM32F4_RAM_BYTES,
+        flops=job.program.flops,
+        states=epuck.STATES,
+        robot=description["robot"] if robotic else None,
+        settings=spec.settings,
+        fields=[field["field"] for field in description["observation"]],
+        seen_robots=epuck_files.seen_robots(spec.settings) if robotic else 0,
+    )

@@ -1,4 +1,15 @@
-"""The layers of an exported policy as plain arrays; `program` says how they follow each other."""
+"""A policy as plain arrays: the layers, memory and head of one seed's greedy policy, which every export is made from.
+
+A program maps a row of observation, and of memory where it has one, to outputs, an action and the next memory:
+
+    x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
+    x = layer(x) for each layer
+    action = argmax(x)                     head `choose`, among the allowed actions where the task has masks; or
+    action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
+
+The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
+agents exchange messages, the rows of a world's agents are adjacent.
+"""
 
 from __future__ import annotations
 
@@ -12,35 +23,63 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 NORM_EPSILON = 1e-5
-"""Added to the variance by layer normalisation (torch's default)."""
+"""Layer normalisation adds this to the variance (torch's default)."""
 SQUASH_EPSILON = 1e-18
-"""Added to the squared length of what is squashed (`esp_cli.networks.heads.squash`)."""
+"""Squashing adds this to the squared length (`esp_cli.networks.heads.squash`)."""
+
+
+class Layer:
+    """One step of a program.
+
+    Attributes:
+        kind: its name in JSON.
+    """
+
+    kind: str
+
+    @property
+    def arrays(self) -> tuple[Floats, ...]:
+        """The learned arrays, in the order in which exports store them."""
+        return ()
+
+    @property
+    def flops(self) -> int:
+        """Operations for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one."""
+        return 0
+
+    def describe(self) -> dict[str, object]:
+        """Return the layer as JSON stores it: without its weights, but with their shapes."""
+        numbers = {name: value for name, value in vars(self).items() if not isinstance(value, np.ndarray | Layer)}
+        return {"kind": self.kind, **numbers, "shapes": [list(array.shape) for array in self.arrays]}
 
 
 @dataclass(frozen=True)
-class Learned:
-    """What a layer with a weight and a bias holds."""
+class Learned(Layer):
+    """A layer with a weight and a bias."""
 
     weight: Floats
     bias: Floats
 
     @property
     def arrays(self) -> tuple[Floats, ...]:
-        """The learned arrays, in the order in which exports store them."""
+        """Weight and bias."""
         return self.weight, self.bias
 
-
-class Fixed:
-    """What a layer without weights holds."""
+    @property
+    def inputs(self) -> int:
+        """Rows of the weight."""
+        return len(self.weight)
 
     @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Nothing: it learned nothing."""
-        return ()
+    def outputs(self) -> int:
+        """Numbers of the bias."""
+        return self.bias.size
 
 
 class Affine(Learned):
     """x W + b with W [in, out] and b [out]."""
+
+    kind = "affine"
 
     @property
     def flops(self) -> int:
@@ -51,6 +90,8 @@ class Affine(Learned):
 class Norm(Learned):
     """(x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
 
+    kind = "norm"
+
     @property
     def flops(self) -> int:
         """Sums for mean and variance (1 + 3 a number), then four operations a number."""
@@ -58,10 +99,10 @@ class Norm(Learned):
 
 
 @dataclass(frozen=True)
-class Activation(Fixed):
+class Activation(Layer):
     """Relu or tanh of every number of a row `width` wide."""
 
-    name: Literal["relu", "tanh"]
+    kind: Literal["relu", "tanh"]
     width: int
 
     @property
@@ -71,7 +112,7 @@ class Activation(Fixed):
 
 
 @dataclass(frozen=True)
-class Recurrent:
+class Recurrent(Layer):
     """A gated recurrent unit of H numbers: r, z = s(p + q); n = tanh(p + r q); h' = n + z (h - n).
 
     p = x W + b and q = h U + c, each in the order r, z, n.
@@ -79,15 +120,16 @@ class Recurrent:
 
     input: Affine
     recurrent: Affine
+    kind = "gru"
 
     @property
     def hidden(self) -> int:
         """H."""
-        return len(self.recurrent.weight)
+        return self.recurrent.inputs
 
     @property
     def arrays(self) -> tuple[Floats, ...]:
-        """The learned arrays, in the order in which exports store them."""
+        """W, b, U and c."""
         return (*self.input.arrays, *self.recurrent.arrays)
 
     @property
@@ -97,16 +139,12 @@ class Recurrent:
 
 
 @dataclass(frozen=True)
-class Slice(Fixed):
+class Slice(Layer):
     """Columns `begin` to `end` of a row."""
 
     begin: int
     end: int
-
-    @property
-    def flops(self) -> int:
-        """None."""
-        return 0
+    kind = "slice"
 
 
 @dataclass(frozen=True)
@@ -121,11 +159,7 @@ class Convolution(Learned):
     columns: int
     side: int
     stride: int
-
-    @property
-    def outputs(self) -> int:
-        """Channels of the output."""
-        return self.bias.size
+    kind = "convolution"
 
     @property
     def places(self) -> tuple[int, int]:
@@ -135,20 +169,21 @@ class Convolution(Learned):
     @property
     def width(self) -> int:
         """Width of the output."""
-        return self.outputs * self.places[0] * self.places[1]
+        return self.outputs * math.prod(self.places)
 
     @property
     def flops(self) -> int:
         """A multiplication and an addition for each weight and place."""
-        return 2 * self.weight.size * self.places[0] * self.places[1]
+        return 2 * self.weight.size * math.prod(self.places)
 
 
 @dataclass(frozen=True)
-class GlobalMaxPool(Fixed):
+class GlobalMaxPool(Layer):
     """The largest number of each channel: [channels x places] to [channels]."""
 
     channels: int
     places: int
+    kind = "global_max_pool"
 
     @property
     def flops(self) -> int:
@@ -157,11 +192,11 @@ class GlobalMaxPool(Fixed):
 
 
 @dataclass(frozen=True)
-class MessageAggregation(Fixed):
-    """Own features x and those of near agents: [x, mean relative position / reach, mean of their x].
+class MessageAggregation(Layer):
+    """Own features x beside the neighbours' mean message: [x, mean relative position / reach, mean of their x].
 
     The observation holds the relative positions of the others from column `begin` on, two numbers each, in team order.
-    Near agents have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
+    Neighbours have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
     itself.
     """
 
@@ -169,11 +204,17 @@ class MessageAggregation(Fixed):
     team: int
     width: int
     reach_squared: float
+    kind = "aggregate"
+
+    @property
+    def others(self) -> int:
+        """Agents of the team but one."""
+        return self.team - 1
 
     @property
     def end(self) -> int:
         """The column after the last relative position."""
-        return self.begin + 2 * (self.team - 1)
+        return self.begin + 2 * self.others
 
     @property
     def reach(self) -> float:
@@ -183,30 +224,57 @@ class MessageAggregation(Fixed):
     @property
     def flops(self) -> int:
         """Per other agent: distance (3), comparison, count, and two operations per number of position and features."""
-        return (self.team - 1) * (9 + 2 * self.width) + 4
+        return self.others * (9 + 2 * self.width) + 4
 
 
-Layer = Affine | Norm | Activation | Recurrent | Slice | Convolution | GlobalMaxPool | MessageAggregation
+@dataclass(frozen=True)
+class Program:
+    """One greedy policy.
 
+    Attributes:
+        num_inputs: D, numbers of an observation.
+        layers: in their order.
+        num_outputs: numbers of the last layer.
+        hidden: H, numbers of the hidden state; 0 for a policy that remembers nothing.
+        previous: numbers of the previous action in the memory.
+        head: how the outputs become an action.
+        groups: widths of what is squashed together; empty where the head chooses.
+        team: agents that act together, with their rows side by side; 1 where each acts by itself.
+        masked: whether a mask of the allowed actions [A] comes with every observation; one that allows none allows all.
+    """
 
-def describe(layer: Layer) -> dict[str, object]:
-    """Return a layer without its weights, as JSON stores it."""
-    if isinstance(layer, Affine):
-        return {"kind": "affine", "inputs": layer.weight.shape[0], "outputs": layer.weight.shape[1]}
-    if isinstance(layer, Norm):
-        return {"kind": "norm", "width": layer.weight.size}
-    if isinstance(layer, Activation):
-        return {"kind": layer.name, "width": layer.width}
-    if isinstance(layer, Slice):
-        return {"kind": "slice", "begin": layer.begin, "end": layer.end}
-    if isinstance(layer, Convolution):
-        return {"kind": "convolution", **_named(layer, "channels", "rows", "columns", "side", "stride", "outputs")}
-    if isinstance(layer, GlobalMaxPool):
-        return {"kind": "global_max_pool", "channels": layer.channels, "places": layer.places}
-    if isinstance(layer, MessageAggregation):
-        return {"kind": "aggregate", **_named(layer, "begin", "end", "team", "reach_squared")}
-    return {"kind": "gru", "inputs": layer.input.weight.shape[0], "hidden": layer.hidden}
+    num_inputs: int
+    layers: tuple[Layer, ...]
+    num_outputs: int
+    hidden: int
+    previous: int
+    head: Literal["choose", "squash"]
+    groups: tuple[int, ...]
+    team: int = 1
+    masked: bool = False
 
+    @property
+    def memory_width(self) -> int:
+        """Numbers that it carries from step to step."""
+        return self.hidden + self.previous
 
-def _named(layer: Layer, *names: str) -> dict[str, object]:
-    return {name: getattr(layer, name) for name in names}
+    @property
+    def weights(self) -> bytes:
+        """Every array of every layer, one after the other, as little-endian float32."""
+        return b"".join(array.astype("<f4").tobytes() for layer in self.layers for array in layer.arrays)
+
+    @property
+    def num_parameters(self) -> int:
+        """Learned numbers."""
+        return len(self.weights) // 4
+
+    @property
+    def flops(self) -> int:
+        """Operations for one action."""
+        own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
+        return sum(layer.flops for layer in self.layers) + own
+
+    def describe(self) -> dict[str, object]:
+        """Return the program without its weights, as JSON stores it."""
+        names = ("num_inputs", "num_outputs", "hidden", "previous", "head", "groups", "team", "masked")
+        return {name: getattr(self, name) for name in names} | {"layers": [layer.describe() for layer in self.layers]}

@@ -1,17 +1,20 @@
-"""A program as an ONNX model, built node by node; needs the extra `export`."""
+"""A program as an ONNX model, written in ONNX's text format; needs the extra `export`."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable
+import re
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from esp_cli.defaults import __version__
 from esp_cli.export import layers
-from esp_cli.export.program import Program
+from esp_cli.export.check import Numbers, Runner
+from esp_cli.export.layers import Floats, Program
 from esp_envs.errors import UserError
 from esp_envs.extras import install
 from esp_envs.spec import others_of
@@ -19,6 +22,76 @@ from esp_envs.spec import others_of
 OPSET = 17
 """The first with layer normalisation; runtimes since 2022 read it."""
 IR_VERSION = 8
+
+_LAYERS: dict[type[layers.Layer], str] = {
+    layers.Affine: "y = Gemm(x, w0, w1)",
+    layers.Activation: "y = {function}(x)",
+    layers.Norm: "y = LayerNormalization<axis = -1, epsilon = 0.00001>(x, w0, w1)",
+    layers.Recurrent: """
+        p = Gemm(x, w0, w1)
+        q = Gemm(hidden, w2, w3)
+        pr, pz, pn = Split<axis = 1>(p)
+        qr, qz, qn = Split<axis = 1>(q)
+        r = Add(pr, qr)
+        reset = Sigmoid(r)
+        z = Add(pz, qz)
+        update = Sigmoid(z)
+        rq = Mul(reset, qn)
+        n = Add(pn, rq)
+        candidate = Tanh(n)
+        difference = Sub(hidden, candidate)
+        step = Mul(update, difference)
+        y = Add(candidate, step)""",
+    layers.Slice: "y = Slice(x, [{0.begin}], [{0.end}], [1])",
+    layers.Convolution: """
+        columns = Transpose<perm = [1, 0]>(w0)
+        filters = Reshape(columns, [{0.outputs},{0.channels},{0.side},{0.side}])
+        pictures = Reshape(x, [-1,{0.channels},{0.rows},{0.columns}])
+        filtered = Conv<strides = [{0.stride}, {0.stride}]>(pictures, filters, w1)
+        y = Reshape(filtered, [-1,{0.width}])""",
+    layers.GlobalMaxPool: """
+        channels = Reshape(x, [-1,{0.channels},{0.places}])
+        y = ReduceMax<axes = [2], keepdims = 0>(channels)""",
+    layers.MessageAggregation: """
+        positions = Slice(observation, [{0.begin}], [{0.end}], [1])
+        ways = Reshape(positions, [-1,{0.others},2])
+        squares = Mul(ways, ways)
+        distances = ReduceSum(squares, [2])
+        within = Less(distances, {0.reach_squared})
+        near = Cast<to = 1>(within)
+        count = ReduceSum(near, [1])
+        divisor = Add(count, 1.0)
+        share = Div(near, divisor)
+        units = Div(ways, {0.reach})
+        shared_ways = Mul(share, units)
+        mean_way = ReduceSum<keepdims = 0>(shared_ways, [1])
+        worlds = Reshape(x, [-1,{0.team},{0.width}])
+        gathered = Gather<axis = 1>(worlds, {index})
+        others = Reshape(gathered, [-1,{0.others},{0.width}])
+        shared = Mul(share, others)
+        message = ReduceSum<keepdims = 0>(shared, [1])
+        y = Concat<axis = 1>(x, mean_way, message)""",
+}
+"""A line an operation, from x to y; w0, w1, ... are the layer's arrays, and numbers stand for constants."""
+_MASK = """
+    flags = Cast<to = 1>(action_mask)
+    largest = ReduceMax<axes = [1], keepdims = 1>(flags)
+    some = Cast<to = 9>(largest)
+    none = Not(some)
+    allowed = Or(action_mask, none)
+    scores = Where(allowed, outputs, -Infinity)"""
+_ENCODE = """
+    column = Unsqueeze(action, [1])
+    equal = Equal(column, {every})
+    encoded = Cast<to = 1>(equal)"""
+_SQUASH = f"""
+    squares = Mul(outputs, outputs)
+    sums = MatMul(squares, same_group)
+    positive = Add(sums, {layers.SQUASH_EPSILON})
+    length = Sqrt(positive)
+    bounded = Tanh(length)
+    scale = Div(bounded, length)
+    action = Mul(outputs, scale)"""
 
 
 def library(name: str) -> Any:
@@ -48,171 +121,98 @@ def onnx_model(program: Program, description: str) -> bytes:
     Raises:
         UserError: onnx is not installed.
     """
-    onnx = library("onnx")
-    graph = _Graph(onnx)
-    float_type, int_type = onnx.TensorProto.FLOAT, onnx.TensorProto.INT64
-    value = onnx.helper.make_tensor_value_info
-    inputs = [value("observation", float_type, ["rows", program.num_inputs])]
-    x, hidden = "observation", ""
+    onnx, graph = library("onnx"), _Graph()
+    choose, row = program.head == "choose", f"float[rows, {program.num_outputs}]"
+    inputs = [f"float[rows, {program.num_inputs}] observation"]
+    outputs = ["int64[rows] action" if choose else f"{row} action", f"{row} outputs"]
+    x = "observation"
     if program.memory_width:
-        inputs.append(value("memory", float_type, ["rows", program.memory_width]))
-        hidden = graph.slice("memory", 0, program.hidden)
+        inputs.append(f"float[rows, {program.memory_width}] memory")
+        outputs.append(f"float[rows, {program.memory_width}] memory_out")
+        graph.add(f"hidden = Slice(memory, [0], [{program.hidden}], [1])")
     if program.previous:
-        x = graph.node("Concat", [x, graph.slice("memory", program.hidden, program.memory_width)], axis=1)
-    for layer in program.layers:
-        if isinstance(layer, layers.Recurrent):
-            x = hidden = graph.recur(graph.affine(x, layer.input), graph.affine(hidden, layer.recurrent), hidden)
-        else:
-            x = graph.layer(x, layer)
-    graph.name(x, "outputs")
-    outputs = [value("outputs", float_type, ["rows", program.num_outputs])]
-    if program.head == "choose":
+        graph.add(f"previous = Slice(memory, [{program.hidden}], [{program.memory_width}], [1])")
+        graph.add("start = Concat<axis = 1>(observation, previous)")
+        x = "start"
+    hidden = "hidden"
+    for k, layer in enumerate(program.layers):
+        x = graph.add_layer(k, layer, x)
+        hidden = x if isinstance(layer, layers.Recurrent) else hidden
+    graph.add(f"outputs = Identity({x})")
+    encoded = "action"
+    if choose:
         if program.masked:
-            inputs.append(value("action_mask", onnx.TensorProto.BOOL, ["rows", program.num_outputs]))
-            x = graph.allowed(x, "action_mask")
-        done = graph.name(graph.node("ArgMax", [x], axis=-1, keepdims=0), "action")
-        outputs.insert(0, value("action", int_type, ["rows"]))
+            inputs.append(f"bool[rows, {program.num_outputs}] action_mask")
+            graph.add(_MASK)
+        graph.add(f"action = ArgMax<axis = -1, keepdims = 0>({'scores' if program.masked else 'outputs'})")
+        if program.previous:
+            graph.add(_ENCODE.format(every=_compact([list(range(program.num_outputs))])))
+            encoded = "encoded"
     else:
-        done = graph.name(graph.squash(x, program.groups), "action")
-        outputs.insert(0, value("action", float_type, ["rows", program.num_outputs]))
+        groups = np.repeat(np.arange(len(program.groups)), program.groups)
+        graph.constants["same_group"] = (groups[:, None] == groups).astype(np.float32)
+        graph.add(_SQUASH)
     if program.memory_width:
-        after = graph.node("Concat", [hidden, graph.encode(done, program)], axis=1) if program.previous else hidden
-        graph.name(after, "memory_out")
-        outputs.append(value("memory_out", float_type, ["rows", program.memory_width]))
-    model = onnx.helper.make_model(
-        onnx.helper.make_graph(graph.nodes, "policy", inputs, outputs, graph.constants),
-        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
-        ir_version=IR_VERSION,
-        producer_name="esp",
-        producer_version=__version__,
-    )
+        after = f"Concat<axis = 1>({hidden}, {encoded})" if program.previous else f"Identity({hidden})"
+        graph.add(f"memory_out = {after}")
+    head = f'ir_version: {IR_VERSION}, opset_import: ["": {OPSET}], producer_name: "esp"'
+    text = f"policy ({', '.join(inputs)}) => ({', '.join(outputs)})"
+    lines = "\n".join(graph.lines)
+    model = onnx.parser.parse_model(f'<{head}, producer_version: "{__version__}"> {text} {{\n{lines}\n}}')
+    arrays = (onnx.numpy_helper.from_array(np.ascontiguousarray(a), name) for name, a in graph.constants.items())
+    model.graph.initializer.extend(arrays)
     onnx.helper.set_model_props(model, {"esp": description})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
 
 
 class _Graph:
-    """Nodes and constants as they come; each method returns the name of what it makes."""
+    """Lines of ONNX's text format, and the constants that they name."""
 
-    def __init__(self, onnx: Any) -> None:
-        self.onnx = onnx
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.constants: dict[str, Any] = {}
 
-    def node(self, kind: str, inputs: list[str], **attributes: object) -> str:
-        name = f"t{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, inputs, [name], **attributes))
-        return name
+    def add(self, text: str) -> None:
+        """Add lines `name = Operation(argument, ...)`; an argument may be a number, or integers without spaces."""
+        for line in filter(None, map(str.strip, text.splitlines())):
+            start, arguments = line.removesuffix(")").rsplit("(", 1)
+            self.lines.append(f"{start}({', '.join(map(self._named, arguments.split(', ')))})")
 
-    def constant(self, array: Any) -> str:
+    def add_layer(self, k: int, layer: layers.Layer, x: str) -> str:
+        """Add what layer k makes of x, and return its name."""
+        index = _compact(others_of(layer.team)) if isinstance(layer, layers.MessageAggregation) else ""
+        text = _LAYERS[type(layer)].format(layer, function=layer.kind.capitalize(), index=index)
+        self.constants |= {f"w{i}_{k}": array for i, array in enumerate(layer.arrays)}
+        names = [name for line in text.splitlines() for name in line.partition(" = ")[0].strip().split(", ")]
+        names += [f"w{i}" for i in range(len(layer.arrays))]
+        renamed = {name: f"{name}_{k}" for name in names} | {"x": x}
+        self.add(re.sub(r"\b[a-z]\w*", lambda match: renamed.get(match[0], match[0]), text))
+        return f"y_{k}"
+
+    def _named(self, argument: str) -> str:
+        """Return the name of an argument, which may be a number."""
+        try:
+            value = json.loads(argument)
+        except json.JSONDecodeError:
+            return argument
         name = f"c{len(self.constants)}"
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        self.constants[name] = np.array(value, np.int64 if isinstance(value, list) else np.float32)
         return name
 
-    def name(self, value: str, name: str) -> str:
-        """Give a value a second name, as an output of the model."""
-        self.nodes.append(self.onnx.helper.make_node("Identity", [value], [name]))
-        return name
 
-    def slice(self, value: str, begin: int, end: int) -> str:
-        """Return columns of a matrix."""
-        bounds = [self.constant(np.array([k], np.int64)) for k in (begin, end, 1)]
-        return self.node("Slice", [value, *bounds])
+def _compact(value: object) -> str:
+    return json.dumps(value, separators=(",", ":"))
 
-    def affine(self, x: str, layer: layers.Affine) -> str:
-        return self.node("Gemm", [x, self.constant(layer.weight), self.constant(layer.bias)])
 
-    def layer(self, x: str, layer: layers.Layer) -> str:
-        """Return what a layer without memory makes of x."""
-        writers: dict[type, Callable[[str, Any], str]] = {
-            layers.Affine: self.affine,
-            layers.Activation: lambda x, layer: self.node("Relu" if layer.name == "relu" else "Tanh", [x]),
-            layers.Norm: self.normalise,
-            layers.Slice: lambda x, layer: self.slice(x, layer.begin, layer.end),
-            layers.Convolution: self.convolve,
-            layers.GlobalMaxPool: self.global_max_pool,
-            layers.MessageAggregation: self.aggregate,
-        }
-        return writers[type(layer)](x, layer)
+def onnx_runner(file: Path) -> Runner:
+    """Run a written ONNX model with onnxruntime."""
+    session = library("onnxruntime").InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    names = [value.name for value in session.get_inputs()]
 
-    def normalise(self, x: str, layer: layers.Norm) -> str:
-        arrays = [self.constant(array) for array in layer.arrays]
-        return self.node("LayerNormalization", [x, *arrays], axis=-1, epsilon=layers.NORM_EPSILON)
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        rows = {"observation": obs, "memory": memory, "action_mask": mask}
+        results = session.run(None, {name: rows[name] for name in names})
+        return results[0], results[1], results[2] if len(results) > 2 else memory
 
-    def reshape(self, value: str, *shape: int) -> str:
-        return self.node("Reshape", [value, self.constant(np.array(shape, np.int64))])
-
-    def reduce(self, kind: str, value: str, axis: int, keepdims: int = 0) -> str:
-        if kind == "ReduceSum":  # of these the first whose axes became an input
-            return self.node(kind, [value, self.constant(np.array([axis], np.int64))], keepdims=keepdims)
-        return self.node(kind, [value], axes=[axis], keepdims=keepdims)
-
-    def convolve(self, x: str, layer: layers.Convolution) -> str:
-        shape = (layer.outputs, layer.channels, layer.side, layer.side)
-        weight = self.constant(layer.weight.T.reshape(shape))
-        pictures = self.reshape(x, -1, layer.channels, layer.rows, layer.columns)
-        out = self.node("Conv", [pictures, weight, self.constant(layer.bias)], strides=[layer.stride, layer.stride])
-        return self.reshape(out, -1, layer.width)
-
-    def global_max_pool(self, x: str, layer: layers.GlobalMaxPool) -> str:
-        """Take the largest number of each channel."""
-        return self.reduce("ReduceMax", self.reshape(x, -1, layer.channels, layer.places), 2)
-
-    def aggregate(self, x: str, layer: layers.MessageAggregation) -> str:
-        """Return own features beside the means over the near."""
-        number = [self.constant(np.array(value, np.float32)) for value in (1, layer.reach_squared, layer.reach)]
-        one, reach_squared, reach = number
-        others = layer.team - 1
-        ways = self.reshape(self.slice("observation", layer.begin, layer.end), -1, others, 2)
-        squares = self.reduce("ReduceSum", self.node("Mul", [ways, ways]), 2, keepdims=1)
-        near = self.node("Cast", [self.node("Less", [squares, reach_squared])], to=self.onnx.TensorProto.FLOAT)
-        count = self.node("Add", [self.reduce("ReduceSum", near, 1, keepdims=1), one])
-        share = self.node("Div", [near, count])  # [rows, N - 1, 1]
-        mean_way = self.reduce("ReduceSum", self.node("Mul", [share, self.node("Div", [ways, reach])]), 1)
-        index = self.constant(np.array(others_of(layer.team), np.int64))
-        said = self.node("Gather", [self.reshape(x, -1, layer.team, layer.width), index], axis=1)
-        said = self.reshape(said, -1, others, layer.width)
-        heard = self.reduce("ReduceSum", self.node("Mul", [share, said]), 1)
-        return self.node("Concat", [x, mean_way, heard], axis=1)
-
-    def recur(self, p: str, q: str, hidden: str) -> str:
-        """Return the next hidden state from both projections."""
-        (pr, pz, pn), (qr, qz, qn) = self._thirds(p), self._thirds(q)
-        reset = self.node("Sigmoid", [self.node("Add", [pr, qr])])
-        update = self.node("Sigmoid", [self.node("Add", [pz, qz])])
-        candidate = self.node("Tanh", [self.node("Add", [pn, self.node("Mul", [reset, qn])])])
-        return self.node("Add", [candidate, self.node("Mul", [update, self.node("Sub", [hidden, candidate])])])
-
-    def _thirds(self, value: str) -> list[str]:
-        names = [f"t{len(self.nodes)}_{k}" for k in range(3)]
-        self.nodes.append(self.onnx.helper.make_node("Split", [value], names, axis=1))
-        return names
-
-    def squash(self, x: str, groups: tuple[int, ...]) -> str:
-        """Return u tanh|u| / |u| for each group."""
-        width = sum(groups)
-        same: layers.Floats = np.zeros((width, width), np.float32)
-        place = 0
-        for size in groups:
-            same[place : place + size, place : place + size] = 1
-            place += size
-        squares = self.node("MatMul", [self.node("Mul", [x, x]), self.constant(same)])
-        epsilon = self.constant(np.array(layers.SQUASH_EPSILON, np.float32))
-        length = self.node("Sqrt", [self.node("Add", [squares, epsilon])])
-        return self.node("Mul", [x, self.node("Div", [self.node("Tanh", [length]), length])])
-
-    def allowed(self, x: str, mask: str) -> str:
-        """Return x with -infinity where the mask forbids; where it forbids everything, x."""
-        types = self.onnx.TensorProto
-        some = self.reduce("ReduceMax", self.node("Cast", [mask], to=types.FLOAT), 1, keepdims=1)
-        nothing = self.node("Not", [self.node("Cast", [some], to=types.BOOL)])
-        allowed = self.node("Or", [mask, nothing])
-        return self.node("Where", [allowed, x, self.constant(np.array(-np.inf, np.float32))])
-
-    def encode(self, action: str, program: Program) -> str:
-        """Return an action as the memory holds it."""
-        if program.head == "squash":
-            return action
-        column = self.node("Unsqueeze", [action, self.constant(np.array([1], np.int64))])
-        every = self.constant(np.arange(program.num_outputs, dtype=np.int64)[None])
-        return self.node("Cast", [self.node("Equal", [column, every])], to=self.onnx.TensorProto.FLOAT)
+    return run

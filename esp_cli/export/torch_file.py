@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from esp_cli.export import layers
-from esp_cli.export.program import Program
+from esp_cli.export.check import Numbers, Runner
+from esp_cli.export.layers import Floats, Program
 from esp_cli.networks.heads import masked
 from esp_envs.spec import others_of
 
@@ -43,15 +47,15 @@ class TorchProgram(nn.Module):
             if isinstance(layer, layers.Recurrent):
                 x = hidden = _recur(x, hidden, arrays)
             else:
-                x = _apply(x, layer, arrays, observation)
+                x = _LAYERS[type(layer)](x, layer, arrays, observation)
         if program.head == "choose":
             action = masked(x, action_mask).argmax(-1)
-            done = nn.functional.one_hot(action, program.num_outputs).float()
+            encoded = nn.functional.one_hot(action, program.num_outputs).float()
         else:
-            action = done = _squash(x, program.groups)
+            action = encoded = _squash(x, program.groups)
         if memory is None:
             return action, x
-        return action, x, torch.cat([hidden, done], 1) if program.previous else hidden
+        return action, x, torch.cat([hidden, encoded], 1) if program.previous else hidden
 
 
 def torch_archive(program: Program, description: str) -> bytes:
@@ -63,49 +67,46 @@ def torch_archive(program: Program, description: str) -> bytes:
     """
     worlds = torch.export.Dim("worlds", min=1)
     rows = worlds if program.team == 1 else program.team * worlds
-    given = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
+    inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
     if program.memory_width:
-        given["memory"] = torch.zeros(2 * program.team, program.memory_width)
-    arguments, named = tuple(given.values()), {}
+        inputs["memory"] = torch.zeros(2 * program.team, program.memory_width)
+    arguments, named = tuple(inputs.values()), {}
     if program.masked:
         named["action_mask"] = torch.ones(2 * program.team, program.num_outputs, dtype=torch.bool)
-    shapes = {name: {0: rows} for name in given | named}
+    shapes = {name: {0: rows} for name in inputs | named}
     exported = torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
     content = BytesIO()
     torch.export.save(exported, content, extra_files={"policy.json": description})
     return content.getvalue()
 
 
-def _apply(x: Tensor, layer: layers.Layer, arrays: list[Tensor], observation: Tensor) -> Tensor:
-    if isinstance(layer, layers.Affine):
-        return torch.addmm(arrays[1], x, arrays[0])
-    if isinstance(layer, layers.Activation):
-        return torch.relu(x) if layer.name == "relu" else torch.tanh(x)
-    if isinstance(layer, layers.Norm):
-        return nn.functional.layer_norm(x, x.shape[-1:], arrays[0], arrays[1], layers.NORM_EPSILON)
-    if isinstance(layer, layers.Slice):
-        return x[:, layer.begin : layer.end]
-    if isinstance(layer, layers.Convolution):
-        return _convolve(x, layer, arrays)
-    if isinstance(layer, layers.MessageAggregation):
-        return _aggregate(x, observation, layer)
-    assert isinstance(layer, layers.GlobalMaxPool)
-    return x.unflatten(1, (layer.channels, layer.places)).amax(2)
+def torch_runner(file: Path) -> Runner:
+    """Run a written torch.export archive."""
+    module = torch.export.load(file).module()
+
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        allowed = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
+        inputs = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
+        with torch.no_grad():
+            results = [result.numpy() for result in module(*inputs, **allowed)]
+        return results[0], results[1], results[2] if len(results) > 2 else memory
+
+    return run
 
 
-def _convolve(x: Tensor, layer: layers.Convolution, arrays: list[Tensor]) -> Tensor:
+def _convolve(x: Tensor, layer: layers.Convolution, arrays: list[Tensor], _: Tensor) -> Tensor:
     weight = arrays[0].T.reshape(layer.outputs, layer.channels, layer.side, layer.side)
     pictures = x.unflatten(1, (layer.channels, layer.rows, layer.columns))
     return nn.functional.conv2d(pictures, weight, arrays[1], layer.stride).flatten(1)
 
 
-def _aggregate(x: Tensor, observation: Tensor, layer: layers.MessageAggregation) -> Tensor:
-    """Put what the near ones say beside each agent's own features."""
-    ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.team - 1, 2))
+def _aggregate(x: Tensor, layer: layers.MessageAggregation, _: list[Tensor], observation: Tensor) -> Tensor:
+    """Concatenate own features with the neighbours' mean relative position and mean message."""
+    ways = observation[:, layer.begin : layer.end].unflatten(1, (layer.others, 2))
     near = (ways.square().sum(2, keepdim=True) < layer.reach_squared).float()
     share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
-    said = x.unflatten(0, (-1, layer.team))[:, torch.tensor(others_of(layer.team))].flatten(0, 1)
-    return torch.cat([x, (share * (ways / layer.reach)).sum(1), (share * said).sum(1)], 1)
+    messages = x.unflatten(0, (-1, layer.team))[:, torch.tensor(others_of(layer.team))].flatten(0, 1)
+    return torch.cat([x, (share * (ways / layer.reach)).sum(1), (share * messages).sum(1)], 1)
 
 
 def _recur(x: Tensor, hidden: Tensor, arrays: list[Tensor]) -> Tensor:
@@ -121,3 +122,17 @@ def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
     parts = x.split(list(groups), -1)
     lengths = [(part.square().sum(-1, keepdim=True) + layers.SQUASH_EPSILON).sqrt() for part in parts]
     return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)
+
+
+_LAYERS: dict[type[layers.Layer], Callable[[Tensor, Any, list[Tensor], Tensor], Tensor]] = {
+    layers.Affine: lambda x, _, arrays, __: torch.addmm(arrays[1], x, arrays[0]),
+    layers.Activation: lambda x, layer, *_: torch.relu(x) if layer.kind == "relu" else torch.tanh(x),
+    layers.Norm: lambda x, _, arrays, __: nn.functional.layer_norm(
+        x, x.shape[-1:], arrays[0], arrays[1], layers.NORM_EPSILON
+    ),
+    layers.Slice: lambda x, layer, *_: x[:, layer.begin : layer.end],
+    layers.Convolution: _convolve,
+    layers.GlobalMaxPool: lambda x, layer, *_: x.unflatten(1, (layer.channels, layer.places)).amax(2),
+    layers.MessageAggregation: _aggregate,
+}
+"""What a layer without memory makes of rows x [rows, width], with its arrays and the observations."""

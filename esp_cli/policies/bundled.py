@@ -1,4 +1,4 @@
-"""The trained policies that come with the application: files in `checkpoints/`, listed in a manifest.
+"""The trained policies that come with the application: files in `checkpoints/`, listed in a manifest; imports no torch.
 
 The folder is beside the packages in a checkout, and inside `esp_cli` in an installed wheel. A policy is found by its
 name (`formation-mappo-esp`) or by its task, and then by algorithm and prior.
@@ -6,19 +6,99 @@ name (`formation-mappo-esp`) or by its task, and then by algorithm and prior.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from pydantic import Field
+
 from esp_cli.defaults import PriorKind
-from esp_cli.files.documents import shortened
-from esp_cli.files.suggesting import did_you_mean
-from esp_cli.policies import manifest
-from esp_cli.policies.loading import TrainedPolicy, load_policy
-from esp_cli.policies.manifest import Entry, read_bundled
+from esp_cli.files.documents import DocumentFormat, Strict
+from esp_cli.files.formatting import file_name
 from esp_envs.errors import UserError
-from esp_envs.registry import task_names
+
+MANIFEST_FORMAT = DocumentFormat("esp-checkpoints", 1, "a manifest of policies")
+MANIFEST = "manifest.json"
+NAME_PATTERN = r"[a-z0-9]+(-[a-z0-9]+)*"
+_FOLDER = "checkpoints"
+
+
+class Score(Strict):
+    """Greedy return of the policy; mean, s.e.m. and interval are over episodes, as there is one seed."""
+
+    mean: float
+    sem: float
+    ci95: tuple[float, float]
+    episodes: int = Field(ge=2)
+
+
+class Entry(Strict):
+    """One bundled policy, as the manifest describes it."""
+
+    name: str = Field(pattern=f"^{NAME_PATTERN}$", max_length=100)
+    file: str = Field(pattern=rf"^{NAME_PATTERN}\.safetensors$", max_length=120)
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    task: str
+    task_version: int
+    convention: str
+    algorithm: str
+    prior: PriorKind
+    seed: int
+    chosen_from: int = Field(ge=1, description="seeds of the run, of which this one did best")
+    step: int = Field(ge=0, description="environment steps behind it")
+    score: Score
+    metrics: dict[str, float]
+    command: str = Field(description="that trains such a run")
+    esp_version: str
+    config: dict[str, Any]
+
+    @property
+    def rank(self) -> tuple[bool, bool, str, int]:
+        """Smallest for the policy that a task's name stands for: a standard name, MAPPO, with the prior."""
+        own_name = self.name != standard_name(self.task, self.algorithm, self.prior)
+        return own_name, self.algorithm != "mappo", self.algorithm, get_args(PriorKind).index(self.prior)
+
+
+class Manifest(Strict):
+    """What a manifest lists."""
+
+    policies: tuple[Entry, ...]
+
+
+def standard_name(task: str, algorithm: str, prior: str) -> str:
+    """Return the default name of a bundled policy."""
+    name = f"{task}-{algorithm}-{'plain' if prior == 'none' else prior}"
+    return file_name(name.replace(".", " "))
+
+
+def bundled_folder() -> Path:
+    """Return the folder of the bundled policies: beside the packages in a checkout, else inside `esp_cli`."""
+    package = Path(__file__).parents[1]
+    inside = package / _FOLDER
+    return inside if inside.is_dir() else package.parent / _FOLDER
+
+
+def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
+    """Return what the manifest lists; nothing where there is no manifest.
+
+    Args:
+        folder: of the manifest; by default that of this installation.
+
+    Raises:
+        UserError: the manifest is damaged or of a newer version.
+    """
+    file = (folder or bundled_folder()) / MANIFEST
+    if not file.is_file():
+        return ()
+    entries = MANIFEST_FORMAT.parse(file, Manifest).policies
+    if len({entry.name for entry in entries}) < len(entries):
+        raise UserError(f"{file} is damaged: it names a policy twice")
+    return entries
+
+
+def write_bundled(folder: Path, entries: tuple[Entry, ...]) -> None:
+    """Write a manifest, sorted by name."""
+    listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
+    MANIFEST_FORMAT.write(folder / MANIFEST, {"policies": listed})
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
@@ -33,68 +113,12 @@ def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
         UserError: there is none.
     """
     entries = read_bundled()
-    named = [e for e in entries if e.name == name]
-    asked = named or [e for e in entries if e.task == name]
-    found = [e for e in asked if algo in (None, e.algorithm) and prior in (None, e.prior)]
-    if found:
-        return min(found, key=_rank)
-    wanted = " ".join([name, *(f"--algo {algo}" for _ in [0] if algo), *(f"--prior {prior}" for _ in [0] if prior)])
-    names = ", ".join(e.name for e in asked or entries)
-    there = f"the bundled policies are {names}" if names else "no policy is bundled"
-    raise UserError(f"no policy fits {wanted}; {there}; train one with esp train, and name its run folder")
-
-
-def _rank(entry: Entry) -> tuple[bool, int, int]:
-    algorithms = list(ALGORITHMS)
-    algorithm = algorithms.index(entry.algorithm) if entry.algorithm in algorithms else len(algorithms)
-    return not entry.is_standard, algorithm, get_args(PriorKind).index(entry.prior)
-
-
-def open_policy(where: Path, algo: str | None = None, prior: str | None = None) -> TrainedPolicy:
-    """Open a run folder, a policy file, or a bundled policy by its name or its task's.
-
-    An existing path goes before a bundled policy of that name, unless algorithm or prior is given.
-
-    Args:
-        where: path or name.
-        algo: of the bundled policies, only those that this algorithm trained; module:Class chooses none.
-        prior: likewise this kind of prior.
-
-    Raises:
-        UserError: nothing there, damaged, or of another version.
-    """
-    if algo is not None and ":" in algo:  # an algorithm of the caller, which trained no bundled policy
-        algo = None
-    choosy = algo is not None or prior is not None
-    try:
-        there = where.exists()
-    except OSError as error:  # a name that no file can have
-        raise UserError(f"there is no policy {shortened(str(where))}: {error.strerror}") from None
-    if there and not choosy:
-        return load_policy(where)
-    if str(where) in task_names() or any(entry.name == str(where) for entry in read_bundled()):
-        entry = find(str(where), algo, prior)
-        trained = load_entry(entry)
-        if entry.name == str(where):
-            return trained
-        return replace(trained, notes=(*trained.notes, f"{where}: taking the bundled policy {entry.name}"))
-    if choosy:
-        raise UserError(f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out")
-    if not there:
-        known = [*task_names(), *(entry.name for entry in read_bundled())]
-        hint = did_you_mean(str(where), known) or "; give a run folder, a policy file, or a task's or policy's name"
-        raise UserError(f"{where} does not exist{hint}")
-    return load_policy(where)
-
-
-def load_entry(entry: Entry) -> TrainedPolicy:
-    """Load a bundled policy.
-
-    Raises:
-        UserError: its file is missing, another than the manifest names, or of another version.
-    """
-    trained = load_policy(manifest.bundled_folder() / entry.file, entry.sha256)
-    described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
-    if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
-        raise UserError(f"{trained.source} does not hold the policy that its manifest describes; get both again")
-    return trained
+    named = [e for e in entries if e.name == name] or [e for e in entries if e.task == name]
+    fitting = [e for e in named if algo in (None, e.algorithm) and prior in (None, e.prior)]
+    if fitting:
+        return min(fitting, key=lambda entry: entry.rank)
+    options = {"--algo": algo, "--prior": prior}
+    wanted = " ".join([name, *(f"{option} {value}" for option, value in options.items() if value)])
+    names = ", ".join(e.name for e in named or entries)
+    known = f"the bundled policies are {names}" if names else "no policy is bundled"
+    raise UserError(f"no policy fits {wanted}; {known}; train one with esp train, and name its run folder")

@@ -11,9 +11,9 @@ import torch
 
 from esp_cli.defaults import __version__
 from esp_cli.files.locking import taking_turns
+from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.policies.evaluation import play_batches
-from esp_cli.policies.loading import TrainedPolicy, single_seed
-from esp_cli.policies.manifest import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import spread_over_episodes
 from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.play import Episodes, PolicyController
@@ -40,9 +40,9 @@ def score_of(episodes: Episodes) -> Score:
     return Score(mean=float(returns.mean()), sem=spread.sem, ci95=spread.ci95, episodes=returns.size)
 
 
-def play_greedily(alone: TrainedPolicy, episodes: int) -> Episodes:
+def play_greedily(trained: TrainedPolicy, episodes: int) -> Episodes:
     """Play the episodes of one seed's policy that `esp eval` plays too."""
-    return play_batches(alone, PolicyController(alone.policy), "greedy", episodes)
+    return play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
 
 
 def bundle(
@@ -53,7 +53,7 @@ def bundle(
     name: str | None = None,
     force: bool = False,
 ) -> Entry:
-    """Write one seed's policy and list it in the manifest.
+    """Write one seed's policy, list it in the manifest, and return its entry.
 
     Args:
         trained: a run.
@@ -62,9 +62,6 @@ def bundle(
         seed: which one; by default the best.
         name: of the policy; by default from task, algorithm and prior.
         force: replace a policy of the same name.
-
-    Returns:
-        Its line in the manifest.
 
     Raises:
         UserError: an unknown seed, an invalid name or one that is taken, the folder of a run, a damaged manifest, or a
@@ -75,27 +72,26 @@ def bundle(
     if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:
         raise UserError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
     _others(folder, name, force)  # before the episodes are played; they take minutes
-    alone = single_seed(trained, best_seed(trained, episodes) if seed is None else seed)
-    played = play_greedily(alone, episodes)
+    own = trained.single_seed(best_seed(trained, episodes) if seed is None else seed)
+    played = play_greedily(own, episodes)
     score = score_of(played)
     folder.mkdir(parents=True, exist_ok=True)
     with taking_turns(folder):
         others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
         file = folder / f"{name}.safetensors"
-        description = describe_policy(alone.config, alone.spec, alone.step, [score.mean])
-        write_policy(file, alone.policy.state_dict(), description)
+        write_policy(file, own.policy.state_dict(), describe_policy(own.config, own.spec, own.step, [score.mean]))
         entry = Entry(
             name=name,
             file=file.name,
             sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
             task=config.task,
-            task_version=alone.spec.version,
-            convention=alone.spec.convention,
+            task_version=own.spec.version,
+            convention=own.spec.convention,
             algorithm=config.algorithm,
             prior=config.prior.kind,
-            seed=alone.config.seeds[0],
+            seed=own.config.seeds[0],
             chosen_from=len(config.seeds),
-            step=alone.step,
+            step=own.step,
             score=score,
             metrics={key: float(value.mean()) for key, value in played.metrics.items()},
             command=config.command(),
@@ -107,14 +103,14 @@ def bundle(
 
 
 def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:
-    """Return what a folder lists besides a policy that is to be written into it.
+    """Return what a folder lists besides the policy of this name.
 
     Raises:
         UserError: it is the folder of a run, has a policy or another file of that name, or its manifest is damaged.
     """
     if os.path.lexists(folder / CONFIG):
         raise UserError(f"{folder} is the folder of a run, whose own policies have such names; choose another --out")
-    there = read_bundled(folder)
-    if not force and (any(entry.name == name for entry in there) or os.path.lexists(folder / f"{name}.safetensors")):
+    entries = read_bundled(folder)
+    if not force and (any(entry.name == name for entry in entries) or os.path.lexists(folder / f"{name}.safetensors")):
         raise UserError(f"{folder} has {name} already; choose another --name, or replace it with --force")
-    return tuple(entry for entry in there if entry.name != name)
+    return tuple(entry for entry in entries if entry.name != name)

@@ -46,7 +46,7 @@ def _matching(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, s
     own = policy.state_dict()
     # names before shapes: those that differ are of another algorithm or network
     for name in sorted(own.keys() | theirs.keys(), key=lambda name: (name in own and name in theirs, name)):
-        here, there = (list(found[name].shape[1:]) if name in found else None for found in (own, theirs))
+        here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, theirs))
         if here != there:
             of_it = f"'{name}' is {'missing' if there is None else there} there"
             of_this = "missing" if here is None else here

@@ -17,14 +17,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.algorithms.learner import Learner
-from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.policies.bundled import open_policy
-from esp_cli.policies.loading import TrainedPolicy, single_seed
+from esp_cli.policies.loading import TrainedPolicy, open_policy, register_own
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
-from esp_envs.registry import register
 from esp_envs.spec import Continuous, Discrete, TaskSpec
 
 Floats = NDArray[np.float32]
@@ -34,8 +30,12 @@ Action = NDArray[np.int64] | NDArray[np.float32]
 class LoadedPolicy:
     """One seed's policy, ready to act; agents share it, so every row of observations is an agent of its own.
 
-    Shape letters as in `esp_envs.spec`; `...` stands for any leading axes, none among them. Where agents hear each
-    other (`team` more than 1), the last of the leading axes has the agents of one world.
+    Example:
+        policy = load_policy("formation")
+        wheels = policy.act(obs)  # [8, D] to [8, 2]
+
+    Shape letters as in `esp_envs.spec`; `...` stands for any leading axes, none among them. Where agents exchange
+    messages (`team` more than 1), the last of the leading axes has the agents of one world.
 
     Attributes:
         spec: of its task: layout of an observation, meaning of the actions.
@@ -45,12 +45,11 @@ class LoadedPolicy:
     """
 
     def __init__(self, trained: TrainedPolicy, seed: int | None = None) -> None:
-        alone = single_seed(trained, trained.config.seeds[0] if seed is None else seed)
-        self.trained = alone
-        self.spec: TaskSpec = alone.spec
-        self.source = alone.source
-        self.team = alone.policy.actor.team
-        self.memory_width = int(alone.policy.initial_memory(1, torch.empty(0)).shape[-1])
+        self.trained = trained.single_seed(seed)
+        self.spec: TaskSpec = trained.spec
+        self.source = trained.source
+        self.team = trained.policy.actor.team
+        self.memory_width = int(trained.policy.initial_memory(1, torch.empty(0)).shape[-1])
 
     def act(
         self, obs: ArrayLike, rng: np.random.Generator | None = None, action_mask: ArrayLike | None = None
@@ -113,7 +112,7 @@ class LoadedPolicy:
         mask = self._checked_mask(action_mask, lead)
         space = self.spec.action
         shape = (*lead, space.width) if isinstance(space, Continuous) else lead
-        count = math.prod(lead)  # told to reshape, as it cannot be guessed where a width is 0
+        count = math.prod(lead)  # reshape cannot infer it where a width is 0
         if not count:
             return np.zeros(shape, np.float32 if isinstance(space, Continuous) else np.int64), carried
         policy, noise = self.trained.policy, None
@@ -122,8 +121,8 @@ class LoadedPolicy:
                 raise UserError(f"rng is {rng!r}; give a generator, as numpy.random.default_rng makes it")
             generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
             noise = policy.head.noise((1, count), [generator])
-        seen = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
-        action, after = policy.act(seen, torch.tensor(carried.reshape(1, count, self.memory_width)), noise, mask)
+        inputs = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
+        action, after = policy.act(inputs, torch.tensor(carried.reshape(1, count, self.memory_width)), noise, mask)
         return action.numpy().reshape(shape), after.numpy().reshape((*lead, self.memory_width))
 
     def _checked_mask(self, action_mask: ArrayLike | None, lead: tuple[int, ...]) -> torch.Tensor | None:
@@ -189,17 +188,3 @@ def load_policy(
     register_own(task, algo, network)
     name = algo if isinstance(algo, str) else None
     return LoadedPolicy(open_policy(Path(where), name, prior), seed)
-
-
-def register_own(
-    task: str | type[Environment] | None,
-    algo: str | type[Learner] | None,
-    network: str | type[NetworkConfig] | None,
-) -> None:
-    """Admit what a caller names; see `Registry.register`."""
-    if task is not None:
-        register(task)
-    if algo is not None:
-        ALGORITHMS.register(algo)
-    if network is not None:
-        NETWORKS.register(network)

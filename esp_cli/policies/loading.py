@@ -1,4 +1,4 @@
-"""Loading a trained policy from a run folder or a policy file; loading never runs code."""
+"""Trained policies, read from a run folder or a policy file or by a bundled one's name; loading never runs code."""
 
 from __future__ import annotations
 
@@ -11,18 +11,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from esp_cli.algorithms.learner import below
+from esp_cli.algorithms.learner import Learner, below
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import __version__
+from esp_cli.files.documents import shortened
+from esp_cli.files.suggesting import did_you_mean
+from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
+from esp_cli.policies import bundled
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig, resolve_task_settings
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators
+from esp_envs.base import Environment
 from esp_envs.errors import UserError
+from esp_envs.registry import register, task_names
 from esp_envs.spec import TaskSpec
 
 
@@ -48,74 +54,146 @@ class TrainedPolicy:
     notes: tuple[str, ...] = ()
     stopped: tuple[int, ...] = ()
 
+    @classmethod
+    def read(cls, path: Path, sha256: str | None = None) -> TrainedPolicy:
+        """Read the policy of a run folder (its newest checkpoint, else its policy file) or of a policy file.
 
-def load_policy(path: Path, sha256: str | None = None) -> TrainedPolicy:
-    """Load the policy of a run folder (its newest checkpoint, else its policy file) or of a policy file.
+        Args:
+            path: of the folder or file.
+            sha256: that a manifest states of the file.
 
-    Args:
-        path: of the folder or file.
-        sha256: that a manifest states of the file.
-
-    Raises:
-        UserError: nothing there, not one of ours, damaged, or of another version of the task.
-    """
-    if sha256 is not None or path.is_file():
-        tensors, meta = read_policy(path, sha256)
-        writer = meta.get("esp_version", __version__)
-        return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
-    folder = RunFolder.open(path)
-    config, notes = parse_config(folder.config, path), list[str]()
-    found = folder.latest_checkpoint(notes.append)
-    if found is None and folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
-        return _build(path, config, *read_policy(folder.policy_path))
-    if found is None:
+        Raises:
+            UserError: nothing there, not one of ours, damaged, or of another version of the task.
+        """
+        if sha256 is not None or path.is_file():
+            tensors, meta = read_policy(path, sha256)
+            writer = meta.get("esp_version", __version__)
+            return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
+        folder, notes = RunFolder.open(path), list[str]()
+        config, checkpoint = parse_config(folder.config, path), folder.latest_checkpoint(notes.append)
+        if checkpoint is not None:
+            tensors, meta = checkpoint
+            return _build(path, config, below(tensors, "policy"), meta, tuple(notes))
+        if folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
+            return _build(path, config, *read_policy(folder.policy_path))
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
-    tensors, meta = found
-    return _build(path, config, below(tensors, "policy"), meta, tuple(notes))
+
+    def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:
+        """Return the policy for its task under other settings: another physics, more noise, another reward.
+
+        Args:
+            settings: task settings that differ from those of its training.
+
+        Raises:
+            UserError: an unknown setting, or one under which the policy does not see or do the same things.
+        """
+        if not settings:
+            return self
+        changed = resolve_task_settings(self.config.task, {**self.config.task_settings, **settings})
+        config = self.config.model_copy(update={"task_settings": changed})
+        spec = spec_of(config)
+        for part in ("num_agents", "observation", "action", "masks"):
+            if getattr(spec, part) != getattr(self.spec, part):
+                names = ", ".join(f"task.{name}" for name in settings)
+                raise UserError(
+                    f"{self.source} was trained with other {part.replace('num_', '')} than the task has with {names} "
+                    "changed; change only what a policy neither sees nor does"
+                )
+        return replace(self, config=config, spec=spec)
+
+    def index_of(self, seed: int | None) -> int:
+        """Return the place of a seed, by default of the first.
+
+        Raises:
+            UserError: the run does not have this seed.
+        """
+        seeds = self.config.seeds
+        if seed is not None and seed not in seeds:
+            raise UserError(f"{self.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
+        return 0 if seed is None else seeds.index(seed)
+
+    def single_seed(self, seed: int | None = None) -> TrainedPolicy:
+        """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export.
+
+        Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
+
+        Raises:
+            UserError: the run does not have this seed.
+        """
+        index = self.index_of(seed)
+        network = _at_default(self.config.network, "precision", "compiled")
+        choice = {"seeds": self.config.seeds[index : index + 1], "network": network, "device": "cpu"}
+        config = self.config.model_copy(update=choice)
+        policy = _untrained(config, self.spec, network)
+        policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in self.policy.state_dict().items()})
+        return replace(self, config=config, policy=policy, stopped=(0,) if index in self.stopped else ())
 
 
-def transfer(trained: TrainedPolicy, settings: Mapping[str, object]) -> TrainedPolicy:
-    """Return the policy for its task under other settings: another physics, more noise, another reward.
+def open_policy(where: Path, algo: str | None = None, prior: str | None = None) -> TrainedPolicy:
+    """Open a run folder, a policy file, or a bundled policy by its name or its task's.
+
+    An existing path goes before a bundled policy of that name, unless algorithm or prior is given.
 
     Args:
-        trained: the policy as it was trained.
-        settings: task settings that differ from those of its training.
+        where: path or name.
+        algo: of the bundled policies, only those that this algorithm trained; module:Class chooses none.
+        prior: likewise this kind of prior.
 
     Raises:
-        UserError: an unknown setting, or one under which the policy does not see or do the same things.
+        UserError: nothing there, damaged, or of another version.
     """
-    if not settings:
-        return trained
-    changed = resolve_task_settings(trained.config.task, {**trained.config.task_settings, **settings})
-    config = trained.config.model_copy(update={"task_settings": changed})
-    spec = spec_of(config)
-    for part in ("num_agents", "observation", "action", "masks"):
-        if getattr(spec, part) != getattr(trained.spec, part):
-            names = ", ".join(f"task.{name}" for name in settings)
-            raise UserError(
-                f"{trained.source} was trained with other {part.replace('num_', '')} than the task has with {names} "
-                "changed; change only what a policy neither sees nor does"
-            )
-    return replace(trained, config=config, spec=spec)
+    name = str(where)
+    if algo is not None and ":" in algo:  # an algorithm of the caller, which trained no bundled policy
+        algo = None
+    chosen = algo is not None or prior is not None
+    try:
+        exists = where.exists()
+    except OSError as error:  # a name that no file can have
+        raise UserError(f"there is no policy {shortened(name)}: {error.strerror}") from None
+    if exists and not chosen:
+        return TrainedPolicy.read(where)
+    known = [*task_names(), *(entry.name for entry in bundled.read_bundled())]
+    if name in known:
+        entry = bundled.find(name, algo, prior)
+        trained = load_entry(entry)
+        note = f"{name}: taking the bundled policy {entry.name}"
+        return trained if entry.name == name else replace(trained, notes=(*trained.notes, note))
+    if chosen:
+        raise UserError(f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out")
+    hint = did_you_mean(name, known) or "; give a run folder, a policy file, or a task's or policy's name"
+    raise UserError(f"{where} does not exist{hint}")
 
 
-def single_seed(trained: TrainedPolicy, seed: int) -> TrainedPolicy:
-    """Return one seed's policy, on the CPU and with products in float32, for export.
-
-    Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
+def load_entry(entry: bundled.Entry) -> TrainedPolicy:
+    """Load a bundled policy.
 
     Raises:
-        UserError: the run does not have this seed.
+        UserError: its file is missing, another than the manifest names, or of another version.
     """
-    seeds = trained.config.seeds
-    if seed not in seeds:
-        raise UserError(f"{trained.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-    network = _at_default(trained.config.network, "precision", "compiled")
-    config = trained.config.model_copy(update={"seeds": (seed,), "network": network, "device": "cpu"})
-    policy = ALGORITHMS[config.algorithm].build_policy(trained.spec, network, generators(config.seeds, "shape")).eval()
-    index = seeds.index(seed)
-    policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in trained.policy.state_dict().items()})
-    return replace(trained, config=config, policy=policy, stopped=(0,) if index in trained.stopped else ())
+    trained = TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
+    described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
+    if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
+        raise UserError(f"{trained.source} does not hold the policy that its manifest describes; get both again")
+    return trained
+
+
+def register_own(
+    task: str | type[Environment] | None,
+    algo: str | type[Learner] | None,
+    network: str | type[NetworkConfig] | None,
+) -> None:
+    """Register the task, algorithm and network that a caller names; see `Registry.register`."""
+    if task is not None:
+        register(task)
+    if algo is not None:
+        ALGORITHMS.register(algo)
+    if network is not None:
+        NETWORKS.register(network)
+
+
+def _untrained(config: RunConfig, spec: TaskSpec, network: NetworkConfig) -> Policy:
+    """Return the policy of a configuration before training, in evaluation mode."""
+    return ALGORITHMS[config.algorithm].build_policy(spec, network, generators(config.seeds, "shape")).eval()
 
 
 def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
@@ -147,9 +225,8 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise UserError(f"{misfit} (hidden widths {config.network.hidden})")
-    build = ALGORITHMS[config.algorithm].build_policy
-    network = _at_default(config.network, "compiled")  # whoever uses a policy needs no compiler
-    policy = build(spec, network, generators(config.seeds, "shape")).to(config.device).eval()
+    network = _at_default(config.network, "compiled")  # using a policy needs no compiler
+    policy = _untrained(config, spec, network).to(config.device)
     _fill(policy, tensors, path, misfit)
     stopped = _stopped(meta, len(config.seeds))
     if stopped:

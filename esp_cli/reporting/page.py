@@ -16,11 +16,11 @@ from typing import NamedTuple
 from jinja2 import Environment, FileSystemLoader
 
 from esp_cli.defaults import __version__
-from esp_cli.drawing.draw import draw
+from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
-from esp_cli.policies.loading import load_policy
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.exports import marl_eval
 from esp_cli.reporting.results import RESULTS_FORMAT
@@ -106,11 +106,11 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
     """
     for count, run in enumerate(runs.values(), start=1):
         if (run / POLICY).is_file() and not _film(run / FILM):
-            trained = load_policy(run / POLICY)
+            trained = TrainedPolicy.read(run / POLICY)
             speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
             with TemporaryDirectory() as scratch:
                 film = Path(scratch) / FILM
-                draw(trained, film, view="top", size=_FILM_PIXELS, speed=speed, fps=_FILM_FRAMES_PER_SECOND)
+                draw(Request(film, view="top", size=_FILM_PIXELS, speed=speed, fps=_FILM_FRAMES_PER_SECOND), [trained])
                 replace_file(run / FILM, film.read_bytes())
         watch(count)
 

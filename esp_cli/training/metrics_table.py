@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 class Metrics(Mapping[str, Floats]):
     """Metrics by name: one row per update, one column per seed, [U, S]; [U, 1] of what the run has as a whole.
 
+    Example:
+        Run("runs/cn").metrics["eval/return_greedy"][-1]  # the last evaluation of each seed
+
     A number is NaN where it was not measured, or its seed had stopped. The first row is the evaluation before training.
 
     Args:

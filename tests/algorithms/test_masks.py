@@ -12,7 +12,7 @@ from esp_cli import load_policy, train
 from esp_cli.checking import check_symmetry
 from esp_cli.networks.exploration import EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import Categorical, masked
-from esp_cli.policies import loading
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.symmetry import transform_set
 from esp_envs import Discrete, Kind, make, register
 from esp_envs.base import random_choice
@@ -234,11 +234,11 @@ def test_masks_need_discrete_actions():
 def test_a_policy_is_not_evaluated_where_other_masks_bind_it(tmp_path, fenced):
     settings = {"task.fenced": fenced, "qmix.num_envs": 4, "network.hidden": [8], "evaluation.episodes": 2}
     train(Gated, "qmix", steps=48, settings=settings, out=tmp_path / "run")
-    trained = loading.load_policy(tmp_path / "run")
+    trained = TrainedPolicy.read(tmp_path / "run")
     with pytest.raises(ValueError, match="masks") as caught:
-        loading.transfer(trained, {"fenced": not fenced})
+        trained.transfer({"fenced": not fenced})
     assert str(caught.value) == (
         f"{tmp_path / 'run'} was trained with other masks than the task has with task.fenced changed; change only what "
         "a policy neither sees nor does"
     )
-    assert loading.transfer(trained, {"horizon": 3}).spec.masks == fenced, "the control"
+    assert trained.transfer({"horizon": 3}).spec.masks == fenced, "the control"

@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from esp_cli.app import app
-from esp_cli.policies import bundled
+from esp_cli.policies import loading
 from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
@@ -69,8 +69,8 @@ def test_one_seed_has_no_error_over_seeds_and_states_that_over_episodes(tmp_path
 
 
 def test_one_seed_that_stopped_has_no_return(monkeypatch: pytest.MonkeyPatch) -> None:
-    open_policy = bundled.open_policy
-    monkeypatch.setattr(bundled, "open_policy", lambda *given: replace(open_policy(*given), stopped=(0,)))
+    open_policy = loading.open_policy
+    monkeypatch.setattr(loading, "open_policy", lambda *given: replace(open_policy(*given), stopped=(0,)))
     told = CliRunner().invoke(app, ["eval", "navigation", "--episodes", "2"])
     assert told.exit_code == 0
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in told.stdout.splitlines()]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.export import check
-from esp_cli.policies.manifest import MANIFEST, bundled_folder, read_bundled
+from esp_cli.export import c_check
+from esp_cli.policies.bundled import MANIFEST, bundled_folder, read_bundled
 from tests.cli.running import DAMAGE, esp, refused
 
 
@@ -23,7 +23,7 @@ def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "out" / "policy.json").read_text())["policy"]["seed"] in (3, 7)
 
 
-@pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
 def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None:
     result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7, "--json", "-")
     written = json.loads(result.stdout)
@@ -36,7 +36,7 @@ def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None
 def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(check, "compiler", lambda: None)
+    monkeypatch.setattr(c_check, "compiler", lambda: None)
     result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7)
     assert "there is no C compiler cc here" in result.stderr
     assert "Not compared with the policy" in (tmp_path / "README.md").read_text()
@@ -49,7 +49,7 @@ def test_a_policy_goes_into_a_folder_and_is_used_from_there(
     result = esp("export", finished, "-f", "policy", "-o", folder, "--episodes", 4)
     (entry,) = read_bundled(folder)
     assert f"{entry.name}: seed {entry.seed} of 2" in result.stderr
-    monkeypatch.setattr("esp_cli.policies.manifest.bundled_folder", lambda: folder)
+    monkeypatch.setattr("esp_cli.policies.bundled.bundled_folder", lambda: folder)
     judged = json.loads(esp("eval", "navigation", "--episodes", 4, "--json", "-").stdout)
     assert judged["greedy"]["mean"] == pytest.approx(entry.score.mean)
     assert entry.name in esp("policies", "navigation").stdout

@@ -26,7 +26,7 @@ from esp_cli.commands import COMMANDS
 from esp_cli.console import streams
 from esp_cli.console.progress import progress_line
 from esp_cli.console.tables import lay_out
-from esp_cli.policies.manifest import read_bundled
+from esp_cli.policies.bundled import read_bundled
 from tests.cli.running import TINY_OPTIONS, esp
 
 ROOT = Path(__file__).parents[2]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from esp_cli.drawing import frames
-from esp_cli.drawing.frames import Mark, Moment, frame, marks
+from esp_cli.drawing.frames import Mark, frame, marks
+from esp_cli.drawing.recording import Moment
 from esp_envs import Body, Scene
 from esp_envs.drawing import TopPainter, draw
 

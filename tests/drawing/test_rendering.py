@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from dataclasses import replace
 
 import imageio.v3 as iio
 import numpy as np
@@ -10,9 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
+from esp_cli.drawing.draw import open_painter, shots, stride, write_film
 from esp_cli.drawing.films import write_gif, write_mp4
-from esp_cli.drawing.recording import Episode, framed, record, record_both
-from esp_cli.drawing.rendering import HOLD_SECONDS, open_painter, shots, stride, write_film
+from esp_cli.drawing.recording import HOLD_SECONDS, Episode, framed, record
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
@@ -22,6 +23,7 @@ from esp_envs import Body, Scene
 from esp_envs.base import Environment
 from esp_envs.compass import Compass
 from esp_envs.drawing import TopPainter, draw
+from esp_envs.errors import UserError
 from tests.training.runs import tiny_config
 
 SEEDS = (3, 7)
@@ -41,9 +43,10 @@ def env(trained):
     return build_environment(trained.config, 1, "film")
 
 
-def filmed(trained, *choice):
-    """Record in a new environment."""
-    return record(trained, build_environment(trained.config, 1, "film"), *choice)
+def filmed(trained, seed, *choice):
+    """Record the episodes of one seed."""
+    (own,) = record([trained.single_seed(seed)], *choice)
+    return own
 
 
 def line(count=9, trail=True):
@@ -58,16 +61,16 @@ def episode(scenes):
     return Episode(scenes, [float(k) for k in range(len(scenes))])
 
 
-def test_the_start_and_every_step_of_every_episode_are_recorded(trained, env):
-    episodes = record(trained, env, 3, 2)
+def test_the_start_and_every_step_of_every_episode_are_recorded(trained):
+    episodes = filmed(trained, 3, 2)
     assert [len(episode.scenes) for episode in episodes] == [6 + 1, 6 + 1]
     assert [episode.steps for episode in episodes] == [6, 6]
     flat = [scene for episode in episodes for scene in episode.scenes]
     assert len(set(flat)) == len(flat), "something moves in each"
 
 
-def test_returns_are_what_the_agents_got_so_far(trained, env):
-    (recorded,) = record(trained, env, 7, 1)
+def test_returns_are_what_the_agents_got_so_far(trained):
+    (recorded,) = filmed(trained, 7, 1)
     fresh = build_environment(trained.config, 1, "film")
     controller, observation = PolicyController(trained.policy), fresh.reset()
     controller.begin(fresh, observation)
@@ -130,20 +133,19 @@ def test_an_episode_that_ends_early_ends_the_recording(trained, monkeypatch):
     step = kind.step
 
     def ending(self, action):
-        """Seed 7's world reaches its end in the third step, seed 3's in the second."""
+        """Reach the end in the third step."""
         result = step(self, action)
-        ended = torch.tensor([[self._time >= 2], [self._time >= 3]])
+        ended = torch.tensor([[self._time >= 3]])
         return type(result)(result.next, result.reward, ended, result.truncated, result.next, result.metrics)
 
     monkeypatch.setattr(kind, "step", ending)
-    assert [episode.steps for episode in filmed(trained, 3, 1)] == [2]
     assert [episode.steps for episode in filmed(trained, 7, 2)] == [3, 3]
 
 
 @pytest.mark.parametrize(("horizon", "episodes"), [(2, 10), (10, 5), (25, 3), (40, 2), (60, 1), (150, 1)])
 def test_episodes_follow_each_other_until_a_film_lasts_about_eight_seconds(trained, horizon, episodes):
     config = tiny_config(seeds=SEEDS, task__horizon=horizon)
-    recorded = record(trained, build_environment(config, 1, "film"), 3)
+    recorded = filmed(replace(trained, config=config), 3)
     assert len(recorded) == episodes
     seconds = episodes * (0.1 * horizon + HOLD_SECONDS)
     assert episodes == 1 or abs(seconds - 8) <= (0.1 * horizon + HOLD_SECONDS) / 2
@@ -157,31 +159,31 @@ def test_two_policies_play_the_same_episodes(trained, tmp_path):
         0,
         tmp_path / "other",
     )
-    first, second = record_both(trained, other, (3, 7), 2, True)
+    first, second = record([trained.single_seed(3), other.single_seed(7)], 2)
     assert first == filmed(trained, 3, 2), "the first plays what it plays alone"
     for one, another in zip(first, second, strict=True):
         assert one.scenes[0] == another.scenes[0]
         assert one.scenes[-1] != another.scenes[-1]
-    assert record_both(trained, other, (7, 7), 1, True)[0] != first[:1]
+    assert record([trained.single_seed(7), other.single_seed(7)], 1)[0] != first[:1]
     crowded = tiny_config(seeds=SEEDS, task__horizon=6, task__num_landmarks=2)
     spec = build_environment(crowded, 1, "shape").spec
     fewer = TrainedPolicy(
         crowded, StochasticPolicy(spec, crowded.network, generators(SEEDS, "weights")), spec, 0, tmp_path / "fewer"
     )
     with pytest.raises(ValueError, match=r"begin differently; compare policies whose task has the same settings"):
-        record_both(trained, fewer, (3, 3), 1, True)
+        record([trained.single_seed(3), fewer.single_seed(3)], 1)
 
 
 def test_a_window_grows_until_everything_stays_in_it():
-    inside = [episode(line(3))]
+    inside = [[episode(line(3))]]
     assert framed(inside) == inside
     leaving = Scene((Body((1.4, 0.0), 0.1, RED),), (-1.0, 1.0, -1.0, 1.0))
     near = Scene((Body((0.92, 0.0), 0.1, RED),), (-1.0, 1.0, -1.0, 1.0))
-    assert framed([episode([near])]) == [episode([near])], "what sticks out by a hair moves no window"
-    wide = framed([*inside, episode([leaving, near])])
-    windows = {scene.window for one in wide for scene in one.scenes}
+    assert framed([[episode([near])]]) == [[episode([near])]], "what sticks out by a hair moves no window"
+    (wide, other) = framed([*inside, [episode([leaving, near])]])
+    windows = {scene.window for one in (*wide, *other) for scene in one.scenes}
     assert windows == {(-1.5, 1.5, -1.5, 1.5)}, "one for all episodes"
-    assert wide[0].scenes[0].bodies == inside[0].scenes[0].bodies
+    assert wide[0].scenes[0].bodies == inside[0][0].scenes[0].bodies
 
 
 @pytest.mark.parametrize(
@@ -330,7 +332,7 @@ def test_the_view_in_space_is_taken_where_there_is_one(env, monkeypatch):
 def test_a_picture_comes_out_where_space_cannot_be_drawn(env, monkeypatch):
     @contextlib.contextmanager
     def broken(size):
-        raise ValueError("no library here can draw")
+        raise UserError("no library here can draw")
         yield
 
     monkeypatch.setattr(env, "painter", broken)

@@ -15,14 +15,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from esp_cli.export import check, epuck
-from esp_cli.export.epuck_c import epuck_sources
+from esp_cli.export import c_check, check, epuck
+from esp_cli.export.epuck_files import c_files
 from esp_cli.export.export import export
 from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
 from esp_envs.epuck.arena import Arena
 from tests.export.policies import drawn_policy
 
-needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
     "offset": {},
     "goal in its unit": {"goal_sight_m": 0.3},
@@ -46,14 +46,14 @@ def policy_with(monkeypatch: pytest.MonkeyPatch, kind: str = "wheels", **setting
 def test_c_and_python_see_from_poses_what_the_task_shows(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = policy_with(monkeypatch, **SETTINGS[case])
+    trained = policy_with(monkeypatch, **SETTINGS[case])
     assert epuck.STATES == 10_000
     states = epuck.STATES if case == "offset" else 2_000
-    scenes = epuck.take_scenes(alone, states)
-    assert len(scenes.poses) == len(scenes.seen) == states
+    scenes = epuck.take_scenes(trained, states)
+    assert len(scenes.poses) == len(scenes.observations) == states
     assert len(np.unique(scenes.poses[:, 0, 0])) > 0.99 * states, "states differ"
-    monkeypatch.setattr(epuck, "take_scenes", lambda alone: scenes)
-    results = export(alone, ["c", "numpy", "onnx"], tmp_path).formats
+    monkeypatch.setattr(epuck, "take_scenes", lambda trained: scenes)
+    results = export(trained, ["c", "numpy", "onnx"], tmp_path).formats
     seen = {result.name: result.seen for result in results}
     assert 0 < seen["c"] < epuck.TOLERANCE
     assert 0 < seen["numpy"] < epuck.TOLERANCE
@@ -63,9 +63,9 @@ def test_c_and_python_see_from_poses_what_the_task_shows(
 
 
 def test_an_observation_that_is_built_wrongly_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = policy_with(monkeypatch, sight="nearness")
-    scenes = epuck.take_scenes(alone, 300)
-    description = described(alone)
+    trained = policy_with(monkeypatch, sight="nearness")
+    scenes = epuck.take_scenes(trained, 300)
+    description = described(trained)
     assert epuck.compare_scenes(scenes, epuck.python_observer(description)) < 1e-6
     for part, wrong in (("fading_m", 0.201), ("body_radius_m", 0.038)):
         spoilt = description | {"robot": description["robot"] | {part: wrong}}
@@ -74,25 +74,25 @@ def test_an_observation_that_is_built_wrongly_is_found(monkeypatch: pytest.Monke
     swapped = description | {"observation": description["observation"][::-1]}
     with pytest.raises(RuntimeError, match="differs from the task's"):
         epuck.compare_scenes(scenes, epuck.python_observer(swapped))
-    unseen = replace(scenes, seen=np.full_like(scenes.seen, np.nan))
+    unseen = replace(scenes, observations=np.full_like(scenes.observations, np.nan))
     with pytest.raises(RuntimeError, match="differs from the task's by nan"):
         epuck.compare_scenes(unseen, epuck.python_observer(description))
 
 
-def described(alone) -> dict:
+def described(trained) -> dict:
     """Return what the exports of a policy are written from."""
     from esp_cli.export.card import describe
     from esp_cli.export.translate import program_of
 
-    program = program_of(alone.policy)
-    return describe(alone, program, check.take_sample(alone, program, 16))
+    program = program_of(trained.policy)
+    return describe(trained, program, check.take_sample(trained, program, 16))
 
 
 def test_what_poses_do_not_tell_is_refused() -> None:
     description = described(drawn_policy("wheels"))
     description["observation"] = [*description["observation"], {"field": "camera", "index": "8..9"}]
     with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
-        epuck_sources(description)
+        c_files(description)
     with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
         Pilot(description, lambda obs: obs)
 
@@ -120,8 +120,8 @@ UNSAFE = {
 
 @pytest.mark.parametrize("case", UNSAFE)
 def test_a_team_stands_still_where_it_is_not_safe_to_drive(case: str) -> None:
-    alone = drawn_policy("wheels")
-    pilot = Pilot(described(alone), lambda obs: obs[..., :2])
+    trained = drawn_policy("wheels")
+    pilot = Pilot(described(trained), lambda obs: obs[..., :2])
     safe = {"poses": TEAM, "goals": GOALS, "pillars": PILLARS, "age_s": PATIENCE_S}
     assert np.abs(pilot.wheels(**safe)).min() > 0
     assert not pilot.wheels(**safe | UNSAFE[case]).any()
@@ -135,16 +135,16 @@ def test_a_team_stands_still_where_its_policy_says_no_number() -> None:
 @pytest.fixture(scope="module", params=["wheels", "wheel pairs"])
 def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
     """Return an exported policy as a compiled library, and its controller in Python."""
-    if check.compiler() is None:
+    if c_check.compiler() is None:
         pytest.skip("needs a C compiler")
     folder, take = tmp_path_factory.mktemp("c"), epuck.take_scenes
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(epuck, "take_scenes", lambda alone: take(alone, 20))
+        patch.setattr(epuck, "take_scenes", lambda trained: take(trained, 20))
         export(drawn_policy(request.param), ["c", "numpy"], folder)
     spec = importlib.util.spec_from_file_location("exported_for_c", folder / "policy.py")
     policy = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(policy)
-    return check.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
+    return c_check.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
 
 
 def driven(code: ctypes.CDLL, own: int, poses=TEAM, goals=GOALS, pillars=PILLARS, age_s=0.1, robots=3):
@@ -178,7 +178,7 @@ def test_a_robot_driven_by_c_needs_the_bodies_that_it_sees(compiled) -> None:
 
 def exported(folder: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     take = epuck.take_scenes
-    monkeypatch.setattr(epuck, "take_scenes", lambda alone: take(alone, 20))
+    monkeypatch.setattr(epuck, "take_scenes", lambda trained: take(trained, 20))
     export(drawn_policy("wheels"), [form], folder)
     return folder
 
@@ -252,6 +252,6 @@ def test_the_launch_file_starts_the_node_of_the_package(tmp_path: Path, monkeypa
 
 
 def test_what_remembers_goes_out_without_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = policy_with(monkeypatch, "point, recurrent")
-    assert "esp_epuck.c" not in export(alone, ["numpy"], tmp_path).formats[0].files
+    trained = policy_with(monkeypatch, "point, recurrent")
+    assert "esp_epuck.c" not in export(trained, ["numpy"], tmp_path).formats[0].files
     assert not (tmp_path / "esp_epuck.py").exists()

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from esp_cli.commands import export as command
-from esp_cli.export import check, onnx_file
-from esp_cli.export.c_source import c_source
+from esp_cli.export import c_check, check, onnx_file
+from esp_cli.export.c_source import cost
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import export
 from esp_cli.export.formats import FORMATS
@@ -26,7 +26,7 @@ from tests.export.policies import KINDS, drawn_policy
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c", "onnx")
-needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
 
 
 @needs_cc
@@ -52,11 +52,11 @@ def test_torch_archives_agree_with_the_policy(kind: str, tmp_path: Path) -> None
 
 
 def test_both_halves_of_the_sample_are_there() -> None:
-    alone = drawn_policy("choice, recurrent")
-    program = program_of(alone.policy)
-    sample = take_sample(alone, program, 400)
+    trained = drawn_policy("choice, recurrent")
+    program = program_of(trained.policy)
+    sample = take_sample(trained, program, 400)
     assert sample.obs.shape == (400, program.num_inputs)
-    assert not sample.memory[: alone.spec.num_agents].any(), "an episode begins with empty memory"
+    assert not sample.memory[: trained.spec.num_agents].any(), "an episode begins with empty memory"
     assert sample.memory[100:200].any()
     # of random observations one in three lies beyond 1, of those of the task hardly any of the first steps
     assert (np.abs(sample.obs[200:]) > 1).mean() == pytest.approx(0.317, abs=0.03)
@@ -65,9 +65,9 @@ def test_both_halves_of_the_sample_are_there() -> None:
 
 @pytest.mark.parametrize("kind", ["choice", "wheels"])
 def test_a_wrong_weight_is_found(kind: str) -> None:
-    alone = drawn_policy(kind)
-    program = program_of(alone.policy)
-    sample = take_sample(alone, program, 500)
+    trained = drawn_policy(kind)
+    program = program_of(trained.policy)
+    sample = take_sample(trained, program, 500)
 
     def runner(spoilt: float) -> check.Runner:
         weights = np.frombuffer(program.weights, "<f4").copy()
@@ -86,8 +86,8 @@ def test_a_wrong_weight_is_found(kind: str) -> None:
 
 
 def test_another_choice_that_is_no_tie_is_found() -> None:
-    alone = drawn_policy("choice")
-    sample = take_sample(alone, program_of(alone.policy), 100)
+    trained = drawn_policy("choice")
+    sample = take_sample(trained, program_of(trained.policy), 100)
     others = (sample.action + 1) % 5
     with pytest.raises(RuntimeError, match="differs from the policy"):
         compare(sample, lambda obs, memory, mask: (others, sample.outputs, sample.after))
@@ -95,8 +95,8 @@ def test_another_choice_that_is_no_tie_is_found() -> None:
 
 @pytest.mark.parametrize(("kind", "spoilt"), [("choice, recurrent", "memory"), ("wheels", "action")])
 def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: str) -> None:
-    alone = drawn_policy(kind)
-    sample = take_sample(alone, program_of(alone.policy), 100)
+    trained = drawn_policy(kind)
+    sample = take_sample(trained, program_of(trained.policy), 100)
     right, wrong = {"action": sample.action, "memory": sample.after}, 0.01
 
     def runner(said: dict[str, np.ndarray]) -> check.Runner:
@@ -116,9 +116,9 @@ def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
     assert program.num_parameters == 8 * 3 + 3 + 3 * 2 + 2 == 35
     assert program.flops == 2 * 24 + 3 + 2 * 6 + 5 * 2
     assert (program.head, program.groups, program.memory_width) == ("squash", (1, 1), 0)
-    written = c_source(program, "")
-    assert written.flash_bytes == 4 * 35
-    assert written.ram_bytes == 4 * (8 + 8), "two rows as wide as the widest layer"
+    needed = cost(program)
+    assert needed.flash_bytes == 4 * 35
+    assert needed.ram_bytes == 4 * (8 + 8), "two rows as wide as the widest layer"
 
 
 def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
@@ -143,15 +143,15 @@ def load(file: Path):
 @torch.no_grad()
 @pytest.mark.parametrize("kind", ["choice, recurrent", "point, recurrent", "values, recurrent"])
 def test_a_recurrent_export_goes_through_an_episode_like_the_policy(kind: str, tmp_path: Path) -> None:
-    alone = drawn_policy(kind)
-    export(alone, ["numpy"], tmp_path)
+    trained = drawn_policy(kind)
+    export(trained, ["numpy"], tmp_path)
     module = load(tmp_path / "policy.py")
-    env = build_environment(alone.config, 2, "test")
+    env = build_environment(trained.config, 2, "test")
     observation = env.reset()
-    memory = alone.policy.initial_memory(2, observation.obs)
-    carried = module.initial_memory(1, 2, alone.spec.num_agents)
-    for _ in range(alone.spec.horizon):
-        action, memory = alone.policy.act(observation.obs, memory)
+    memory = trained.policy.initial_memory(2, observation.obs)
+    carried = module.initial_memory(1, 2, trained.spec.num_agents)
+    for _ in range(trained.spec.horizon):
+        action, memory = trained.policy.act(observation.obs, memory)
         exported, carried = module.step(observation.obs.numpy(), carried)
         assert np.allclose(exported, action.numpy(), atol=1e-4)
         observation = env.step(action).next
@@ -186,16 +186,16 @@ def test_the_python_file_refuses_what_does_not_fit(tmp_path: Path) -> None:
 @needs_cc
 def test_the_worked_example_in_c_fails_where_the_weights_are_others(tmp_path: Path) -> None:
     export(drawn_policy("wheels"), ["c"], tmp_path)
-    assert check.example_runs(tmp_path)
+    assert c_check.example_runs(tmp_path)
     source = (tmp_path / "policy.c").read_text()
     begin = source.index("= {\n", source.index("static const float w4_1")) + 4
     (tmp_path / "policy.c").write_text(source[:begin] + "    0.5f," + source[source.index(",", begin) + 1 :])
-    assert not check.example_runs(tmp_path)
+    assert not c_check.example_runs(tmp_path)
 
 
 def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
-    alone = drawn_policy("wheel pairs")
-    export(alone, [name for name in FORMATS if name != "torch"], tmp_path)
+    trained = drawn_policy("wheel pairs")
+    export(trained, [name for name in FORMATS if name != "torch"], tmp_path)
     said = json.loads((tmp_path / "policy.json").read_text())
     fields = [(row["index"], row["field"], row["unit"]) for row in said["observation"]]
     assert fields == [
@@ -211,7 +211,7 @@ def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
     assert len(example["observation"]) == 8
     assert example["action"] == int(np.argmax(example["outputs"]))
     page = (tmp_path / "README.md").read_text()
-    for part in ("| 2..3 | obstacle | vector x 1 | m |", "STM32F407", "never on hardware", "Worked example", "10000"):
+    for part in ("   2..3  obstacle: vector x 1 (m)\n", "STM32F407", "never on hardware", "Worked example", "10000"):
         assert part in page
     import onnx
 
@@ -228,16 +228,16 @@ def test_an_onnx_export_without_its_libraries_names_them(monkeypatch: pytest.Mon
 
 
 def test_what_is_in_the_way_is_not_written_over(tmp_path: Path) -> None:
-    alone = drawn_policy("wheels")
+    trained = drawn_policy("wheels")
     (tmp_path / "policy.py").write_text("mine")
     with pytest.raises(ValueError, match=r"has policy\.py already"):
-        export(alone, ["numpy"], tmp_path)
+        export(trained, ["numpy"], tmp_path)
     assert (tmp_path / "policy.py").read_text() == "mine"
-    export(alone, ["numpy"], tmp_path, force=True)
+    export(trained, ["numpy"], tmp_path, force=True)
     assert "NumpyPolicy" in (tmp_path / "policy.py").read_text()
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="is a file; name a folder"):
-        export(alone, ["numpy"], tmp_path / "file")
+        export(trained, ["numpy"], tmp_path / "file")
 
 
 @pytest.mark.parametrize("kind", ["choice", "choice, recurrent"])
@@ -251,7 +251,7 @@ def test_the_command_lists_every_format() -> None:
 
 
 def test_a_policy_that_the_rounding_of_its_observations_moves_is_no_bug_of_the_export() -> None:
-    sample = take_sample(alone := drawn_policy("choice"), program_of(alone.policy), 100)
+    sample = take_sample(trained := drawn_policy("choice"), program_of(trained.policy), 100)
     seen = sample.obs.copy()
 
     def steep(obs: np.ndarray, memory: np.ndarray, mask: np.ndarray | None) -> tuple:

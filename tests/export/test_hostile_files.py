@@ -20,11 +20,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from esp_cli.policies.bundled import MANIFEST, read_bundled, write_bundled
 from esp_cli.policies.bundling import bundle
 from esp_cli.policies.loaded import load_policy
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.loading import load_policy as load_trained
-from esp_cli.policies.manifest import MANIFEST, read_bundled, write_bundled
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_envs.policy_format import POLICY_FORMAT
 from tests.export.policies import drawn_policy, write_policy
@@ -132,7 +131,7 @@ def test_spoilt_bytes_give_a_sentence_or_the_very_same_policy(
     before, refused, count = peak_kb(), 0, -(-SPOILT // len(SPOILERS))
     for _ in range(count):
         path.write_bytes(spoiler(bytearray(content), draw))
-        loaded = attempt(lambda: load_trained(path))
+        loaded = attempt(lambda: TrainedPolicy.read(path))
         refused += loaded is None
         # what is not meant (a space in the JSON) may change; whoever gets a policy gets the right one
         assert loaded is None or same(loaded, original)
@@ -196,7 +195,7 @@ def test_files_written_on_purpose_give_a_sentence_or_a_policy(kind: str, tmp_pat
         description = meta if spoil_tensors else with_hostile_value(meta, draw)
         stored = with_hostile_tensor(tensors, draw) if spoil_tensors else tensors
         save_checkpoint(path, stored, description, POLICY_FORMAT)
-        loaded = attempt(lambda: load_trained(path))
+        loaded = attempt(lambda: TrainedPolicy.read(path))
         refused += loaded is None
         assert loaded is None or all(bool(t.isfinite().all()) for t in loaded.policy.state_dict().values())
     # the rest changed what a policy does not depend on, as the steps of its run

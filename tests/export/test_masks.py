@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.export import check, onnx_file
+from esp_cli.export import c_check, onnx_file
+from esp_cli.export.c_check import c_runner
 from esp_cli.export.c_source import c_source
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import export
-from esp_cli.export.onnx_file import onnx_model
+from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
 from esp_cli.export.translate import program_of
@@ -26,7 +27,7 @@ from esp_envs.registry import TASKS
 from tests.export.policies import KINDS, drawn_policy
 from tests.fenced import Fenced
 
-needs_cc = pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
 MASKED = {
     "masked choice": ("tests.fenced:Fenced", "mappo", {}),
     "masked choice, recurrent": ("tests.fenced:Fenced", "maddpg", {"network.name": "gru"}),
@@ -82,8 +83,8 @@ def _run_calls(page: str, example: dict) -> None:
 
 
 def test_an_export_that_ignores_masks_is_found() -> None:
-    alone = drawn_policy("masked choice")
-    sample = take_sample(alone, replace(program_of(alone.policy), masked=True), 400)
+    trained = drawn_policy("masked choice")
+    sample = take_sample(trained, replace(program_of(trained.policy), masked=True), 400)
     assert sample.mask is not None
     assert not sample.mask.all()
     free = sample.outputs.argmax(-1)
@@ -111,14 +112,13 @@ def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Pa
     memory = np.zeros((len(rows), 0), np.float32)
     mask = rng.random((len(rows), program.num_outputs)) < 0.4
     mask[0], mask[1] = False, [True, *[False] * (program.num_outputs - 1)]
-    code = c_source(program, "")
-    (tmp_path / "policy.h").write_text(code.header)
-    (tmp_path / "policy.c").write_text(code.source)
+    for name, content in c_source(program, "").items():
+        (tmp_path / name).write_bytes(content)
     (tmp_path / "policy.onnx").write_bytes(onnx_model(program, "{}"))
-    action, outputs, _ = check.c_runner(tmp_path / "policy.c", program)(rows, memory, mask)
+    action, outputs, _ = c_runner(tmp_path / "policy.c", program)(rows, memory, mask)
     expected = np.where(mask | ~mask.any(-1, keepdims=True), outputs, -np.inf).argmax(-1)
     assert action.tolist() == expected.tolist()
     assert (action[0], action[1]) == (outputs[0].argmax(), 0)
-    assert check.onnx_runner(tmp_path / "policy.onnx")(rows, memory, mask)[0].tolist() == expected.tolist()
+    assert onnx_runner(tmp_path / "policy.onnx")(rows, memory, mask)[0].tolist() == expected.tolist()
     through_torch = TorchProgram(program)(torch.from_numpy(rows), action_mask=torch.from_numpy(mask))[0]
     assert through_torch.tolist() == expected.tolist()

@@ -29,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("few_scenes")
 class Team:
     """Robots and pillars in MuJoCo, as they stood in an environment, to be driven by wheel speeds."""
 
-    def __init__(self, alone: TrainedPolicy) -> None:
-        self.env = build_environment(alone.config, 1, "test")
+    def __init__(self, trained: TrainedPolicy) -> None:
+        self.env = build_environment(trained.config, 1, "test")
         self.start = self.env.reset()
         settings = self.env.settings
         robots = (1, settings.num_agents)
@@ -67,13 +67,13 @@ def fake(**members: object) -> ModuleType:
 
 
 @torch.no_grad()
-def trained_paths(alone: TrainedPolicy, team: Team) -> np.ndarray:
+def trained_paths(trained: TrainedPolicy, team: Team) -> np.ndarray:
     """Return where the policy itself drives in the environment from the team's start: [STEPS + 1, N, 3]."""
     env, observation = team.env, team.start
-    memory = alone.policy.initial_memory(1, observation.obs)
+    memory = trained.policy.initial_memory(1, observation.obs)
     paths = [env.physics.pose[0]]
     for _ in range(STEPS):
-        action, memory = alone.policy.act(observation.obs, memory)
+        action, memory = trained.policy.act(observation.obs, memory)
         observation = env.step(action).next
         paths.append(env.physics.pose[0])
     return np.stack(paths)
@@ -100,16 +100,16 @@ def policy_for(case: str, monkeypatch: pytest.MonkeyPatch) -> TrainedPolicy:
 @torch.no_grad()
 @pytest.mark.parametrize("case", SETTINGS)
 def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = policy_for(case, monkeypatch)
-    export(alone, ["webots"], tmp_path)
+    trained = policy_for(case, monkeypatch)
+    export(trained, ["webots"], tmp_path)
     module = imported(tmp_path / WEBOTS, "esp_epuck", monkeypatch)
     policy = importlib.import_module("policy")
-    pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(alone)
+    pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(trained)
     for _ in range(5):
         seen = pilot.observations(team.poses, team.goals, team.pillars[0])
         assert np.allclose(seen, team.env._seen().obs[0, 0].numpy(), atol=1e-6)
         wheels = pilot.wheels(team.poses, team.goals, team.pillars[0])
-        action = alone.policy.act(team.env._seen().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
+        action = trained.policy.act(team.env._seen().obs, torch.zeros(1, team.env.settings.num_agents, 0))[0]
         expected = team.env._wheel_speeds(action)[0]
         assert np.allclose(wheels, expected, atol=1e-4)
         assert np.abs(wheels).max() <= MAX_WHEEL_SPEED + 1e-6
@@ -134,11 +134,11 @@ def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("setting", UNSEEN)
 def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path, setting: str) -> None:
-    alone = drawn_policy(setting)
+    trained = drawn_policy(setting)
     for kind in ("ros2", "webots"):
         with pytest.raises(ValueError, match=r"without heading_offset_rad and blind_sector_rad; train without them"):
-            export(alone, [kind], tmp_path)
-    export(alone, ["numpy"], tmp_path)
+            export(trained, [kind], tmp_path)
+    export(trained, ["numpy"], tmp_path)
     assert "from poses" not in (tmp_path / "README.md").read_text()
 
 
@@ -210,9 +210,9 @@ class Robot:
 def test_the_webots_controller_drives_as_the_policy_does(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = policy_for(case, monkeypatch)
-    export(alone, ["webots"], tmp_path)
-    team = Team(alone)
+    trained = policy_for(case, monkeypatch)
+    export(trained, ["webots"], tmp_path)
+    team = Team(trained)
     wheels, paths = np.zeros((len(team.poses), 2)), [team.poses]
 
     def advance() -> int:
@@ -232,7 +232,7 @@ def test_the_webots_controller_drives_as_the_policy_does(
     monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *map(str, goals[0])])
     module.main()
     assert len(paths) == STEPS + 1
-    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
+    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(trained, team)[..., :2]).max()
     moved = np.abs(paths[-1][:, :2] - paths[0][:, :2]).max()
     assert moved > 0.05
     assert gap < 1e-3, "in 4 s and up to half a metre the same way, but for float32"
@@ -270,9 +270,9 @@ def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = drawn_policy("wheels")
-    export(alone, ["webots"], tmp_path)
-    team = Team(alone)
+    trained = drawn_policy("wheels")
+    export(trained, ["webots"], tmp_path)
+    team = Team(trained)
     robot = Robot(team, 0, np.zeros((8, 2)))
     module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
     monkeypatch.setattr(robot, "getBasicTimeStep", lambda: 32.0)
@@ -344,9 +344,9 @@ def ros_poses(poses: np.ndarray, stamp_s: int = 0) -> SimpleNamespace:
 
 
 def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = drawn_policy("wheels")
-    export(alone, ["ros2"], tmp_path)
-    team, paths = Team(alone), []
+    trained = drawn_policy("wheels")
+    export(trained, ["ros2"], tmp_path)
+    team, paths = Team(trained), []
     parameters = {"goals": team.goals.ravel().tolist(), "pillars": team.pillars.ravel().tolist()}
     monkeypatch.setattr(RosNode, "parameters", parameters)
 
@@ -392,7 +392,7 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
     module.main()
     stopped = [nodes[0].published[f"epuck{k}/wheel_speeds"].data for k in range(8)]
     assert stopped == [[0.0, 0.0]] * 8, "interrupted robots stand still"
-    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(alone, team)[..., :2]).max()
+    gap = np.abs(np.stack(paths)[..., :2] - trained_paths(trained, team)[..., :2]).max()
     assert gap < 1e-3
 
 

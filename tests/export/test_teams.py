@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.export import check
+from esp_cli.export import c_check, check
+from esp_cli.export.c_check import c_runner
 from esp_cli.export.c_source import c_source
 from esp_cli.export.export import export
-from esp_cli.export.layers import Affine, Convolution, GlobalMaxPool, MessageAggregation, Slice
-from esp_cli.export.program import Program
+from esp_cli.export.layers import Affine, Convolution, GlobalMaxPool, MessageAggregation, Program, Slice
+from esp_cli.export.onnx_file import onnx_runner
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
 from esp_cli.export.translate import program_of
@@ -70,19 +71,19 @@ def both(program: Program, rows: np.ndarray) -> list[np.ndarray]:
 @pytest.mark.slow
 @torch.no_grad()
 def test_those_just_three_cells_away_both_ways_are_not_heard_by_any_of_them(tmp_path: Path) -> None:
-    alone = drawn_policy("team")
-    program = program_of(alone.policy)
-    export(alone, ["onnx"], tmp_path)
+    trained = drawn_policy("team")
+    program = program_of(trained.policy)
+    export(trained, ["onnx"], tmp_path)
     rows = np.random.default_rng(0).standard_normal((3, WIDTH)).astype(np.float32)
-    runners = [check.onnx_runner(tmp_path / "policy.onnx"), runner_of(program)]
-    if check.compiler():
-        export(alone, ["c"], tmp_path / "c")
-        runners.append(check.c_runner(tmp_path / "c" / "policy.c", program))
+    runners = [onnx_runner(tmp_path / "policy.onnx"), runner_of(program)]
+    if c_check.compiler():
+        export(trained, ["c"], tmp_path / "c")
+        runners.append(c_runner(tmp_path / "c" / "policy.c", program))
 
     def said(ways: list[float]) -> np.ndarray:
         rows[:, -4:] = ways
         memory = np.zeros((3, 0), np.float32)
-        outputs = alone.policy.actor(torch.from_numpy(rows)[None])[0].numpy()
+        outputs = trained.policy.actor(torch.from_numpy(rows)[None])[0].numpy()
         for runner in runners:
             assert np.allclose(runner(rows, memory)[1], outputs, atol=1e-4)
         return outputs
@@ -120,20 +121,20 @@ def test_a_drawn_network_as_layers_and_its_costs() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(check.compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
 def test_the_worked_example_is_a_whole_world(tmp_path: Path) -> None:
     export(drawn_policy("team"), ["c", "numpy"], tmp_path)
     example = json.loads((tmp_path / "policy.json").read_text())["example"]
     assert np.shape(example["observation"]) == (3, WIDTH)
     assert example["action"] == np.argmax(example["outputs"], 1).tolist()
-    assert check.example_runs(tmp_path)
+    assert c_check.example_runs(tmp_path)
     subprocess.run(["python", "policy.py"], cwd=tmp_path, check=True, capture_output=True)
     for file in ("README.md", "policy.h", "policy.py"):
         assert "The 3 agents of a world exchange messages and act together" in (tmp_path / file).read_text()
     changed = (tmp_path / "policy_example.c").read_text()
-    begin = changed.index("expected[ESP_POLICY_AGENTS] = {") + len("expected[ESP_POLICY_AGENTS] = {")
+    begin = changed.index("expected[] = {") + len("expected[] = {")
     (tmp_path / "policy_example.c").write_text(changed[:begin] + "7" + changed[begin + 1 :])
-    assert not check.example_runs(tmp_path)
+    assert not c_check.example_runs(tmp_path)
 
 
 def test_an_exported_team_refuses_rows_that_are_no_world(tmp_path: Path) -> None:
@@ -163,9 +164,9 @@ def test_a_loaded_team_refuses_rows_that_are_no_world(shape: tuple[int, ...]) ->
 
 
 def test_an_equivariant_team_is_exported_as_plain_layers() -> None:
-    alone = drawn_policy("team, values, equivariant")
-    program = program_of(alone.policy)
-    sample = check.take_sample(alone, program, 300)
+    trained = drawn_policy("team, values, equivariant")
+    program = program_of(trained.policy)
+    sample = check.take_sample(trained, program, 300)
     assert len(sample.obs) == 300
     agreement = check.compare(sample, runner_of(program))
     assert agreement.max_difference < 5e-5

@@ -16,12 +16,11 @@ import pytest
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
 from esp_cli.files.locking import taking_turns
-from esp_cli.policies import bundling, manifest
-from esp_cli.policies.bundled import find, load_entry, open_policy
+from esp_cli.policies import bundled, bundling
+from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
 from esp_cli.policies.bundling import best_seed, bundle, play_greedily, score_of
 from esp_cli.policies.evaluation import evaluate
-from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.manifest import MANIFEST, Entry, bundled_folder, read_bundled, standard_name
+from esp_cli.policies.loading import TrainedPolicy, load_entry, open_policy
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_cli.training.play import Episodes
 from tests.export.policies import drawn_policy
@@ -86,8 +85,8 @@ def test_no_file_of_the_box_is_without_a_line_in_the_manifest() -> None:
 def test_the_box_is_beside_the_packages_or_in_the_wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert bundled_folder() == Path(__file__).parents[2] / "checkpoints"
     package = tmp_path / "site-packages" / "esp_cli"
-    (package / "deploy").mkdir(parents=True)
-    monkeypatch.setattr(manifest, "__file__", str(package / "deploy" / "manifest.py"))
+    (package / "policies").mkdir(parents=True)
+    monkeypatch.setattr(bundled, "__file__", str(package / "policies" / "bundled.py"))
     assert bundled_folder() == tmp_path / "site-packages" / "checkpoints"
     shutil.copytree(Path(__file__).parents[2] / "checkpoints", package / "checkpoints")
     assert bundled_folder() == package / "checkpoints"
@@ -107,7 +106,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def small(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of `made`, as that of this installation."""
-    monkeypatch.setattr(manifest, "bundled_folder", lambda: made)
+    monkeypatch.setattr(bundled, "bundled_folder", lambda: made)
     return made
 
 
@@ -115,10 +114,10 @@ def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
     entry = find("navigation")
     assert (entry.name, entry.file) == ("navigation-mappo-esp", "navigation-mappo-esp.safetensors")
     assert (entry.chosen_from, entry.score.episodes, entry.step) == (2, 4, 100)
-    alone = load_entry(entry)
-    assert alone.config.seeds == (entry.seed,)
-    assert score_of(play_greedily(alone, 4)) == entry.score
-    assert evaluate(alone, 4).greedy.mean == pytest.approx(entry.score.mean)
+    trained = load_entry(entry)
+    assert trained.config.seeds == (entry.seed,)
+    assert score_of(play_greedily(trained, 4)) == entry.score
+    assert evaluate(trained, 4).greedy.mean == pytest.approx(entry.score.mean)
 
 
 def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
@@ -128,7 +127,7 @@ def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
     assert best == max(with_seed, key=with_seed.__getitem__)
     for seed in (3, 7):
         (small / f"seed-{seed}.safetensors").unlink()
-    manifest.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
+    bundled.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
 
 
 def test_a_seed_that_stopped_is_not_the_best_unless_all_did() -> None:
@@ -199,10 +198,10 @@ def test_files_of_others_are_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def meanwhile(alone: TrainedPolicy, episodes: int) -> Episodes:
+    def meanwhile(trained: TrainedPolicy, episodes: int) -> Episodes:
         monkeypatch.setattr(bundling, "play_greedily", play_greedily)
         bundle(drawn_policy("vector"), tmp_path, 4, name="other")
-        return play_greedily(alone, episodes)
+        return play_greedily(trained, episodes)
 
     monkeypatch.setattr(bundling, "play_greedily", meanwhile)
     bundle(drawn_policy("choice"), tmp_path, 4, name="own")
@@ -213,7 +212,7 @@ def test_a_file_that_is_not_the_manifests_is_refused(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "bundled"))
-    monkeypatch.setattr(manifest, "bundled_folder", lambda: folder)
+    monkeypatch.setattr(bundled, "bundled_folder", lambda: folder)
     shutil.copy(folder / "navigation-vectors.safetensors", folder / "navigation-mappo-esp.safetensors")
     with pytest.raises(ValueError, match="is not the file that its manifest names: their SHA-256 differ"):
         open_policy(Path("navigation"))
@@ -226,9 +225,9 @@ def test_a_manifest_that_says_something_else_of_a_file_is_refused(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Path(shutil.copytree(made, tmp_path / "bundled"))
-    monkeypatch.setattr(manifest, "bundled_folder", lambda: folder)
+    monkeypatch.setattr(bundled, "bundled_folder", lambda: folder)
     entry = find("navigation")
-    manifest.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
+    bundled.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
     with pytest.raises(ValueError, match="does not hold the policy that its manifest describes"):
         open_policy(Path("navigation"))
 
@@ -256,7 +255,7 @@ def test_a_damaged_manifest_is_told_in_one_sentence(small: Path, tmp_path: Path,
 
 
 def test_a_folder_without_a_manifest_is_an_empty_box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manifest, "bundled_folder", lambda: tmp_path)
+    monkeypatch.setattr(bundled, "bundled_folder", lambda: tmp_path)
     assert read_bundled() == ()
     with pytest.raises(ValueError, match="no policy fits navigation; no policy is bundled"):
         find("navigation")

@@ -12,7 +12,7 @@ import torch
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.checking.measured import prepared
-from esp_cli.policies.loading import load_policy
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment, build_learner
@@ -303,7 +303,7 @@ def test_a_robots_program_takes_no_policy_with_a_compass(tmp_path: Path) -> None
 
 def test_a_policy_with_a_compass_is_evaluated_drawn_and_exported_as_any_other(tmp_path: Path) -> None:
     train_small(tmp_path / "run", "mappo", "--set", "prior.compass=1")
-    assert load_policy(tmp_path / "run").spec.observation.width == 18
+    assert TrainedPolicy.read(tmp_path / "run").spec.observation.width == 18
     esp("eval", tmp_path / "run", "--episodes", "4")
     esp("export", tmp_path / "run", "-f", "numpy", "-o", tmp_path / "out")
     assert "compass" in (tmp_path / "out" / "policy.json").read_text()

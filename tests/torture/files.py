@@ -21,8 +21,8 @@ from esp_cli.app import app
 from esp_cli.checking import collect
 from esp_cli.checking.logs import read_transitions
 from esp_cli.files.documents import DocumentFormat, parse_object
-from esp_cli.policies.loading import load_policy
-from esp_cli.policies.manifest import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
+from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
@@ -236,7 +236,7 @@ def _document(kind: DocumentFormat, path: Path, taken: Any) -> str | None:
 
 
 def _policy(path: Path) -> None:
-    load_policy(path)
+    TrainedPolicy.read(path)
 
 
 def _checkpoint(path: Path) -> None:

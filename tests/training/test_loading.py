@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_cli.policies.loading import load_policy
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
@@ -42,7 +42,7 @@ def edited_policy(folder, **changes) -> Path:
 def test_run_and_policy_file_give_the_weights_that_were_trained(trained):
     weights = trained.learner.policy.state_dict()
     for path in (trained.folder.path, trained.folder.policy_path):
-        loaded = load_policy(path)
+        loaded = TrainedPolicy.read(path)
         assert loaded.config == trained.config
         assert (loaded.step, loaded.source, loaded.notes) == (100, path, ())
         assert loaded.spec == trained.learner.spec
@@ -53,7 +53,7 @@ def test_run_and_policy_file_give_the_weights_that_were_trained(trained):
 
 def test_a_run_that_keeps_no_checkpoint_is_loaded_from_its_policy_file(folder):
     shutil.rmtree(folder.path / "checkpoints")
-    loaded, file = load_policy(folder.path), load_policy(folder.policy_path)
+    loaded, file = TrainedPolicy.read(folder.path), TrainedPolicy.read(folder.policy_path)
     assert (loaded.config, loaded.spec, loaded.source) == (file.config, file.spec, folder.path)
     assert (loaded.step, loaded.stopped) == (file.step, file.stopped)
     weights = file.policy.state_dict()
@@ -65,7 +65,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_note_and_no_warning(folder):
     folder.checkpoint_path(150).write_bytes(good.read_bytes()[:-1])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        loaded = load_policy(folder.path)
+        loaded = TrainedPolicy.read(folder.path)
     assert loaded.step == 100
     assert [("step-000000000150" in note, "going back to step 100" in note) for note in loaded.notes] == [(True, True)]
 
@@ -84,7 +84,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_note_and_no_warning(folder):
 )
 def test_a_policy_file_with_a_wrong_description_is_refused(folder, changes, sentence):
     with pytest.raises(ValueError, match=sentence) as caught:
-        load_policy(edited_policy(folder, **changes))
+        TrainedPolicy.read(edited_policy(folder, **changes))
     assert str(folder.policy_path) in str(caught.value)
 
 
@@ -104,7 +104,7 @@ def test_a_policy_file_with_a_wrong_description_is_refused(folder, changes, sent
 def test_weights_of_another_shape_are_refused(folder, changes):
     config = tiny_config(steps=100, seeds=(3, 7)).model_dump(mode="json") | changes
     with pytest.raises(ValueError, match="the weights do not fit the configuration") as caught:
-        load_policy(edited_policy(folder, config=config))
+        TrainedPolicy.read(edited_policy(folder, config=config))
     assert "\n" not in str(caught.value)
 
 
@@ -112,14 +112,14 @@ def test_weights_of_another_shape_are_refused(folder, changes):
 def test_networks_of_impossible_size_are_refused_before_they_are_built(folder, hidden):
     config = tiny_config(steps=100, seeds=(3, 7)).model_dump(mode="json") | {"network": {"hidden": hidden}}
     with pytest.raises(ValueError, match=r"network\.hidden") as caught:
-        load_policy(edited_policy(folder, config=config))
+        TrainedPolicy.read(edited_policy(folder, config=config))
     assert "\n" not in str(caught.value)
 
 
 def test_where_there_is_no_gpu_a_policy_of_one_lands_on_the_cpu(folder, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     config = tiny_config(steps=100, seeds=(3, 7)).model_copy(update={"device": "cuda"})
-    loaded = load_policy(edited_policy(folder, config=config.model_dump(mode="json")))
+    loaded = TrainedPolicy.read(edited_policy(folder, config=config.model_dump(mode="json")))
     assert loaded.config.device == "cpu"
     assert all(tensor.device.type == "cpu" for tensor in loaded.policy.state_dict().values())
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from esp_cli import app
-from esp_cli.policies.loading import load_policy
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training import trainer as training
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config import resolve_config
@@ -408,7 +408,7 @@ def test_an_interrupt_stops_cleanly_with_the_command_to_go_on(tmp_path):
 def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(lambda news: True)
-    run, alone = load_policy(folder.path), load_policy(folder.policy_path)
+    run, alone = TrainedPolicy.read(folder.path), TrainedPolicy.read(folder.policy_path)
     obs = torch.randn(2, 5, 3, run.spec.observation.width)
     memory = run.policy.initial_memory(5, obs)
     assert torch.equal(run.policy.act(obs, memory)[0], alone.policy.act(obs, memory)[0])

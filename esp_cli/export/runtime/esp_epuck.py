@@ -12,6 +12,8 @@ import numpy as np
 
 PATIENCE_S = 0.5
 """Age of poses beyond which robots stand still."""
+FIELDS = {"heading", "obstacle", "goal", "robots"}
+"""Of an observation, that poses tell."""
 
 
 class Pilot:
@@ -33,7 +35,7 @@ class Pilot:
         self.goal_sight_m = settings.get("goal_sight_m")
         self.pillar_radius_m = settings["obstacle_radius_m"]
         self.fields = [field["field"] for field in description["observation"]]
-        if unknown := set(self.fields) - {"heading", "obstacle", "goal", "robots"}:
+        if unknown := set(self.fields) - FIELDS:
             raise ValueError(f"poses do not tell what this policy sees: {', '.join(sorted(unknown))}")
         self.seen_robots = min(settings["neighbours"], settings["num_agents"] - 1)
         options = description["action"].get("options")

@@ -22,7 +22,7 @@ class NumpyPolicy:
         self.layers: list[tuple[dict[str, Any], list[Any]]] = []
         for layer in program["layers"]:
             arrays = []
-            for shape in _shapes(layer):
+            for shape in layer["shapes"]:
                 count = int(np.prod(shape))
                 arrays.append(numbers[:count].reshape(shape))
                 numbers = numbers[count:]
@@ -37,7 +37,7 @@ class NumpyPolicy:
         """
         if self.hidden:
             raise ValueError("this policy remembers: begin with initial_memory(), and call step(obs, memory)")
-        return self.step(obs, np.zeros((*np.shape(obs)[:-1], 0), np.float32), action_mask)[0]
+        return self.step(obs, self.initial_memory(*np.shape(obs)[:-1]), action_mask)[0]
 
     def initial_memory(self, *lead: int) -> Any:
         """Return the memory with which an episode begins: zeros [*lead, H]."""
@@ -48,13 +48,13 @@ class NumpyPolicy:
         outputs, hidden = self.outputs(obs, memory)
         if self.program["head"] == "choose":
             action = self._allowed(outputs, action_mask).argmax(-1)
-            done = np.eye(outputs.shape[-1], dtype=np.float32)[action]
+            encoded = np.eye(outputs.shape[-1], dtype=np.float32)[action]
         else:
-            action = done = self._squash(outputs)
-        return action, np.concatenate([hidden, done], -1) if self.previous else hidden
+            action = encoded = self._squash(outputs)
+        return action, np.concatenate([hidden, encoded], -1) if self.previous else hidden
 
     def outputs(self, obs: Any, memory: Any) -> tuple[Any, Any]:
-        """Return what the last layer says (logits, values or unbounded actions), and the hidden state after it."""
+        """Return the last layer's outputs (logits, values or unbounded actions), and the hidden state after it."""
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
@@ -68,7 +68,7 @@ class NumpyPolicy:
             if layer["kind"] == "gru":
                 x = hidden = _recur(x, hidden, arrays)
             else:
-                x = _apply(x, layer, arrays, obs)
+                x = LAYERS[layer["kind"]](x, layer, arrays, obs)
         return x, hidden
 
     def _allowed(self, outputs: Any, action_mask: Any) -> Any:
@@ -84,13 +84,11 @@ class NumpyPolicy:
 
     def _squash(self, outputs: Any) -> Any:
         """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
-        parts, place = [], 0
-        for width in self.program["groups"]:
-            part = outputs[..., place : place + width]
-            length = np.sqrt((part * part).sum(-1, keepdims=True) + np.float32(1e-18))
-            parts.append(part * (np.tanh(length) / length))
-            place += width
-        return np.concatenate(parts, -1)
+        parts = np.split(outputs, np.cumsum(self.program["groups"])[:-1], -1)
+        lengths = [np.sqrt((part * part).sum(-1, keepdims=True) + np.float32(1e-18)) for part in parts]
+        return np.concatenate(
+            [part * (np.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1
+        )
 
 
 def _recur(x: Any, hidden: Any, arrays: list[Any]) -> Any:
@@ -103,59 +101,41 @@ def _recur(x: Any, hidden: Any, arrays: list[Any]) -> Any:
     return candidate + update * (hidden - candidate)
 
 
-def _apply(x: Any, layer: dict[str, Any], arrays: list[Any], obs: Any) -> Any:
-    """Apply a layer without memory."""
-    kind = layer["kind"]
-    if kind == "affine":
-        x = x @ arrays[0] + arrays[1]
-    elif kind == "relu":
-        x = np.maximum(x, 0)
-    elif kind == "tanh":
-        x = np.tanh(x)
-    elif kind == "norm":
-        centred = x - x.mean(-1, keepdims=True)
-        x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
-        x = x * arrays[0] + arrays[1]
-    elif kind == "slice":
-        x = x[..., layer["begin"] : layer["end"]]
-    elif kind == "convolution":
-        x = _convolve(x, layer, arrays)
-    elif kind == "global_max_pool":
-        x = x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1)
-    else:
-        x = _aggregate(x, layer, obs)
-    return x
+def _normalise(x: Any, _: dict[str, Any], arrays: list[Any], __: Any) -> Any:
+    """Normalise each row to mean 0 and variance 1, then scale and shift it."""
+    centred = x - x.mean(-1, keepdims=True)
+    x = centred / np.sqrt((centred * centred).mean(-1, keepdims=True) + np.float32(1e-5))
+    return x * arrays[0] + arrays[1]
 
 
-def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any]) -> Any:
+def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any], _: Any) -> Any:
     """Apply filters to rows that hold pictures, channels first."""
     side, stride = layer["side"], layer["stride"]
     pictures = x.reshape(*x.shape[:-1], layer["channels"], layer["rows"], layer["columns"])
-    seen = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
-    patches = np.moveaxis(seen, -5, -3).reshape(*seen.shape[:-5], seen.shape[-4] * seen.shape[-3], -1)
+    windows = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
+    patches = np.moveaxis(windows, -5, -3).reshape(*x.shape[:-1], windows.shape[-4] * windows.shape[-3], -1)
     return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], -1)
 
 
-def _aggregate(x: Any, layer: dict[str, Any], obs: Any) -> Any:
-    """Put what the near ones say beside each agent's own features."""
+def _aggregate(x: Any, layer: dict[str, Any], _: list[Any], obs: Any) -> Any:
+    """Concatenate own features with the neighbours' mean relative position and mean message."""
     team, reach_squared = layer["team"], np.float32(layer["reach_squared"])
-    ways = obs[..., layer["begin"] : layer["end"]].reshape(*obs.shape[:-1], team - 1, 2)
+    ways = obs[..., layer["begin"] : layer["begin"] + 2 * (team - 1)].reshape(*obs.shape[:-1], team - 1, 2)
     near = ((ways * ways).sum(-1, keepdims=True) < reach_squared).astype(np.float32)
     share = near / (1 + near.sum(-2, keepdims=True))  # [..., N, N - 1, 1]
     others = [[j for j in range(team) if j != i] for i in range(team)]
-    heard = (share * x[..., others, :]).sum(-2)
-    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), heard], -1)
+    messages = (share * x[..., others, :]).sum(-2)
+    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), messages], -1)
 
 
-def _shapes(layer: dict[str, Any]) -> list[tuple[int, ...]]:
-    """Return the shapes of a layer's arrays, in their order."""
-    if layer["kind"] == "affine":
-        return [(layer["inputs"], layer["outputs"]), (layer["outputs"],)]
-    if layer["kind"] == "norm":
-        return [(layer["width"],)] * 2
-    if layer["kind"] == "convolution":
-        return [(layer["channels"] * layer["side"] ** 2, layer["outputs"]), (layer["outputs"],)]
-    if layer["kind"] == "gru":
-        wide = 3 * layer["hidden"]
-        return [(layer["inputs"], wide), (wide,), (layer["hidden"], wide), (wide,)]
-    return []
+LAYERS = {
+    "affine": lambda x, _, arrays, *__: x @ arrays[0] + arrays[1],
+    "relu": lambda x, *_: np.maximum(x, 0),
+    "tanh": lambda x, *_: np.tanh(x),
+    "norm": _normalise,
+    "slice": lambda x, layer, *_: x[..., layer["begin"] : layer["end"]],
+    "convolution": _convolve,
+    "global_max_pool": lambda x, layer, *_: x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1),
+    "aggregate": _aggregate,
+}
+"""What a layer without memory makes of rows x [..., width], by its kind."""

@@ -15,7 +15,7 @@ from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.recurrent import SeedGRU
-from esp_cli.policies.loading import load_policy, single_seed
+from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from tests.networks.kernels.compiler import needs_compiler
@@ -47,8 +47,8 @@ def test_a_policy_trained_with_it_needs_no_compiler(tmp_path, monkeypatch):
     result = CliRunner().invoke(app, ["train", *options, "--out", str(folder)])
     assert result.exit_code == 0, result.output
     monkeypatch.setattr(library, "library", without_compiler)
-    assert load_policy(folder).config.network.compiled
-    assert not single_seed(load_policy(folder), 0).config.network.compiled
+    assert TrainedPolicy.read(folder).config.network.compiled
+    assert not TrainedPolicy.read(folder).single_seed(0).config.network.compiled
 
 
 def without_compiler(_name):

@@ -1,0 +1,120 @@
+static void affine(const float *weight, const float *bias, int inputs, int outputs,
+                   const float *x, float *y)
+{
+    int i, j;
+    for (j = 0; j < outputs; j++) y[j] = bias[j];
+    for (i = 0; i < inputs; i++) {
+        for (j = 0; j < outputs; j++) y[j] += x[i] * weight[i * outputs + j];
+    }
+}
+
+static void apply_relu(float *x, int width)
+{
+    int k;
+    for (k = 0; k < width; k++) x[k] = x[k] > 0.0f ? x[k] : 0.0f;
+}
+
+static void apply_tanh(float *x, int width)
+{
+    int k;
+    for (k = 0; k < width; k++) x[k] = tanhf(x[k]);
+}
+
+static void normalise(const float *weight, const float *bias, int width, float *x)
+{
+    int k;
+    float mean = 0.0f, variance = 0.0f, scale;
+    for (k = 0; k < width; k++) mean += x[k];
+    mean /= (float)width;
+    for (k = 0; k < width; k++) variance += (x[k] - mean) * (x[k] - mean);
+    scale = 1.0f / sqrtf(variance / (float)width + 1e-05f);
+    for (k = 0; k < width; k++) x[k] = (x[k] - mean) * scale * weight[k] + bias[k];
+}
+
+static void convolve(const float *weight, const float *bias, int channels, int rows, int columns,
+                     int side, int stride, int outputs, const float *x, float *y)
+{
+    const int high = (rows - side) / stride + 1, wide = (columns - side) / stride + 1;
+    int out, row, column, channel, i, j;
+    for (out = 0; out < outputs; out++) {
+        for (row = 0; row < high; row++) {
+            for (column = 0; column < wide; column++) {
+                float sum = bias[out];
+                const float *w = weight + out;
+                for (channel = 0; channel < channels; channel++) {
+                    for (i = 0; i < side; i++) {
+                        const float *pixel = x + (channel * rows + row * stride + i) * columns + column * stride;
+                        for (j = 0; j < side; j++, w += outputs) sum += pixel[j] * *w;
+                    }
+                }
+                y[(out * high + row) * wide + column] = sum;
+            }
+        }
+    }
+}
+
+static void global_max_pool(int channels, int places, const float *x, float *y)
+{
+    int channel, place;
+    for (channel = 0; channel < channels; channel++) {
+        y[channel] = x[channel * places];
+        for (place = 1; place < places; place++) {
+            if (x[channel * places + place] > y[channel]) y[channel] = x[channel * places + place];
+        }
+    }
+}
+
+static void aggregate(const float *ways, int width, float reach_squared, float reach, const float *x, float *y)
+{
+    int i, j, k;
+    for (i = 0; i < AGENTS; i++, ways += ESP_POLICY_OBSERVATION) {
+        float *own = y + i * ROW, *way = own + width, *received = way + 2, count = 1.0f;
+        memcpy(own, x + i * ROW, sizeof(float) * width);
+        for (k = 0; k < width + 2; k++) way[k] = 0.0f;
+        for (j = 0; j < AGENTS; j++) {
+            const float *to = ways + 2 * (j < i ? j : j - 1);
+            if (j == i || !(to[0] * to[0] + to[1] * to[1] < reach_squared)) continue;
+            count += 1.0f;
+            for (k = 0; k < 2; k++) way[k] += to[k];
+            for (k = 0; k < width; k++) received[k] += x[j * ROW + k];
+        }
+        for (k = 0; k < 2; k++) way[k] /= count * reach;
+        for (k = 0; k < width; k++) received[k] /= count;
+    }
+}
+
+static float sigmoid(float x)
+{
+    return 0.5f + 0.5f * tanhf(0.5f * x);
+}
+
+static void recur(int width, const float *into, const float *back, float *hidden)
+{
+    int k;
+    for (k = 0; k < width; k++) {
+        const float reset = sigmoid(into[k] + back[k]);
+        const float update = sigmoid(into[width + k] + back[width + k]);
+        const float candidate = tanhf(into[2 * width + k] + reset * back[2 * width + k]);
+        hidden[k] = candidate + update * (hidden[k] - candidate);
+    }
+}
+
+static int choose(const float *x)
+{
+    int k, best = 0;
+    for (k = 1; k < ESP_POLICY_ACTION; k++) {
+        if (x[k] > x[best]) best = k;
+    }
+    return best;
+}
+
+/* Where nothing is allowed, everything is. */
+static int choose_allowed(const float *x, const unsigned char *allowed)
+{
+    int k, best = -1, any = 0;
+    for (k = 0; k < ESP_POLICY_ACTION; k++) any |= allowed[k];
+    for (k = 0; k < ESP_POLICY_ACTION; k++) {
+        if ((allowed[k] || !any) && (best < 0 || x[k] > x[best])) best = k;
+    }
+    return best;
+}

@@ -1,0 +1,20 @@
+"""The files of exports that are text with gaps: `templates/NAME.jinja`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+RUNTIME = Path(__file__).parent / "runtime"
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    keep_trailing_newline=True,
+)
+
+
+def filled(name: str, **values: object) -> bytes:
+    """Return a file whose gaps are filled with values."""
+    return _TEMPLATES.get_template(f"{name}.jinja").render(values).encode()
