@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from esp_cli.run import Run, train
     from esp_cli.training.metrics_table import Metrics
     from esp_cli.training.trainer import Progress
-    from esp_envs.moves import discrete_moves
-    from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, layout
+    from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, discrete_moves, layout
 
 __all__ = ["Continuous", "Discrete", "Field", "Items", "Kind", "Layout", "LoadedPolicy", "Metrics", "Progress", "Run"]
 __all__ += ["Symmetry", "Transitions", "__version__", "discrete_moves", "layout", "load_policy", "train"]
@@ -24,7 +23,7 @@ _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
     "Symmetry": "esp_cli.loop.symmetry",
     "Transitions": "esp_cli.checking",
     "__version__": "esp_cli.defaults",
-    "discrete_moves": "esp_envs.moves",
+    "discrete_moves": "esp_envs.spec",
     "load_policy": "esp_cli.policies.loaded",
     "train": "esp_cli.run",
 }

@@ -18,18 +18,11 @@ from esp_envs.spec import (
 )
 
 if TYPE_CHECKING:
-    from esp_envs.base import (
-        Environment,
-        Observation,
-        Step,
-        TaskSettings,
-        generator_states,
-        generators_for,
-        restore_generators,
-    )
+    from esp_envs.base import Environment, Observation, Step, generator_states, generators_for, restore_generators
     from esp_envs.batched import BatchedTask, Outcome, World, to_others
     from esp_envs.registry import make, register, task_class, task_names
     from esp_envs.scene import Body, Scene
+    from esp_envs.settings import TaskSettings
 
 __all__ = [
     "BatchedTask",
@@ -66,7 +59,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import what makes worlds when it is asked for; a spec alone needs the standard library alone."""
     if name in __all__:
-        for module in map(import_module, ("esp_envs.base", "esp_envs.scene", "esp_envs.registry", "esp_envs.batched")):
-            if hasattr(module, name):
-                return getattr(module, name)
+        for module in ("base", "settings", "scene", "registry", "batched"):
+            found = import_module(f"esp_envs.{module}")
+            if hasattr(found, name):
+                return getattr(found, name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")

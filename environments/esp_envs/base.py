@@ -9,16 +9,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
-from esp_envs.breaking import Breaks, remaining
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter, Scene
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import Continuous, TaskSpec
 
 
@@ -155,39 +154,6 @@ def put_back(env: Environment, observation: Observation) -> None:
     states = generator_states(env.generators)
     env.set_state(observation.state)
     restore_generators(env.generators, states)
-
-
-class TaskSettings(BaseModel):
-    """What a user may change of a task; each field has its default, unit and bounds here and nowhere else."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def without_effect(self) -> frozenset[str]:
-        """Return the names of settings that change nothing beside the others."""
-        return frozenset()
-
-    @classmethod
-    def breakable(cls) -> dict[str, Breaks]:
-        """Return what each setting that breaks a symmetry leaves of it, by the setting's name."""
-        return {
-            name: mark
-            for name, field in cls.model_fields.items()
-            for mark in field.metadata
-            if isinstance(mark, Breaks)
-        }
-
-    def broken(self) -> dict[str, Breaks]:
-        """Return what those leave that are not 0, each with the name of a planar group."""
-        marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name)}
-        return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
-
-    def left_of(self, whole: str, *further: Breaks) -> str:
-        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents"."""
-        return remaining(whole, (*self.broken().values(), *further))
-
-    def broken_in_words(self) -> str:
-        """Return what a reward convention adds about the settings that break a symmetry: ", wind 0.3"."""
-        return "".join(f", {name} {getattr(self, name):g}" for name in self.broken())
 
 
 class Environment(ABC):

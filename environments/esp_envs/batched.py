@@ -9,8 +9,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import OTHER_SIZE, Environment, Observation, Step, TaskSettings, require_flags, require_shape
+from esp_envs.base import OTHER_SIZE, Environment, Observation, Step, require_flags, require_shape
 from esp_envs.errors import UserError
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import Discrete, TaskSpec
 
 World = dict[str, Tensor]

@@ -1,4 +1,6 @@
-"""Classes by name: built in, installed by other packages, or named by the caller as module and class.
+"""What this machine has: classes by name, optional packages, cores.
+
+Classes are built in, installed by other packages, or named by the caller as module and class.
 
 A package installs classes as entry points. A class `module:Class` is known only after the caller has passed it to
 `Registry.register`: its name in a file never imports anything.
@@ -6,12 +8,13 @@ A package installs classes as entry points. A class `module:Class` is known only
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from importlib import import_module, invalidate_caches
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, requires
 from inspect import isabstract
 from pathlib import Path
 from typing import Any, TypeVar
@@ -168,3 +171,15 @@ def last_line(error: BaseException) -> str:
     """Return the last line of a traceback."""
     text = str(error).strip()
     return f"{type(error).__name__}: {text.splitlines()[-1]}" if text else type(error).__name__
+
+
+def install(extra: str) -> str:
+    """Return the command that installs what an extra needs, from any index: "pip install 'optuna>=4.2'"."""
+    rows = (row.replace('"', "'").split(";") for row in requires("esp-marl") or [])
+    needed = [row[0].strip() for row in rows if row[-1].strip() == f"extra == '{extra}'"]
+    return " ".join(["pip install", *(f"'{package}'" for package in needed)])
+
+
+def available_cores() -> int:
+    """Return the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

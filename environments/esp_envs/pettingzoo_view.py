@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from esp_envs.base import Observation, put_back
 from esp_envs.drawing import draw
 from esp_envs.errors import UserError
-from esp_envs.extras import install
+from esp_envs.installed import install
 from esp_envs.registry import make
 from esp_envs.spec import Continuous
 

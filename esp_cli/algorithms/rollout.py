@@ -70,16 +70,22 @@ class Collector:
 
     def __init__(self, env: Environment, policy: StochasticPolicy, generators: Sequence[torch.Generator]) -> None:
         self.env, self.policy, self.generators = env, policy, generators
-        self.observation = env.reset()
-        self.memory = policy.initial_memory(env.num_envs, self.observation.obs)
-        shape = (env.num_seeds, env.num_envs)
-        self.episode_return = torch.zeros(shape, device=env.device)
+        self._begin()
         self.finished_return = torch.zeros(env.num_seeds, device=env.device)
         self.finished_count = torch.zeros(env.num_seeds, device=env.device)
+
+    def _begin(self) -> None:
+        """Start a new episode in every world."""
+        env = self.env
+        self.observation, self._stale = env.reset(), False
+        self.memory = self.policy.initial_memory(env.num_envs, self.observation.obs)
+        self.episode_return = torch.zeros(env.num_seeds, env.num_envs, device=env.device)
 
     @torch.no_grad()
     def collect(self, num_steps: int) -> Rollout:
         """Act for `num_steps` steps in every world with actions drawn from the policy."""
+        if self._stale:
+            self._begin()
         spec, device = self.env.spec, self.env.device
         lead = (self.env.num_seeds, self.env.num_envs, num_steps)
         noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators)
@@ -141,7 +147,10 @@ class Collector:
         return mean
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a resumed run needs to go on bit for bit."""
+        """Return what a resumed run needs: of worlds that cannot go on in mid-episode their generators alone."""
+        worlds = {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
+        if not self.env.has("state_dict"):
+            return worlds
         own = {
             "obs": self.observation.obs,
             "state": self.observation.state,
@@ -150,10 +159,14 @@ class Collector:
         }
         flags = {"action_mask": self.observation.action_mask, "alive": self.observation.alive}
         own |= {name: tensor for name, tensor in flags.items() if tensor is not None}
-        return own | {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
+        return own | worlds
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
+        if not self.env.has("state_dict"):
+            self.env.load_state_dict(below(tensors, "env"))
+            self._stale = True  # the next rollout begins new episodes
+            return
         own = {name: tensors[name].to(self.env.device) for name in ("obs", "state", "memory", "episode_return")}
         if own["obs"].shape != self.observation.obs.shape:
             raise UserError("the saved worlds have other seeds, worlds or observations than these; use their settings")

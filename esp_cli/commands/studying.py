@@ -20,7 +20,7 @@ from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.machine import busy_with
 from esp_cli.training.folder_names import LOG
 from esp_envs.errors import UserError
-from esp_envs.extras import install
+from esp_envs.installed import install
 
 if TYPE_CHECKING:
     from esp_cli.defaults import Mode

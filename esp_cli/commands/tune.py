@@ -16,7 +16,7 @@ from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
 from esp_envs.errors import UserError
-from esp_envs.extras import install
+from esp_envs.installed import install
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request

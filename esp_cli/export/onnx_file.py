@@ -16,7 +16,7 @@ from esp_cli.export import layers
 from esp_cli.export.check import Numbers, Runner
 from esp_cli.export.layers import Floats, Program
 from esp_envs.errors import UserError
-from esp_envs.extras import install
+from esp_envs.installed import install
 from esp_envs.spec import others_of
 
 OPSET = 17

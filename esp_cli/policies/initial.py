@@ -17,7 +17,7 @@ from esp_cli.training.config import InitialPolicy, RunConfig
 from esp_cli.training.policy_file import read_initial
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
-from esp_envs.policy_format import digest
+from esp_envs.mpe.frozen_prey import digest
 
 
 def matching_weights(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import esp_envs
 from esp_cli.files.opening import open_own
-from esp_envs.machine import available_cores
+from esp_envs.installed import available_cores
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""

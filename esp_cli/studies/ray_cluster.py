@@ -13,7 +13,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from esp_cli.studies.versions import refuse_difference, versions
 from esp_envs.errors import UserError
-from esp_envs.machine import available_cores
+from esp_envs.installed import available_cores
 
 NAMESPACE = "esp"
 CONNECT_S = 10.0

@@ -29,7 +29,7 @@ from esp_cli.files.failures import attempting
 from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
-from esp_envs.policy_format import METADATA_KEY, digest
+from esp_envs.mpe.frozen_prey import METADATA_KEY, digest
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
 CHECKPOINT_VERSION = 1

@@ -13,7 +13,7 @@ from torch import Tensor
 from esp_cli.defaults import __version__
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
 from esp_cli.training.config import InitialPolicy, RunConfig
-from esp_envs.policy_format import POLICY_FORMAT, POLICY_VERSION, digest
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT, POLICY_VERSION, digest
 from esp_envs.spec import TaskSpec
 
 

@@ -44,7 +44,7 @@ from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, ME
 from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 from esp_envs.errors import UserError
-from esp_envs.policy_format import POLICY_FORMAT, digest
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT, digest
 
 
 class RunFolderError(UserError):

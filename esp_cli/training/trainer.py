@@ -289,7 +289,10 @@ class Trainer:
         before = self.learner.state_dict()
         self.learner.load_state_dict(tensors)
         now, needed = self.learner.state_dict(), self.learner.state_dict(complete=True)
-        for name in sorted({*tensors, *needed}):
+        names = {*tensors, *needed}
+        if not self.learner.collector.env.has("state_dict"):  # worlds that begin anew, whatever was saved of them
+            names = {name for name in names if not name.startswith("collector.")}
+        for name in sorted(names):
             fits = name in now and name in tensors and _same(now[name], tensors[name])
             if fits and name in before:
                 a, b = before[name], now[name]

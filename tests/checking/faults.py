@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_envs import Environment, Field, Items, Kind, Layout, Observation, Step, make
-from esp_envs.base import TaskSettings
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import Continuous, TaskSpec
 
 Distort = Callable[[Tensor, Environment], Tensor]

@@ -12,9 +12,8 @@ from esp_cli.checking import Transitions, blind, collect
 from esp_cli.checking.blind import discover_blindly, search
 from esp_cli.checking.numbers import NumberMap
 from esp_envs import make
-from esp_envs.moves import discrete_moves
 from esp_envs.mpe.task import FORCE
-from esp_envs.spec import Field, Kind, Spaces, layout
+from esp_envs.spec import Field, Kind, Spaces, discrete_moves, layout
 from tests.cli.running import refused
 
 MOVES = torch.tensor([[0.0, 0.0], [-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])

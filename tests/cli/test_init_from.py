@@ -12,7 +12,7 @@ import torch
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.run_folder import RunFolder
-from esp_envs.policy_format import POLICY_FORMAT
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, stored_config, train_tiny, written
 
 

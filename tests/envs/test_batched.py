@@ -13,9 +13,8 @@ import torch
 
 from esp_envs import BatchedTask, Environment, Field, Kind, TaskSettings, generators_for, layout, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
-from esp_envs.moves import discrete_moves
 from esp_envs.mpe.task import MOVES
-from esp_envs.spec import Continuous, TaskSpec
+from esp_envs.spec import Continuous, TaskSpec, discrete_moves
 from tests.own_tasks import lines_of, page_files, save_page_files
 
 

@@ -12,8 +12,8 @@ from esp_cli.checking import check_symmetry
 from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
 from esp_envs import make
-from esp_envs.breaking import Breaks, remaining
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
+from esp_envs.settings import Breaks, remaining
 from esp_envs.spec import Spaces
 from tests.envs.test_frozen_prey import write
 

@@ -11,8 +11,8 @@ import torch
 from safetensors.torch import save_file
 
 from esp_envs import make
+from esp_envs.mpe.frozen_prey import digest
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings
-from esp_envs.policy_format import digest
 
 HEADER = {"format": "esp-policy", "version": 1, "task": "predator-prey", "network": "mlp", "activation": "tanh"}
 NUM_INPUTS, HIDDEN, NUM_MOVES, SEEDS = 14, 8, 5, 2

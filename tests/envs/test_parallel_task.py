@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import torch
 
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
 from esp_envs import Continuous, Environment, Field, Kind, generators_for, layout, make, register
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
 from esp_envs.conformance.subject import same_step
+from esp_envs.registry import TASKS
 from esp_envs.spec import Discrete
 from tests.own_tasks import lines_of, page_files, save_page_files
 
@@ -23,17 +26,17 @@ spaces = LIKE_GYMNASIUM.spaces
 
 
 class Walk:
-    """Two walkers and a ghost on a line; what chance does follows from the seed, or from the process if `dicey`."""
+    """Two walkers and a ghost on a line; what chance does follows from the seed."""
 
-    def __init__(self, length: int = 6, box: bool = False, dicey: bool = False) -> None:
+    def __init__(self, length: int = 6, box: bool = False) -> None:
         self.possible_agents = ["walker_0", "walker_1", "ghost"]
-        self.length, self.box, self.dicey = length, box, dicey
+        self.length, self.box = length, box
 
     def action_space(self, agent):
         return spaces.Box(np.float32([0.0]), np.float32([10.0])) if self.box else spaces.Discrete(3)
 
     def reset(self, seed=None, options=None):
-        self.rng = np.random.default_rng(None if self.dicey else seed)
+        self.rng = np.random.default_rng(seed)
         self.places, self.time = self.rng.normal(size=3), 0
         return self._seen(), {}
 
@@ -83,6 +86,7 @@ def test_a_parallel_task_keeps_every_promise(workers: int) -> None:
     assert [finding for finding in findings if finding.broken] == []
     assert {f.not_asked for f in findings if f.not_asked} == {
         "all worlds end together",
+        "a run that is resumed begins new episodes",
         "the task cannot be put into a state",
         "the task has no picture",
     }
@@ -332,17 +336,38 @@ def test_what_goes_wrong_in_mid_run_is_one_sentence(how: str, sentence: str, wor
     assert "\n" not in str(caught.value)
 
 
-def test_a_copy_that_does_not_repeat_itself_is_named_when_the_run_is_resumed() -> None:
-    class Dicey(Walking):
-        def make_one(self):
-            return Walk(self.settings.horizon, dicey=True)
-
-    env = worlds(Dicey)
-    env.reset()
+def test_a_run_that_is_resumed_begins_the_episodes_that_a_reset_would_begin() -> None:
+    env, other = worlds(Walking), worlds(Walking, seeds=(100, 101))
+    env.reset(), other.reset()
     env.step(env.random_action())
     saved = env.state_dict()
-    with pytest.raises(ValueError, match="a copy of dicey does not repeat its episode from the same seed"):
-        worlds(Dicey).load_state_dict(saved)
+    assert set(saved) == {"generators"}
+    other.load_state_dict(saved)
+    expected = env.reset()
+    assert torch.equal(other.reset().obs, expected.obs)
+    with pytest.raises(ValueError, match="other seeds"):
+        worlds(Walking, seeds=(1,)).load_state_dict(saved)
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg"])
+def test_a_resumed_learner_goes_on_in_new_episodes(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(TASKS, "_registered", {})
+    small = {"num_envs": 2, **({"num_steps": 6} if algorithm == "mappo" else {"warmup_episodes": 0})}
+    overrides = {f"{algorithm}.{name}": value for name, value in small.items()}
+    overrides |= {"prior.kind": "none", "task.workers": 0, "network.hidden": [8]}
+    config = resolve_config(register(Walking), algorithm, steps=100, overrides=overrides)
+    trained, resumed = build_learner(config), build_learner(config)
+    trained.iterate(0.0)
+    saved = {name: tensor.clone() for name, tensor in trained.state_dict().items()}
+    resumed.load_state_dict(saved)
+    now = resumed.state_dict()
+    assert all(torch.equal(now[name], saved[name]) for name in saved), "nothing is drawn before the next rollout"
+    assert bool(resumed.iterate(0.0).finite.all())
+    first = resumed.state_dict()
+    again = build_learner(config)
+    again.load_state_dict(saved)
+    again.iterate(0.0)
+    assert all(torch.equal(first[name], value) for name, value in again.state_dict().items()), "as often as one likes"
 
 
 def test_workers_leave_with_the_environment() -> None:
@@ -396,7 +421,7 @@ def test_the_spread_of_the_page_agrees_with_mpe2_step_by_step(page: None) -> Non
     env = make(register("spread:Spread"), 1, [0], {"workers": 0})
     start = env.reset()
     theirs = simple_spread_v3.parallel_env(N=3, local_ratio=0.5, max_cycles=25)
-    first_episode = np.random.SeedSequence([int(env.state_dict()["base"]), 0])
+    first_episode = np.random.SeedSequence([int(env._base), 0])
     seen, _ = theirs.reset(seed=int(first_episode.generate_state(1)[0] >> 1))
     for _ in range(25):
         np.testing.assert_array_equal(start.obs[0, 0].numpy(), np.float32([seen[a] for a in theirs.possible_agents]))

@@ -13,7 +13,7 @@ from esp_cli.training.checkpoint import save_checkpoint
 from esp_cli.training.config import resolve_config
 from esp_cli.training.policy_file import describe_policy
 from esp_cli.training.streams import generators
-from esp_envs.policy_format import POLICY_FORMAT
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 
 KINDS = {
     "choice": ("navigation", "mappo", {}),

@@ -7,16 +7,9 @@ from torch import Tensor
 
 from esp_cli.training.play import Controller, play
 from esp_cli.training.streams import stream_seeds
-from esp_envs.base import (
-    Environment,
-    Observation,
-    Step,
-    TaskSettings,
-    generator_states,
-    generators_for,
-    restore_generators,
-)
+from esp_envs.base import Environment, Observation, Step, generator_states, generators_for, restore_generators
 from esp_envs.scene import Scene
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, joint_layout, layout
 
 SEEDS = (0, 1)

@@ -58,7 +58,8 @@ def _choices() -> Iterator[Choice]:
     if find_spec("gymnasium"):
         register(OWN_TASK)
         for (algorithm, network), workers in itertools.product(learners, (0, 2)):
-            yield algorithm, network, OWN_TASK, {"workers": workers}
+            if algorithm != "mappo":  # resumed, its rollouts begin new episodes
+                yield algorithm, network, OWN_TASK, {"workers": workers}
 
 
 def run_job(path: Path, config: RunConfig) -> None:

@@ -13,7 +13,7 @@ from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer
-from esp_envs.policy_format import POLICY_FORMAT
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.training.runs import tiny_config, tiny_folder
 
 

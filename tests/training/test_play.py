@@ -7,8 +7,9 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.training.play import HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
-from esp_envs.base import Environment, Observation, Step, TaskSettings, generators_for
+from esp_envs.base import Environment, Observation, Step, generators_for
 from esp_envs.scene import Scene
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import LEFT, RIGHT, Discrete, Field, Kind, TaskSpec, joint_layout, layout
 
 SEEDS = (5, 6)

@@ -16,7 +16,7 @@ from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
 from esp_cli.training.metrics import MetricsWriter, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
-from esp_envs.policy_format import POLICY_FORMAT
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.faults import Fault
 
 CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}

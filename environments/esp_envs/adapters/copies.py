@@ -49,7 +49,6 @@ class Board:
     """Arrays over one piece of memory, which a fork of this process shares.
 
     Attributes:
-        active: [C] uint8, which copies the next command concerns.
         cut: [C] uint8, which copies reach the horizon with the next step.
         ended: [C] uint8, 0 or how the episode ended in the last step.
         seed: [C] int64, of the next start.
@@ -62,7 +61,6 @@ class Board:
         alive, final_alive: [C, N] uint8, the agents that have not ended.
     """
 
-    active: NDArray[np.uint8]
     cut: NDArray[np.uint8]
     ended: NDArray[np.uint8]
     seed: NDArray[np.int64]
@@ -90,7 +88,6 @@ class Board:
             "state": ((copies, sizes.state), np.float32),
             "final_state": ((copies, sizes.state), np.float32),
             "metrics": ((copies, sizes.metrics), np.float32),
-            "active": ((copies,), np.uint8),
             "cut": ((copies,), np.uint8),
             "ended": ((copies,), np.uint8),
             **dict.fromkeys(("mask", "final_mask"), ((copies, agents, sizes.choices), np.uint8)),
@@ -109,15 +106,15 @@ class Board:
 
 
 class Stepper(Protocol):
-    """What resets and steps the copies of a board that are `active`."""
+    """What resets and steps the copies of a board."""
 
     board: Board
 
     def reset(self) -> None:
-        """Start an episode in the active copies."""
+        """Start an episode in every copy."""
 
     def step(self) -> None:
-        """Advance the active copies by one step, and reset those whose episode ends."""
+        """Advance every copy by one step, and reset those whose episode ends."""
 
 
 class WorkerCopies:
@@ -150,11 +147,11 @@ class WorkerCopies:
         self._wait()
 
     def reset(self) -> None:
-        """Start an episode in the active copies."""
+        """Start an episode in every copy."""
         self._command(_RESET)
 
     def step(self) -> None:
-        """Advance the active copies by one step."""
+        """Advance every copy by one step."""
         self._command(_STEP)
 
     def _command(self, word: bytes) -> None:

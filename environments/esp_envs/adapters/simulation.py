@@ -1,30 +1,18 @@
-"""Inside a VMAS simulator: its tensors by name, its random numbers, its entities as a layout of the global state."""
+"""Inside a VMAS simulator: its random numbers, and its entities as a layout of the global state."""
 
 from __future__ import annotations
 
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from esp_envs.base import Observation
 from esp_envs.errors import UserError
-from esp_envs.extras import install
+from esp_envs.installed import install
 from esp_envs.spec import Field, Items, Kind, Layout
-
-Tensors = dict[str, Tensor]
-
-
-@dataclass(frozen=True)
-class Start:
-    """The tensors of a simulator in which an episode begins in every world, and what is seen there."""
-
-    tensors: Tensors
-    seen: Observation
 
 
 def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping[str, object]) -> Callable[[], Any]:
@@ -58,11 +46,7 @@ class RandomNumbers:
     """The random numbers of one simulator. VMAS has one state for all simulators; this exchanges it around a call."""
 
     def __init__(self, seed: int) -> None:
-        self.begin(seed)
-
-    def begin(self, seed: int) -> None:
-        """Begin with the numbers of a seed."""
-        self.state = torch.Generator().manual_seed(seed).get_state()
+        self._state = torch.Generator().manual_seed(seed).get_state()
 
     @contextlib.contextmanager
     def drawn(self) -> Iterator[None]:
@@ -70,80 +54,11 @@ class RandomNumbers:
         from vmas.simulator.environment import Environment  # noqa: PLC0415 - an extra
 
         shared = Environment.vmas_random_state
-        before, shared[0] = shared[0], self.state
+        before, shared[0] = shared[0], self._state
         try:
             yield
         finally:
-            self.state, shared[0] = shared[0], before
-
-
-def snapshot(sim: Any) -> Tensors:
-    """Return a copy of every tensor of a simulator that has a row for each world."""
-    return {name: tensor.clone() for name, _, _, tensor in _tensors(sim)}
-
-
-def restore(sim: Any, tensors: Tensors) -> None:
-    """Put a simulator into the state of a `snapshot`, which may hold more than the simulator has used so far."""
-    owners = dict(_owners(sim))
-    for name, tensor in tensors.items():
-        path, _, key = name.rpartition(".")
-        if path in owners:
-            _put(owners[path], key, tensor)
-
-
-def copy_worlds(tensors: Tensors, sim: Any, which: Tensor) -> None:
-    """Copy some worlds [E] of a snapshot into a simulator."""
-    for name, owner, key, tensor in list(_tensors(sim)):
-        if name in tensors and tensors[name].shape == tensor.shape:
-            mask = which.view(-1, *(1,) * (tensor.dim() - 1))
-            _put(owner, key, torch.where(mask, tensors[name], tensor))
-
-
-def _put(owner: Any, key: str, tensor: Tensor) -> None:
-    """Write a tensor in place, so that other names of it follow; set it where there is none of its shape."""
-    values = owner if isinstance(owner, list | dict) else vars(owner)
-    place: Any = int(key) if isinstance(owner, list) else key
-    old = values.get(place) if isinstance(values, dict) else values[place]
-    if isinstance(old, Tensor) and old.shape == tensor.shape and old.dtype == tensor.dtype and 0 not in old.stride():
-        old.copy_(tensor)
-    else:
-        values[place] = tensor.clone()
-
-
-def _tensors(sim: Any) -> Iterator[tuple[str, Any, str, Tensor]]:
-    """Yield name, owner, key and tensor of everything that has a row for each world."""
-    for path, owner in _owners(sim):
-        for key, value in _items(owner):
-            if isinstance(value, Tensor) and value.dim() and value.shape[0] == sim.num_envs:
-                yield f"{path}.{key}", owner, key, value
-
-
-def _owners(sim: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the objects of a simulator that may hold tensors, each once, by a path that does not depend on its past."""
-    known: set[int] = set()
-    waiting: list[tuple[str, Any]] = [("scenario", sim.scenario), ("world", sim.world)]
-    while waiting:
-        path, owner = waiting.pop()
-        if id(owner) in known:
-            continue
-        known.add(id(owner))
-        yield path, owner
-        waiting += [(f"{path}.{key}", value) for key, value in _items(owner) if _may_hold(value)]
-
-
-def _items(owner: Any) -> list[tuple[str, Any]]:
-    if isinstance(owner, list | tuple):
-        return [(str(i), value) for i, value in enumerate(owner)]
-    if isinstance(owner, dict):
-        return [(key, value) for key, value in owner.items() if isinstance(key, str)]
-    return list(vars(owner).items())
-
-
-def _may_hold(value: Any) -> bool:
-    if isinstance(value, list | tuple | dict):
-        return True
-    bases = type(value).__mro__
-    return any(base.__module__.startswith("vmas.") for base in bases) and hasattr(value, "__dict__")
+            self._state, shared[0] = shared[0], before
 
 
 class Entities:

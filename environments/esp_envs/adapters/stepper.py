@@ -151,16 +151,14 @@ class CopyStepper:
         self._opponents_draws: dict[int, np.random.Generator] = {}
 
     def reset(self) -> None:
-        """Start an episode in the active copies."""
+        """Start an episode in every copy."""
         for k in self._copies:
-            if self.board.active[k]:
-                self._start(k)
+            self._start(k)
 
     def step(self) -> None:
-        """Advance the active copies by one step, and reset those whose episode ends."""
+        """Advance every copy by one step, and reset those whose episode ends."""
         for k, copy in self._copies.items():
-            if self.board.active[k]:
-                self._step(k, copy)
+            self._step(k, copy)
 
     def __del__(self) -> None:
         """Close the copies of a task that is forgotten, or of a worker that leaves; what they raise concerns nobody."""

@@ -1,10 +1,5 @@
 """A VMAS scenario as a task: batched in torch, on CPU or GPU, with a layout that says what its numbers are.
 
-    class Passage(VmasTask):
-        scenario = "passage"
-        symmetry, convention = "flip-y", "vmas passage"
-        def seen(self): return layout(...)
-
 `esp_envs.adapters.vmas_scenarios` holds layouts for four scenarios. Needs the extra `vmas`.
 """
 
@@ -19,24 +14,13 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import seed_of, simulation
-from esp_envs.base import (
-    OTHER_SIZE,
-    Environment,
-    Observation,
-    Step,
-    TaskSettings,
-    generator_states,
-    require_attributes,
-    require_shape,
-    restore_generators,
-)
+from esp_envs.base import Environment, Observation, Step, require_attributes, require_shape
 from esp_envs.errors import UserError
 from esp_envs.scene import Body, Scene
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import Continuous, Field, Kind, Layout, TaskSpec, layout
 
 FORCE = Continuous(layout(Field("force", Kind.VECTOR, unit="share of the full force")))
-_KEPT_STARTS = 4
-"""Batches of starts that a seed keeps: worlds that end at different times often begin the same episode number."""
 
 
 class VmasSettings(TaskSettings):
@@ -51,7 +35,14 @@ class VmasTask(Environment):
 
     A subclass sets the attributes below and implements `seen`. The global state holds what the physics moves: velocity
     and position (and angle and spin where it turns) of each entity, and the `flags`. Chance inside of a step has to
-    come from torch; VMAS's own scenarios comply. On a GPU that chance is not part of a saved state.
+    come from torch; VMAS's own scenarios comply.
+
+    Example:
+        class Passage(VmasTask):
+            scenario, symmetry, convention = "passage", "flip-y", "vmas passage"
+
+            def seen(self):
+                return layout(Field("position", Kind.VECTOR), Field("velocity", Kind.VECTOR), ...)
     """
 
     Settings: ClassVar[type[TaskSettings]] = VmasSettings
@@ -90,7 +81,6 @@ class VmasTask(Environment):
         make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
         self._sims = [make() for _ in self.generators]
         self._numbers = [simulation.RandomNumbers(generator.initial_seed()) for generator in self.generators]
-        self._starter = make()
         self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags)
         self.spec = TaskSpec(
             name=f"vmas-{self.scenario}" if isinstance(self.scenario, str) else type(self).__name__.lower(),
@@ -111,7 +101,6 @@ class VmasTask(Environment):
         self._base = torch.zeros(self.num_seeds, dtype=torch.int64)
         lead = (self.num_seeds, num_envs)
         self._begun, self._time = torch.zeros(2, *lead, dtype=torch.int64).unbind()  # on the CPU: clocks are asked
-        self._starts: list[dict[int, simulation.Start]] = [{} for _ in self.generators]
         width = self.reading(torch.stack(self._sims[0].reset(), 1)).shape[-1]
         if width != self.spec.observation.width:
             raise UserError(
@@ -122,11 +111,9 @@ class VmasTask(Environment):
         """Start a new episode in every world."""
         for s, generator in enumerate(self.generators):
             self._base[s] = torch.randint(2**31, (), generator=generator, device=self.device)
-            self._numbers[s].begin(int(self._base[s]))
-        self._starts = [{} for _ in self.generators]
+            self._numbers[s] = simulation.RandomNumbers(int(self._base[s]))
         self._begun.zero_()
-        every = torch.ones(self.num_envs, dtype=torch.bool)
-        return _joined([self._begin(s, every, None) for s in range(self.num_seeds)])
+        return _joined([self._begin(s) for s in range(self.num_seeds)])
 
     def step(self, action: Tensor) -> Step:
         """Advance every world by one step.
@@ -146,7 +133,7 @@ class VmasTask(Environment):
             over = done.cpu() if self.terminates else torch.zeros(self.num_envs, dtype=torch.bool)
             ends.append(over)
             reached.append(here)
-            following.append(self._begin(s, over | due[s], here))
+            following.append(self._renew(s, over | due[s], here))
             rewards.append(torch.stack(reward, 1))
             measured.append([done.float(), *(_mean(infos, name, done) for name in self.metrics)])
         terminated = torch.stack(ends)
@@ -179,32 +166,6 @@ class VmasTask(Environment):
             parts.append(self._look(sim, sim.get_from_scenario(True, False, False, False)[0]))
         return _joined(parts)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return every simulator's tensors, its random numbers, clocks and generators."""
-        saved = {"base": self._base.clone(), "begun": self._begun.clone(), "time": self._time.clone()}
-        saved["dice"] = torch.stack([numbers.state for numbers in self._numbers])
-        saved["generators"] = generator_states(self.generators)
-        for s, sim in enumerate(self._sims):
-            saved |= {f"{s}.{name}": tensor for name, tensor in simulation.snapshot(sim).items()}
-        return saved
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            UserError: the tensors belong to an environment of another size.
-        """
-        if tensors["time"].shape != self._time.shape or len(tensors["generators"]) != self.num_seeds:
-            raise UserError(OTHER_SIZE)
-        self._base = tensors["base"].cpu().clone()
-        self._begun, self._time = (tensors[name].cpu().clone() for name in ("begun", "time"))
-        self._starts = [{} for _ in self.generators]
-        for s, (sim, numbers) in enumerate(zip(self._sims, self._numbers, strict=True)):
-            numbers.state = tensors["dice"][s].cpu().clone()
-            own = {n.removeprefix(f"{s}."): t.to(self.device) for n, t in tensors.items() if n.startswith(f"{s}.")}
-            simulation.restore(sim, own)
-        restore_generators(self.generators, tensors["generators"])
-
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return every entity of one world as a disc or a square of its colour."""
         sim = self._sims[world[0]]
@@ -212,29 +173,32 @@ class VmasTask(Environment):
         half = 1.2 * max(1.0, float(sim.world.x_semidim or 1), float(sim.world.y_semidim or 1))
         return Scene(tuple(bodies), (-half, half, -half, half))
 
-    def _begin(self, s: int, over: Tensor, here: Observation | None) -> Observation:
-        """Start the next episode in some worlds [E] of one seed; the others keep what they see."""
-        if here is not None and not over.any():
+    def _begin(self, s: int) -> Observation:
+        """Start the next episode in all worlds of one seed, which are at the same episode."""
+        sim, seed = self._sims[s], seed_of(int(self._base[s]), int(self._begun[s, 0]))
+        with simulation.RandomNumbers(seed).drawn():
+            obs = sim.reset(seed=seed)
+        self._begun[s] += 1
+        self._time[s] = 0
+        return self._look(sim, obs)
+
+    def _renew(self, s: int, over: Tensor, here: Observation) -> Observation:
+        """Start the next episode in some worlds [E] of one seed, each from a seed of its own; the others go on."""
+        if not over.any():
             return here
-        for episode in self._begun[s][over].unique().tolist():
-            start = self._start(s, episode)
-            which = (over & (self._begun[s] == episode)).to(self.device)
-            simulation.copy_worlds(start.tensors, self._sims[s], which)
-            here = start.seen if here is None else _chosen(which, start.seen, here)
+        if not self.terminates:
+            return self._begin(s)
+        sim, base = self._sims[s], int(self._base[s])
+        for world in over.nonzero().flatten().tolist():
+            with simulation.RandomNumbers(seed_of(base, int(self._begun[s, world]), world)).drawn():
+                sim.reset_at(world, return_observations=False)
         self._begun[s] += over
         self._time[s][over] = 0
-        assert here is not None
-        return here
-
-    def _start(self, s: int, episode: int) -> simulation.Start:
-        """Return how all worlds of a seed begin an episode; a world takes its own row, whatever the others do."""
-        kept = self._starts[s]
-        if episode not in kept:
-            while len(kept) >= _KEPT_STARTS:
-                kept.pop(next(iter(kept)))
-            obs = self._starter.reset(seed=seed_of(int(self._base[s]), episode))
-            kept[episode] = simulation.Start(simulation.snapshot(self._starter), self._look(self._starter, obs))
-        return kept[episode]
+        with simulation.RandomNumbers(seed_of(base, int(self._begun[s].sum()))).drawn():
+            new = self._look(sim, sim.get_from_scenario(True, False, False, False)[0])
+        which = over.to(self.device)
+        obs = torch.where(which[None, :, None, None], new.obs, here.obs)
+        return Observation(obs, torch.where(which[None, :, None], new.state, here.state))
 
     def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:
         seen = self.reading(torch.stack(list(obs), 1).float())
@@ -244,11 +208,6 @@ class VmasTask(Environment):
 def _joined(parts: Sequence[Observation]) -> Observation:
     """Return the seeds' observations as memory of their own."""
     return Observation(torch.cat([part.obs for part in parts]), torch.cat([part.state for part in parts]))
-
-
-def _chosen(which: Tensor, new: Observation, old: Observation) -> Observation:
-    obs = torch.where(which[None, :, None, None], new.obs, old.obs)
-    return Observation(obs, torch.where(which[None, :, None], new.state, old.state))
 
 
 def _mean(infos: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters.vmas import VmasSettings, VmasTask
-from esp_envs.base import TaskSettings
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import Field, Kind, Layout, layout
 
 _OWN = (Field("position", Kind.VECTOR, unit="length"), Field("velocity", Kind.VECTOR, unit="length/s"))

@@ -12,7 +12,7 @@ from esp_envs.conformance.subject import (
     nearly,
     parts_of,
     require,
-    require_set_state,
+    require_method,
     same_observation,
     same_step,
     tensors_of,
@@ -91,6 +91,7 @@ def results_are_memory_of_their_own(subject: Subject) -> None:
 def a_saved_environment_goes_on_bit_for_bit(subject: Subject) -> None:
     """Restored into worlds of other seeds, a saved state repeats what followed; saving takes a copy."""
     env, other = subject.worlds(), subject.worlds(seeds=(100, 101))
+    require_method(env, "state_dict", "a run that is resumed begins new episodes")
     env.reset(), other.reset()
     for _ in range(env.spec.horizon // 2):
         env.step(env.random_action())
@@ -107,6 +108,7 @@ def a_saved_environment_goes_on_bit_for_bit(subject: Subject) -> None:
 def an_environment_of_another_size_is_refused(subject: Subject) -> None:
     """A saved state of other seeds or worlds is answered by a ValueError."""
     env = subject.worlds()
+    require_method(env, "state_dict", "a run that is resumed begins new episodes")
     env.reset()
     saved = env.state_dict()
     for other in (subject.worlds(WORLDS + 1), subject.worlds(seeds=(1,))):
@@ -120,7 +122,7 @@ def an_environment_of_another_size_is_refused(subject: Subject) -> None:
 def set_state_reproduces_what_follows(subject: Subject) -> None:
     """A state fixes observations and, where a task has no chance of its own, the next step."""
     env, other, third = subject.worlds(), subject.worlds(seeds=(50, 60)), subject.worlds(seeds=(51, 61))
-    require_set_state(env)
+    require_method(env, "set_state", "the task cannot be put into a state")
     if env.spec.hidden:
         raise NotAsked(f"the state leaves out {' and '.join(env.spec.hidden)}")
     observation, _, _ = env.reset(), other.reset(), third.reset()
@@ -149,7 +151,7 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
 def set_state_starts_an_episode(subject: Subject) -> None:
     """The clock starts at 0, and a state of another width is refused."""
     env = subject.worlds()
-    require_set_state(env)
+    require_method(env, "set_state", "the task cannot be put into a state")
     observation = env.reset()
     if env.spec.horizon > 1:
         env.step(env.random_action())

@@ -15,6 +15,7 @@ from esp_envs.conformance.subject import (
     Subject,
     require,
     require_equal,
+    require_method,
     same_observation,
     tensors_of,
 )
@@ -154,8 +155,7 @@ def a_joint_action_of_the_wrong_shape_is_refused(subject: Subject) -> None:
 def a_scene_can_be_drawn(subject: Subject) -> None:
     """Finite bodies in a window, other ones in another world."""
     env = subject.worlds()
-    if not env.has("scene"):
-        raise NotAsked("the task has no picture")
+    require_method(env, "scene", "the task has no picture")
     env.reset()
     first, second = env.scene((0, 0)), env.scene((1, WORLDS - 1))
     require(first != second, "two worlds give the same picture")

@@ -72,10 +72,10 @@ def nearly(a: Sequence[Tensor], b: Sequence[Tensor], bound: float) -> bool:
     )
 
 
-def require_set_state(env: Environment) -> None:
-    """Ask nothing of a task that cannot be put into a state."""
-    if not env.has("set_state"):
-        raise NotAsked("the task cannot be put into a state")
+def require_method(env: Environment, method: str, otherwise: str) -> None:
+    """Ask nothing of a task that lacks an optional method."""
+    if not env.has(method):
+        raise NotAsked(otherwise)
 
 
 def require(holds: bool, otherwise: str) -> None:

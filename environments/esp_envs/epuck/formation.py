@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from esp_envs.base import TaskSettings
 from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.epuck import steering
 from esp_envs.epuck.engines import make_physics
@@ -22,6 +21,7 @@ from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within
 from esp_envs.scene import Painter, Scene
+from esp_envs.settings import TaskSettings
 from esp_envs.spec import TaskSpec
 
 _REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")

@@ -8,9 +8,8 @@ from pydantic import Field as Setting
 from pydantic import model_validator
 from torch import Tensor
 
-from esp_envs.base import TaskSettings
-from esp_envs.breaking import Breaks
 from esp_envs.epuck.arena import Arena
+from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, TaskSpec, filled_layout, layout
 
 WHEELS = Continuous(layout(Field("wheels", Kind.WHEELS, 1, "share of full speed")))

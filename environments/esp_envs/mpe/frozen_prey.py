@@ -2,21 +2,27 @@
 
 The file is a policy as trained with `control="prey"`: tensors `actor.layers.{k}.weight` [S, in, out] and
 `actor.layers.{k}.bias` [S, 1, out], one policy per seed along the first axis, and a metadata entry `esp` with JSON that
-says what the file is. Reading it never runs code.
+says what the file is: an object with the keys `format`, `version`, `sha256` and others. The application writes these
+files. Reading one never runs code.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from esp_envs.errors import UserError
-from esp_envs.policy_format import METADATA_KEY, POLICY_FORMAT, POLICY_VERSION, digest
 
+METADATA_KEY = "esp"
+POLICY_FORMAT = "esp-policy"
+POLICY_VERSION = 1
 _ACTIVATIONS = {"relu": torch.relu, "tanh": torch.tanh}
 _TASK, _NETWORK = "predator-prey", "mlp"
 _MOST_BYTES = 1 << 26
@@ -123,6 +129,21 @@ def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tens
     if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
         raise UserError(f"the prey policy {path} holds numbers that are not finite; export it again")
     return layers
+
+
+def digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:
+    """Return the SHA-256, as hex, of the description and of each tensor's name, dtype, shape and bytes by name."""
+    found = hashlib.sha256(_canonical(description))
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        found.update(_canonical([name, str(tensor.dtype), list(tensor.shape)]))
+        if tensor.numel():
+            found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
 def _short(value: object) -> str:

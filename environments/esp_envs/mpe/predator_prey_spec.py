@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 from pydantic import Field as Setting
 from pydantic import field_validator, model_validator
 
-from esp_envs.breaking import Breaks
 from esp_envs.errors import UserError
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
+from esp_envs.settings import Breaks
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
 

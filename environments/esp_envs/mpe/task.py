@@ -15,10 +15,10 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.base import Observation, TaskSettings
+from esp_envs.base import Observation
 from esp_envs.batched import BatchedTask, Outcome, World
-from esp_envs.breaking import Breaks
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
+from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, layout
 
 STILL = (0.0, 0.0)

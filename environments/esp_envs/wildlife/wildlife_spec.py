@@ -7,9 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field as Setting
 from pydantic import model_validator
 
-from esp_envs.base import TaskSettings
-from esp_envs.breaking import Breaks
 from esp_envs.errors import UserError
+from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
 from esp_envs.wildlife.pictures import PIXELS
 

@@ -8,8 +8,7 @@ from importlib.util import find_spec
 
 from esp_cli.training.trackers.sink import Guarded, Sink, TrackedRun
 from esp_envs.errors import UserError
-from esp_envs.extras import install
-from esp_envs.installed import load
+from esp_envs.installed import install, load
 
 __all__ = ["TRACKERS", "Guarded", "Sink", "TrackedRun", "open_trackers", "require"]
 

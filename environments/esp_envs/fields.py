@@ -1,0 +1,199 @@
+"""What numbers are: kinds, fields and layouts.
+
+A task never says how it transforms under a rotation. It says what each number *is* (a scalar, a planar
+vector, a pair of wheel speeds, ...); how a group element acts on that kind is known once, elsewhere.
+
+Shape letters, used in every docstring of this project:
+    S seeds, T steps, E worlds per seed, B batch, N agents, D observation width, A discrete actions, G group elements.
+
+Axes and signs: x points right, y points up, angles are counter-clockwise in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
+from typing import ClassVar
+
+from esp_envs.errors import UserError
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What one item of a field is. These are known; a task may define more, beside elements that act on them.
+
+    SCALAR        unchanged by every planar transform (a distance, a flag, a mass).
+    PSEUDOSCALAR  changes sign under reflection, unchanged by rotation (a turning rate).
+    VECTOR        (x, y), turned by the 2x2 matrix of the element (a position, a velocity, a heading given as
+                  the unit vector (cos, sin)).
+    WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
+    PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
+                  top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
+    RING          one number for each of n rays around a body, counter-clockwise from the x-axis (a lidar). A turn by
+                  360 / n shifts them, a mirror in the x-axis reverses them; other turns are refused.
+    RECORD        several numbers of several kinds, as the field's `parts` say (another agent's position and its speed).
+
+    Attributes:
+        name: one word.
+        width: numbers per item; of a picture, per pixel, of a ring, per ray.
+        is_vector: whether the length of an action's item is bounded by 1, and not each of its numbers.
+    """
+
+    SCALAR: ClassVar[Kind]
+    PSEUDOSCALAR: ClassVar[Kind]
+    VECTOR: ClassVar[Kind]
+    WHEELS: ClassVar[Kind]
+    PICTURE: ClassVar[Kind]
+    RING: ClassVar[Kind]
+    RECORD: ClassVar[Kind]
+
+    name: str
+    width: int
+    is_vector: bool = False
+
+
+Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.PICTURE = Kind("scalar", 1), Kind("pseudoscalar", 1), Kind("picture", 1)
+Kind.VECTOR, Kind.WHEELS = Kind("vector", 2, is_vector=True), Kind("wheels", 2)
+Kind.RING, Kind.RECORD = Kind("ring", 1), Kind("record", 0)
+
+
+class Items(Enum):
+    """What the items of a field count over, which orders of agents and of items look at.
+
+    FIXED   things that no agent permutation moves (landmarks, the own body).
+    OTHERS  the other agents in index order, the observer left out.
+    AGENTS  all agents in index order.
+    """
+
+    FIXED = "fixed"
+    OTHERS = "others"
+    AGENTS = "agents"
+
+
+def others_of(num_agents: int) -> list[list[int]]:
+    """Return for each agent the others, in the order of `Items.OTHERS`: N lists of N - 1."""
+    return [[other for other in range(num_agents) if other != agent] for agent in range(num_agents)]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A run of numbers of one kind: `count` items of `item_width` numbers each, item after item.
+
+    Only a picture has `pixels`, its rows and columns; its items are its channels. Only a ring has `rays`, and only a
+    record has `parts`, the fields of one item in their order.
+    """
+
+    name: str
+    kind: Kind
+    count: int = 1
+    unit: str = ""
+    items: Items = Items.FIXED
+    pixels: tuple[int, int] | None = None
+    rays: int = 0
+    parts: tuple[Field, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, kind, example in _FIELD_TYPES:
+            if not isinstance(getattr(self, name), kind):
+                raise UserError(f"field '{self.name}': {name} is {getattr(self, name)!r}; give {example}")
+        if self.count < 0:
+            raise UserError(f"field '{self.name}': count is {self.count}; give how many items it has")
+        if (self.kind == Kind.PICTURE) != (self.pixels is not None):
+            raise UserError(f"field '{self.name}': a picture, and nothing else, says how many rows and columns it has")
+        if self.pixels is not None and min(self.pixels) < 1:
+            raise UserError(f"field '{self.name}': pixels are {self.pixels}; give at least one row and one column")
+        if (self.kind == Kind.RING) != (self.rays > 0) or self.rays < 0:
+            raise UserError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
+        if (self.kind == Kind.RECORD) != bool(self.parts):
+            raise UserError(f"field '{self.name}': a record, and nothing else, says what parts it has")
+        if any(part.items is not Items.FIXED or part.pixels is not None for part in self.parts):
+            raise UserError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
+
+    @property
+    def item_width(self) -> int:
+        """Numbers per item."""
+        if self.parts:
+            return sum(part.width for part in self.parts)
+        return self.kind.width * (self.rays or math.prod(self.pixels or (1,)))
+
+    @property
+    def width(self) -> int:
+        """Numbers in the whole field."""
+        return self.count * self.item_width
+
+    @property
+    def described(self) -> str:
+        """What it holds, in words: "vector x 2", "picture of 21 x 21 x 1"."""
+        size = "" if self.pixels is None else f" of {self.pixels[0]} x {self.pixels[1]}"
+        if self.rays:
+            size = f" of {self.rays} rays"
+        if self.parts:
+            size = f" of {', '.join(f'{part.name} ({part.described})' for part in self.parts)}"
+        return f"{self.kind.name}{size} x {self.count}"
+
+
+_FIELD_TYPES = (
+    ("name", str, "a text"),
+    ("kind", Kind, "a kind, as Kind.VECTOR"),
+    ("count", int, "a number of items"),
+    ("unit", str, "a text, as unit='m'"),
+    ("items", Items, "what items count over, as items=Items.OTHERS"),
+)
+"""What attributes of a field have to be; the fourth and fifth are easily confused."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A sequence of fields: the whole meaning of an observation, a state or a continuous action vector."""
+
+    fields: tuple[Field, ...]
+
+    def __post_init__(self) -> None:
+        if stranger := next((repr(f) for f in self.fields if not isinstance(f, Field)), None):
+            raise UserError(f"a layout is made of fields, and {stranger} is none; write layout(Field(...), ...)")
+        names = [f.name for f in self.fields]
+        if len(set(names)) != len(names):
+            raise UserError(f"field names must differ, got {names}")
+
+    @cached_property
+    def width(self) -> int:
+        """Numbers in one row."""
+        return sum(f.width for f in self.fields)
+
+    def slices(self) -> dict[str, slice]:
+        """Where each field lies in a row."""
+        out, start = {}, 0
+        for f in self.fields:
+            out[f.name] = slice(start, start + f.width)
+            start += f.width
+        return out
+
+    @property
+    def summary(self) -> str:
+        """The fields in a few words: "heading 2, goal 2 (m)"."""
+        return ", ".join(f"{f.name} {f.width}" + (f" ({f.unit})" if f.unit else "") for f in self.fields)
+
+    def table(self) -> list[tuple[str, str, str, str]]:
+        """Rows (index range, name, kind x count, unit) for environment cards and export manifests."""
+        rows = []
+        for f, s in zip(self.fields, self.slices().values(), strict=True):
+            span = str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}"
+            rows.append((span, f.name, f.described, f.unit))
+        return rows
+
+
+def layout(*fields: Field) -> Layout:
+    """Build a layout from its fields."""
+    return Layout(tuple(fields))
+
+
+def filled_layout(*fields: Field) -> Layout:
+    """Build a layout from those of the fields that have items."""
+    return layout(*(field for field in fields if field.count))
+
+
+def joint_layout(observation: Layout, num_agents: int) -> Layout:
+    """Return the layout of all agents' observations one after the other (width N * D)."""
+    return Layout(tuple(replace(f, name=f"agent{i}.{f.name}") for i in range(num_agents) for f in observation.fields))

@@ -1,0 +1,77 @@
+"""What a user may change of a task, and which settings break some of its symmetry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from pydantic import BaseModel, ConfigDict
+
+
+@dataclass(frozen=True)
+class Breaks:
+    """What a setting leaves of a task's symmetry while it is not 0; it annotates the setting.
+
+    Attributes:
+        plane: the planar group that is left, the name of the settings' attribute that says it, or None where nothing of
+            the plane is broken.
+        agents: whether the agents may still be exchanged.
+
+    Example:
+        class WindySettings(TaskSettings):
+            wind: Annotated[float, Breaks("flip-x")] = 0.0
+    """
+
+    plane: str | None
+    agents: bool = True
+
+
+def remaining(whole: str, broken: Iterable[Breaks]) -> str:
+    """Return the symmetry that is left where several things break it: "flip-x*agents", "c1" for none.
+
+    Two that leave different planar groups are taken to leave none of the plane.
+
+    Args:
+        whole: the symmetry without them, "d4*agents".
+        broken: each with the name of the planar group that it leaves.
+    """
+    real = list(broken)
+    planes = {one.plane for one in real if one.plane is not None}
+    plane, *rest = whole.split("*")
+    if planes:
+        plane = planes.pop() if len(planes) == 1 else "c1"
+    exchanged = all(one.agents for one in real)
+    return "*".join((plane, *(factor for factor in rest if factor != "agents" or exchanged)))
+
+
+class TaskSettings(BaseModel):
+    """What a user may change of a task; each field has its default, unit and bounds here and nowhere else."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def without_effect(self) -> frozenset[str]:
+        """Return the names of settings that change nothing beside the others."""
+        return frozenset()
+
+    @classmethod
+    def breakable(cls) -> dict[str, Breaks]:
+        """Return what each setting that breaks a symmetry leaves of it, by the setting's name."""
+        return {
+            name: mark
+            for name, field in cls.model_fields.items()
+            for mark in field.metadata
+            if isinstance(mark, Breaks)
+        }
+
+    def broken(self) -> dict[str, Breaks]:
+        """Return what those leave that are not 0, each with the name of a planar group."""
+        marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name)}
+        return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
+
+    def left_of(self, whole: str, *further: Breaks) -> str:
+        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents"."""
+        return remaining(whole, (*self.broken().values(), *further))
+
+    def broken_in_words(self) -> str:
+        """Return what a reward convention adds about the settings that break a symmetry: ", wind 0.3"."""
+        return "".join(f", {name} {getattr(self, name):g}" for name in self.broken())
