@@ -85,17 +85,6 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
     return (allowed.cumsum(-1) <= place.unsqueeze(-1)).sum(-1)
 
 
-def require_attributes(task: object, *names: str) -> None:
-    """Refuse a task whose class leaves out what its base class asks for.
-
-    Raises:
-        UserError: names what is missing.
-    """
-    missing = [name for name in names if getattr(task, name, None) is None]
-    if missing:
-        raise UserError(f"the class {type(task).__name__} does not say its {', '.join(missing)}; set it in the class")
-
-
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
     """Refuse a tensor of another shape.
 

@@ -7,15 +7,23 @@ So a prior that turns the frame too never says anything false. The task itself o
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from esp_envs.base import Environment, Observation, Step
-from esp_envs.scene import Painter, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, joint_layout, layout
+
+
+def _of_the_worlds(method: str) -> Any:
+    """Return a method that hands on to that of the worlds; the frame changes nothing for it."""
+
+    def call(self: Compass, *given: Any, **named: Any) -> Any:
+        return getattr(self.inner, method)(*given, **named)
+
+    return call
 
 
 class Compass(Environment):
@@ -29,6 +37,10 @@ class Compass(Environment):
         length: of both vectors; a short one is hard to learn from, so that the symmetry is given up late.
         labels: whether each agent sees a number of its own.
     """
+
+    has, heuristic, scene, painter = map(_of_the_worlds, ("has", "heuristic", "scene", "painter"))
+    action_mask, random_action = map(_of_the_worlds, ("action_mask", "random_action"))
+    state_dict, load_state_dict = map(_of_the_worlds, ("state_dict", "load_state_dict"))
 
     def __init__(self, inner: Environment, length: float, labels: bool = False) -> None:
         super().__init__(inner.settings, inner.num_envs, inner.generators)
@@ -52,14 +64,6 @@ class Compass(Environment):
         final = None if step.final is None else self._framed(step.final)
         return replace(step, next=self._framed(step.next), final=final)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return that of the worlds."""
-        return self.inner.state_dict()
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        self.inner.load_state_dict(tensors)
-
     def set_state(self, state: Tensor) -> Observation:
         """Put every world into a global state; its frame is left out."""
         own = self.inner.spec
@@ -67,30 +71,6 @@ class Compass(Environment):
             rows = state.unflatten(-1, (own.num_agents, -1))
             return self._framed(self.inner.set_state(rows[..., : own.observation.width].flatten(2)))
         return self._framed(self.inner.set_state(state[..., : own.state.width]))
-
-    def has(self, method: str) -> bool:
-        """Return whether the task offers a method."""
-        return self.inner.has(method)
-
-    def heuristic(self, name: str | None = None) -> Tensor:
-        """Return what the task's hand-written policy does."""
-        return self.inner.heuristic(name)
-
-    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return what there is to draw; the frame is not drawn."""
-        return self.inner.scene(world)
-
-    def painter(self, size: int) -> AbstractContextManager[Painter] | None:
-        """Return the task's own view."""
-        return self.inner.painter(size)
-
-    def action_mask(self) -> Tensor | None:
-        """Return which actions each agent may take now."""
-        return self.inner.action_mask()
-
-    def random_action(self) -> Tensor:
-        """Return the task's random joint action."""
-        return self.inner.random_action()
 
     def _framed(self, seen: Observation) -> Observation:
         lead = seen.obs.shape[:2]

@@ -57,8 +57,6 @@ ROUNDING = {"formation": 1e-5}
 
 
 NOT_ASKED = (
-    "all worlds end together",
-    "each world ends for itself",
     "the state leaves out ",
     "what is seen has chance",
 )

@@ -13,10 +13,10 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import seed_of
+from esp_envs.adapters import require_attributes, seed_of
 from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
-from esp_envs.base import Environment, Observation, Step, require_attributes, require_shape
+from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.installed import available_cores
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import Discrete, TaskSpec, joint_layout

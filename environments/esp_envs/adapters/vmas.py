@@ -13,8 +13,8 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import seed_of, simulation
-from esp_envs.base import Environment, Observation, Step, require_attributes, require_shape
+from esp_envs.adapters import require_attributes, seed_of, simulation
+from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
 from esp_envs.scene import Body, Scene
 from esp_envs.settings import TaskSettings

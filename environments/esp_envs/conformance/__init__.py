@@ -22,8 +22,7 @@ __all__ = ["PROMISES", "Broken", "Finding", "NotAsked", "Subject", "check"]
 PROMISES: tuple[Callable[[Subject], None], ...] = (
     stepping.observations_rewards_and_metrics_fit_the_spec,
     stepping.actions_of_heuristics_and_chance_lie_in_the_action_space,
-    stepping.episodes_end_together_at_the_horizon,
-    stepping.episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest,
+    stepping.episodes_end_when_the_spec_says,
     repeating.the_same_seed_gives_the_same_run,
     repeating.a_seed_alone_equals_itself_among_others,
     repeating.worlds_do_not_touch_each_other,

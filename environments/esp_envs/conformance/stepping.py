@@ -11,7 +11,6 @@ from esp_envs.base import Environment, Step
 from esp_envs.conformance.subject import (
     WORLDS,
     Broken,
-    NotAsked,
     Subject,
     require,
     require_equal,
@@ -20,6 +19,9 @@ from esp_envs.conformance.subject import (
     tensors_of,
 )
 from esp_envs.spec import Continuous, Discrete
+
+_MANY = 40
+"""Worlds among which some end early at random."""
 
 
 def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
@@ -97,48 +99,32 @@ def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -
         require(first, "the default heuristic is not the first that the class names")
 
 
-def episodes_end_together_at_the_horizon(subject: Subject) -> None:
-    """Where no world ends of its own: truncated in the last step alone, then elsewhere, and again after a reset."""
+def episodes_end_when_the_spec_says(subject: Subject) -> None:
+    """Truncated at the horizon, terminated only with `terminates`; `final` where a world may have ended."""
     env = subject.worlds()
-    if env.spec.terminates:
-        raise NotAsked("each world ends for itself")
+    horizon, terminates = env.spec.horizon, env.spec.terminates
+    if terminates:
+        env = subject.worlds(_MANY)
+    age = torch.zeros(env.num_seeds, env.num_envs, device=env.device)
     env.reset()
-    for _ in range(2):
-        step = env.step(env.random_action())
-        for t in range(env.spec.horizon):
-            last = t == env.spec.horizon - 1
-            require(not bool(step.terminated.any()), "a world terminated; set 'terminates' in the spec")
-            require(bool(step.truncated.all() if last else not step.truncated.any()), "truncated at another step")
-            require((step.final is not None) == last, "'final' belongs to the last step alone")
-            if not last:
-                step = env.step(env.random_action())
-        assert step.final is not None
-        require(not torch.equal(step.final.state, step.next.state), "the next episode starts where the last ended")
-    env.step(env.random_action())
-    env.reset()
-    ends = [bool(env.step(env.random_action()).truncated.any()) for _ in range(env.spec.horizon)]
-    require(ends == [False] * (env.spec.horizon - 1) + [True], "reset does not restart the clock")
-
-
-def episodes_that_end_for_themselves_end_at_the_horizon_at_the_latest(subject: Subject) -> None:
-    """Where worlds end of their own: never both ends at once, and `final` equals `next` in the others."""
-    env = subject.worlds(40)
-    if not env.spec.terminates:
-        raise NotAsked("all worlds end together")
-    env.reset()
-    age = torch.zeros(env.num_seeds, 40, device=env.device)
-    for _ in range(2 * env.spec.horizon + 2):
+    for t in range(2 * horizon + 3):
+        if t == 2 * horizon + 1:  # in mid-episode
+            env.reset()
+            age.zero_()
         step = env.step(env.random_action())
         age += 1
-        require(step.final is not None, "'final' is missing although a world may have ended")
-        assert step.final is not None
+        require(terminates or not bool(step.terminated.any()), "a world terminated; set 'terminates' in the spec")
         require(not bool((step.terminated & step.truncated).any()), "a world is terminated and truncated at once")
-        at_horizon = torch.equal(step.truncated, (age == env.spec.horizon) & ~step.terminated)
-        require(at_horizon, "a world is truncated at another step than the horizon")
-        goes_on = ~step.ended
-        same = same_observation(step.final, step.next, (goes_on,))
-        require(same, "'final' differs from 'next' in a world that goes on")
-        age[~goes_on] = 0
+        due = (age == horizon) & ~step.terminated
+        require(torch.equal(step.truncated, due), "a world is truncated at another step than the horizon")
+        may_end = terminates or bool(due.any())
+        require((step.final is not None) == may_end, "'final' belongs to the steps in which a world may have ended")
+        if step.final is not None:
+            same = same_observation(step.final, step.next, (~step.ended,))
+            require(same, "'final' differs from 'next' in a world that goes on")
+            anew = not bool(step.ended.any()) or not torch.equal(step.final.state, step.next.state)
+            require(anew, "the next episode starts where the last ended")
+        age[step.ended] = 0
 
 
 def a_joint_action_of_the_wrong_shape_is_refused(subject: Subject) -> None:
