@@ -23,7 +23,6 @@ RANKS = {
     "defaults": 0,
     "files": 0,
     "machine": 0,
-    "settings_index": 0,
     "console": 0.5,
     "symmetry": 1,
     "prior": 2,

@@ -11,8 +11,8 @@ from typing import Any
 import typer
 
 from esp_cli.app import app
-from esp_cli.settings_index import Setting, read_index
 from esp_cli.symmetry import carried_groups
+from esp_cli.training.settings import Setting, sections
 from esp_envs.registry import make, task_class, task_names
 
 
@@ -57,7 +57,7 @@ def settings() -> str:
         "# Settings\n\n`--set NAME=VALUE` changes one setting, `--preset paper` takes the paper's values."
         " `esp settings` prints the same. [Configuration](../configuration.md) says which source of a value wins.\n"
     )
-    for section in read_index():
+    for section in sections():
         title = section.name if section.kind in (section.name, "algorithm") else f"{section.kind} {section.name}"
         rows = [
             (

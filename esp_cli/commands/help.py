@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-import typer
-
-from esp_cli.commands.completion import COMPLETERS, Completer
+from esp_cli.commands.completion import offers
 from esp_cli.files.formatting import format_count
 
 _TRAINED, _SEARCHED, _PRIOR, _SETTINGS = "What is trained", "What is searched", "Symmetry prior", "Settings"
@@ -39,8 +36,8 @@ def arrange(command: Any) -> Any:
     shared = {"task": _POLICY, "algo": _POLICY, "network": _POLICY, "prior": _POLICY}
     groups = {**shared, **groups, **_MOVED.get(command.name, {})}
     for parameter in command.params:
-        if completer := COMPLETERS.get(parameter.name):
-            parameter._custom_shell_complete = partial(_completed, completer)
+        if completer := offers(parameter.name):
+            parameter._custom_shell_complete = completer
         kind = parameter.type_descriptor.annotation
         if not parameter.opts[0].startswith("-"):
             parameter.display_type_rich = _nothing  # the metavar and the help say it
@@ -56,10 +53,6 @@ def arrange(command: Any) -> Any:
         elif parameter.name == "steps" and isinstance(parameter.default, int):
             parameter.show_default = format_count(parameter.default)
     return command
-
-
-def _completed(completer: Completer, context: typer.Context, _: object, incomplete: str) -> list[str]:
-    return completer(context, incomplete)
 
 
 def _nothing(**_: object) -> str:

@@ -10,13 +10,13 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, installed_tasks
-from esp_cli.settings_index import Section, Setting, read_index
+from esp_cli.files.suggesting import did_you_mean
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from esp_cli.settings_index import Value
+    from esp_cli.training.settings import Section, Setting
 
 EPILOG = """Examples:\n
     esp settings mappo\n
@@ -45,16 +45,16 @@ def _sections(of: str | None) -> Sequence[Section]:
     Raises:
         UserError: there is nothing of that name.
     """
-    built_in = read_index()
+    from esp_cli.training.settings import own_section, sections, task_section
+
+    if of is not None and ":" in of:
+        return [own_section(of)]
+    built_in = list(sections())
     found = [section for section in built_in if of in (None, section.name)]
-    if of is None or found:
+    if found or of is None:
         return found
-    if ":" in of or of in installed_tasks():
-        from esp_cli.training.settings import own_section, task_section
-
-        return [own_section(of) if ":" in of else task_section(of)]
-    from esp_cli.files.suggesting import did_you_mean
-
+    if of in installed_tasks():
+        return [task_section(of)]
     names = [section.name for section in built_in]
     hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
     raise UserError(f"nothing with settings is called '{of}'{hint}")
@@ -91,7 +91,7 @@ def _meaning(setting: Setting) -> str:
     return f"{setting.description} ({'; '.join(texts)})" if texts else setting.description
 
 
-def _written(value: Value) -> str:
+def _written(value: object) -> str:
     """Write a value as --set takes it."""
     if value is None:
         return "-"
@@ -99,8 +99,6 @@ def _written(value: Value) -> str:
         return str(value).lower()
     if isinstance(value, float):
         return f"{value:g}"
-    if isinstance(value, int | str):
-        return str(value)
     if isinstance(value, Mapping):
         return json.dumps(value)
-    return f"[{','.join(map(str, value))}]"
+    return f"[{','.join(map(str, value))}]" if isinstance(value, list | tuple) else str(value)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from pydantic import BaseModel
 
@@ -11,7 +12,6 @@ from esp_cli.algorithms.presets import FAST, PAPER, PRESETS, TUNED, Sections
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
-from esp_cli.settings_index import Section, Setting
 from esp_cli.training.config import EvaluationConfig
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, task_class
@@ -31,6 +31,40 @@ _UNITS = {
     "_landmark_extent": "length",
 }
 """Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting.
+
+    Attributes:
+        name: as `--set` takes it, "mappo.learning_rate".
+        type: "integer", "number", "text", "flag", or "list of ...".
+        default: where neither preset, task, file nor command line says something else.
+        bounds: of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none.
+        unit: of its value; empty for a bare number.
+        description: what it does.
+        presets: values that a preset sets instead, by preset; "fast on navigation" on this task alone.
+        tasks: values that the preset default sets on a task instead, by task.
+    """
+
+    name: str
+    type: str
+    default: Any
+    bounds: str
+    unit: str
+    description: str
+    presets: Mapping[str, Any]
+    tasks: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Section:
+    """The settings of one task, algorithm or network, or of every run, in the order of their model."""
+
+    name: str
+    kind: Literal["algorithm", "task", "network", "prior", "evaluation"]
+    settings: tuple[Setting, ...]
 
 
 def sections() -> Iterator[Section]:

@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 import json
-import runpy
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from esp_cli.settings_index import INDEX, Section, read_index
 from esp_cli.training.config import resolve_config
-from esp_cli.training.settings import task_section
+from esp_cli.training.settings import Section, sections, task_section
 from tests.cli.running import esp, refused
 
-ROOT = Path(__file__).parents[2]
-SECTIONS = read_index()
-
-
-def test_the_index_is_that_of_the_models() -> None:
-    maker = runpy.run_path(str(ROOT / "docs" / "make_settings.py"))
-    assert INDEX.read_text(encoding="utf-8") == maker["index"](), "run python docs/make_settings.py"
+SECTIONS = tuple(sections())
 
 
 def test_every_setting_says_what_it_does() -> None:
@@ -96,14 +86,3 @@ def test_a_task_of_ones_own_has_settings_too(tmp_path: Path, monkeypatch: pytest
 def test_a_name_without_settings_is_one_sentence() -> None:
     assert refused("settings", "mapo") == "nothing with settings is called 'mapo'; did you mean 'mappo'?"
     assert "there is mappo, maddpg, qmix, navigation" in refused("settings", "colour")
-
-
-def test_the_list_needs_no_torch() -> None:
-    code = (
-        "import sys; from esp_cli.app import app\n"
-        "try: app(['settings', 'mappo'])\n"
-        "except SystemExit as end: assert end.code == 0\n"
-        "assert 'torch' not in sys.modules"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr

@@ -21,12 +21,17 @@ from rich.table import Table
 from typer.testing import CliRunner
 
 from esp_cli import console
+from esp_cli.algorithms.presets import PRESETS
+from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.app import app, build_command
-from esp_cli.commands import COMMANDS
+from esp_cli.commands import COMMANDS, completion
 from esp_cli.console import streams
 from esp_cli.console.progress import progress_line
 from esp_cli.console.tables import lay_out
+from esp_cli.networks.build import NETWORKS
 from esp_cli.policies.bundled import read_bundled
+from esp_cli.training.trackers import TRACKERS
+from esp_envs.registry import TASKS
 from tests.cli.running import TINY_OPTIONS, esp
 
 ROOT = Path(__file__).parents[2]
@@ -256,15 +261,6 @@ def completed(line: str, **environment: str) -> list[str]:
         ("esp train --network emp", ["empn"]),
         ("esp train --prior aug", ["augment"]),
         ("esp train --track w", ["wandb"]),
-        ("esp train --set mappo.le", ["mappo.learning_rate="]),
-        ("esp train --algo qmix --set qmix.mixer", ["qmix.mixer_width="]),
-        ("esp train --task formation --set task.sensor", ["task.sensor_noise_m="]),
-        ("esp train --set task.sensor", []),
-        ("esp discover formation --set task.sensor", ["task.sensor_noise_m="]),
-        ("esp discover navigation --set task.sensor", []),
-        ("esp discover formation --set mappo.le", []),
-        ("esp check symmetry navigation --set task.sensor", []),
-        ("esp eval runs/mine --set task.sensor", ["task.sensor_noise_m="]),
         ("esp eval formation-mappo-", ["formation-mappo-esp", "formation-mappo-plain"]),
         ("esp render navigation wildlife-mappo-", ["wildlife-mappo-esp", "wildlife-mappo-plain"]),
         ("esp settings pri", ["prior"]),
@@ -278,13 +274,27 @@ def test_the_shell_is_offered_what_can_follow(
     assert completed(line) == offered
 
 
-def test_run_folders_are_offered_beside_the_bundled_policies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "runs" / "form").mkdir(parents=True)
-    (tmp_path / ".hidden").mkdir()
-    monkeypatch.chdir(tmp_path)
-    assert completed("esp eval ru") == ["runs/"]
-    assert completed("esp eval runs/f") == ["runs/form/"]
-    assert not any(name.startswith(".") for name in completed("esp eval "))
+def test_the_names_that_are_offered_are_those_of_the_registries() -> None:
+    assert tuple(filter(TASKS.ships, TASKS)) == completion.TASKS
+    assert tuple(filter(ALGORITHMS.ships, ALGORITHMS)) == completion.ALGORITHMS
+    assert tuple(filter(NETWORKS.ships, NETWORKS)) == completion.NETWORKS
+    assert {*PRESETS["mappo"], "fast"} == set(completion.PRESETS)
+    assert tuple(TRACKERS) == completion.TRACKERS
+
+
+def test_neither_help_nor_completion_imports_torch() -> None:
+    code = "import sys, runpy\ntry: from esp_cli.app import app; app()\nfinally: assert 'torch' not in sys.modules"
+    for words, environment in (
+        (["--help"], {}),
+        (["train", "--help"], {}),
+        ([], {"_ESP_COMPLETE": "complete_bash", "COMP_WORDS": "esp train --task na", "COMP_CWORD": "3"}),
+    ):
+        command = [sys.executable, "-c", code, *words]
+        done = subprocess.run(
+            command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
+        )
+        assert "AssertionError" not in done.stderr, words
+        assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
