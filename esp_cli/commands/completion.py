@@ -43,4 +43,4 @@ def offers(parameter: str) -> Callable[[typer.Context, object, str], list[str]] 
     names = _NAMES.get(parameter)
     if names is None:
         return None
-    return lambda context, of, incomplete: [name for name in names() if name.startswith(incomplete)]
+    return lambda _context, _of, incomplete: [name for name in names() if name.startswith(incomplete)]
