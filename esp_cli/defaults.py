@@ -20,5 +20,7 @@ SLOWEST = 0.01
 """Speed of a film, times real time, at least."""
 MAX_STEPS = 10**12
 """Steps that one run may take; the fastest machine needs years for them."""
+MAX_SEED = 999_999_999
+"""Largest number of a seed on a command line."""
 MAX_SEEDS = 1000
 """Most seeds of one run; more is a typing error."""

@@ -7,12 +7,12 @@ from collections.abc import Iterable
 from decimal import Decimal
 
 from esp_cli import console
-from esp_cli.defaults import MAX_SEEDS, MAX_STEPS
+from esp_cli.defaults import MAX_SEED, MAX_SEEDS, MAX_STEPS
 from esp_envs.errors import UserError
 
 _MULTIPLIERS = {"": 1, "k": 1_000, "m": 1_000_000, "g": 1_000_000_000}
 _COUNT = re.compile(r"(?P<number>\d[\d_]*(?:\.\d+)?(?:e\d{1,2})?)\s*(?P<letter>[kmg]?)", re.IGNORECASE)
-_SEED_LIST = re.compile(r"\d{1,9}(\s*,\s*\d{1,9})*\s*,?")
+_SEED_LIST = re.compile(r"\d+(\s*,\s*\d+)*\s*,?")
 
 
 def parse_count(value: str | int) -> int:
@@ -60,11 +60,13 @@ def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
     """Read the seeds of a run by their numbers: "3,7" means the seeds 3 and 7, "7" the seed 7 alone.
 
     Raises:
-        UserError: not a list of seeds, a seed twice, or too many seeds.
+        UserError: not a list of seeds, a seed twice or beyond `MAX_SEED`, or too many seeds.
     """
     text = str(value).strip() if isinstance(value, str) else ",".join(map(str, value))
     if not _SEED_LIST.fullmatch(text):
         raise UserError(f"'{text}' is not a list of seeds; write their numbers, as 3,7")
+    if re.search(r"\d{10}", text):
+        raise UserError(f"'{text[:40]}' names a seed beyond {MAX_SEED}; write numbers from 0 to {MAX_SEED}")
     seeds = tuple(int(item) for item in text.split(",") if item.strip())
     if len(seeds) > MAX_SEEDS:
         raise UserError(f"{len(seeds)} seeds cannot be trained at once; name at most {MAX_SEEDS}")

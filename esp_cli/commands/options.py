@@ -122,7 +122,7 @@ def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
     def parser(value: str) -> T:
         try:
             return parse(value)
-        except ValueError as failure:
+        except UserError as failure:
             raise typer.BadParameter(str(failure)) from failure
 
     parser.__name__ = name

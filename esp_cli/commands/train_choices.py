@@ -97,7 +97,7 @@ def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
     started = f"the run of {path} started from the policy {source}"
     try:
         trained = open_policy(Path(source))
-    except ValueError:
+    except UserError:
         raise UserError(f"{started}, which cannot be read here; add --init-from POLICY") from None
     if not is_start_of(trained, config):
         folder = "" if path.is_dir() else ", or name the folder of the run, which holds a copy"
@@ -114,7 +114,7 @@ def _read(path: Path, name: str, value: Any) -> Any:
             return parse_seeds(value)
         if name == "seeds" and isinstance(value, list):
             return parse_seed_list(value)
-    except ValueError as error:
+    except UserError as error:
         raise UserError(f"{path}: {error}") from None
     known = get_args(Device) if name == "device" else (value,)
     if not isinstance(value, str) or value not in known:

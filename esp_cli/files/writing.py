@@ -77,9 +77,7 @@ def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) 
         size, tail = file.seek(0, os.SEEK_END), b""
         while b"\n" not in tail and len(tail) < size:
             if len(tail) > MAX_LINE_BYTES:
-                raise UserError(
-                    f"{path} is damaged: its last line has more than {MAX_LINE_BYTES} bytes; remove that line"
-                )
+                raise UserError(f"{path} is damaged: its last line has more than 16 MiB; remove that line")
             start = file.seek(max(0, size - max(2 * len(tail), _TAIL_BYTES)))
             tail = file.read(size - start)
         last = tail.rpartition(b"\n")[2]

@@ -87,6 +87,8 @@ class Symmetry:
             raise UserError(f"copies is {copies!r}; choose 'draw' or 'all'")
         if num_agents < 1:
             raise UserError(f"num_agents is {num_agents}; there is at least one agent")
+        if not -(2**63) <= seed < 2**64:
+            raise UserError(f"seed is {seed}; give a number from 0 to 2**64 - 1")
         joint = joint_layout(observation, num_agents)
         self.spaces = unrestricted(
             Spaces(num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="c1")

@@ -104,7 +104,7 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     try:
         learner = ALGORITHMS[config.algorithm]
-    except ValueError as error:
+    except UserError as error:
         raise UserError(f"{source}: {error}") from None
     _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
     _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)

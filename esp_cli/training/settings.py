@@ -97,7 +97,7 @@ def own_section(name: str) -> Section:
     for registry in (TASKS, ALGORITHMS, NETWORKS):
         try:
             registry.register(name)
-        except ValueError as refusal:
+        except UserError as refusal:
             refusals.append(str(refusal))
             continue
         if registry is ALGORITHMS:

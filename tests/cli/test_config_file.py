@@ -144,6 +144,8 @@ def test_a_wrong_file_is_one_sentence(tmp_path: Path, content: object, sentence:
         ("steps = ", "is not valid TOML"),
         ("mappo.gamma = inf", "sets 'mappo.gamma' to inf; write a finite number"),
         ("task.day = 2020-01-01", "sets 'task.day' to a date or time"),
+        (f"[a{'.a' * 3000}]\nx = 1", "is not valid TOML: it is nested more than 64 deep"),
+        (f"a{'.a' * 3000} = 1", "is not valid TOML: it is nested more than 64 deep"),
     ],
 )
 def test_wrong_toml_is_one_sentence(tmp_path: Path, content: str, sentence: str) -> None:

@@ -77,6 +77,55 @@ def test_an_error_is_one_line_without_markup(capsys: pytest.CaptureFixture[str])
     assert captured.err == "error: field [bold]x[/bold] is wrong; " + ("mend it " * 30).strip() + "\n"
 
 
+HOSTILE = "a\x1b]52;c;aGk=\x07\x9b2Jb\x7f"
+"""It would set the clipboard and clear the screen."""
+
+
+def test_no_control_character_of_a_text_reaches_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    console.say(HOSTILE)
+    console.text(HOSTILE)
+    console.note(HOSTILE)
+    console.error(HOSTILE)
+    console.table((HOSTILE, "n>"), [(HOSTILE, 1)], title=HOSTILE, caption=HOSTILE)
+    console.write_json("-", {HOSTILE: HOSTILE})
+    captured = capsys.readouterr()
+    shown = captured.out + captured.err
+    assert [c for c in shown if c != "\n" and (c < " " or "\x7f" <= c < "\xa0")] == []
+    assert shown.count(r"a\x1b]52;c;aGk=") == 8
+    console.say("\tä ± 1")
+    assert "ä ± 1" in capsys.readouterr().out  # negative control: other characters stay
+
+
+def shell(words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run Python code that has the console, in a shell that can send its output anywhere."""
+    known = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)} | environment
+    command = words.replace("PYTHON", f"{sys.executable} -c")
+    return subprocess.run(["sh", "-c", command], env=known, capture_output=True, text=True, check=False)
+
+
+def test_a_full_disk_behind_standard_error_ends_nothing() -> None:
+    code = "from esp_cli import console; console.note('a'); console.note('b'); print('done')"
+    done = shell(f'PYTHON "{code}" 2>/dev/full')
+    assert (done.returncode, done.stdout) == (0, "done\n")
+    done = shell(f'PYTHON "{code.replace("note", "say")}" >/dev/full')
+    assert done.returncode != 0, "negative control: results have to be written"
+
+
+def test_what_a_terminal_cannot_show_is_written_otherwise() -> None:
+    code = "from esp_cli import console; console.fit_encoding(); console.table(('a','b>'), [('x', '1 ± 2')])"
+    done = shell(f'PYTHON "{code}"', PYTHONIOENCODING="ascii")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "1 +- 2" in done.stdout
+
+
+def test_a_deleted_working_directory_is_one_sentence(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    done = shell(f"cd {gone} && rmdir {gone} && PYTHON 'from esp_cli.app import main; main()' tasks")
+    assert done.returncode == 2
+    assert done.stderr == "error: the working directory was deleted; change to another one (cd)\n"
+
+
 def test_a_table_in_a_pipe_keeps_its_columns(capsys: pytest.CaptureFixture[str]) -> None:
     console.table(["policy", "mean>"], [["a" * 90, -122.5], ["random [x]", 3]], title="navigation", caption="esp")
     lines = capsys.readouterr().out.splitlines()

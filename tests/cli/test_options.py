@@ -87,6 +87,8 @@ def test_what_names_no_seeds_is_refused(text: str, reason: str) -> None:
         ("a", "is not a list of seeds"),
         ("-1", "is not a list of seeds"),
         (",", "is not a list of seeds"),
+        ("9223372036854775807", "names a seed beyond 999999999; write numbers from 0 to 999999999"),
+        ("3," + "9" * 5000, "names a seed beyond 999999999"),
     ],
 )
 def test_what_is_no_list_of_seeds_is_refused(text: str, reason: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from esp_cli.app import report
 from esp_envs import installed
 from esp_envs.installed import raised_in
 from esp_envs.registry import TASKS
@@ -44,6 +45,14 @@ class Raises(Rendezvous):
         if Raises.steps > 130:
             raise KeyError("lost")
         return super()._advance(world, action)
+
+class Looks(Rendezvous):
+    def _advance(self, world, action):
+        return [1, 2].index(3)
+
+class Forgets(Rendezvous):
+    def _advance(self, world, action):
+        return {}["nothing"]
 
 class Builds(Rendezvous):
     def __init__(self, *arguments):
@@ -93,7 +102,9 @@ class Pays(Rendezvous):
     ("name", "sentence"),
     [
         ("Raises", "your code raises in '_advance' (wrong.py, line 11): KeyError: 'lost'"),
-        ("Builds", "your code raises in '__init__' (wrong.py, line 16): RuntimeError: no simulator here"),
+        ("Builds", "your code raises in '__init__' (wrong.py, line 24): RuntimeError: no simulator here"),
+        ("Looks", "your code raises in '_advance' (wrong.py, line 16): ValueError: 3 is not in list"),
+        ("Forgets", "your code raises in '_advance' (wrong.py, line 20): KeyError: 'nothing'"),
         ("Describes", "'_describe' of Describes returns None; return a TaskSpec"),
         ("Starts", "'position' of what '_start' of rendezvous gives is no tensor; give tensors"),
         ("StartsAlone", "'_start' of rendezvous gives Tensor; give a dict of tensors by name"),
@@ -127,6 +138,8 @@ def test_a_run_whose_task_raised_goes_on_from_its_checkpoint(folder, monkeypatch
 def test_what_esp_itself_does_wrong_is_no_fault_of_the_users_code(monkeypatch):
     """Negative control: an error whose traceback has no line of the user's."""
     monkeypatch.setattr(installed, "_FOREIGN", {"mine"})  # tests of this process may have registered tasks of theirs
-    with pytest.raises(KeyError) as caught:
-        {}["nothing"]
-    assert raised_in(caught.value) is None
+    for fail in (lambda: {}["nothing"], lambda: [1, 2].index(3)):
+        with pytest.raises((KeyError, ValueError)) as caught:
+            fail()
+        assert raised_in(caught.value) is None
+        assert report(caught.value) is None, "it keeps its traceback"

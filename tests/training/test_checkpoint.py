@@ -318,6 +318,15 @@ def test_fuzzed_files_load_unchanged_or_not_at_all(tmp_path):
     assert refused > 0.8 * FUZZ_ROUNDS
 
 
+def test_a_file_larger_than_its_header_declares_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "a"
+    save_checkpoint(path, small_tensors(), META)
+    with path.open("rb+") as file:
+        file.truncate(40 * 2**30)  # a hole, which takes no space
+    with pytest.raises(CheckpointError, match="its size, 42949672960 bytes, is not what its header declares"):
+        load_checkpoint(path)
+
+
 # Killed writers
 
 KILLER = """

@@ -18,6 +18,7 @@ from esp_cli.training.metrics import (
     read_metrics,
     truncate_metrics,
 )
+from esp_envs.errors import UserError
 
 ROWS = [
     {"step": 100, "train/loss": [1.0, 2.0], "time/seconds": 0.5},
@@ -179,3 +180,17 @@ def test_the_last_row_is_found_however_long_it_is(path, monkeypatch):
     assert read_last_row(path) == ROWS[-1]
     path.write_text("torn")
     assert read_last_row(path) == {}
+
+
+def test_a_file_of_forty_gigabytes_that_holds_nothing_is_one_sentence(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    with path.open("wb") as file:
+        file.truncate(40 * 2**30)  # a hole, which takes no space
+    with pytest.raises(MetricsError, match="line 1 is not a row of metrics"):
+        read_metrics(path)
+    with pytest.raises(MetricsError, match="line 1 is not a row of metrics"):
+        truncate_metrics(path, 100)
+    with pytest.raises(UserError, match="its last line has more than 16 MiB"):
+        MetricsWriter(path)
+    assert read_last_row(path) == {}
+    assert [entry.name for entry in tmp_path.iterdir()] == ["metrics.jsonl"]
