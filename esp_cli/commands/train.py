@@ -248,11 +248,14 @@ def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
     for mode, values in trainer.final_returns().items():
         good = values[np.isfinite(values)]  # a seed that stopped has none
         rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
-    caption = f"convention {trainer.convention}; mean ± s.e.m. over seeds, last evaluation"
+    caption = f"convention {trainer.learner.spec.convention}; mean ± s.e.m. over seeds, last evaluation"
     console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
     if not trainer.learner.has_learned:
         console.note(
             "nothing was learned: the run ended within its warm-up; take more --steps or fewer warmup_episodes"
         )
     words = shlex.join([str(path), *config.own_words()])
-    console.note(f"next: esp eval {words}" + (f"    esp render {words} -o out.gif" if trainer.can_be_drawn else ""))
+    console.note(
+        f"next: esp eval {words}"
+        + (f"    esp render {words} -o out.gif" if trainer.evaluation_worlds.has("scene") else "")
+    )

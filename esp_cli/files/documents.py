@@ -23,6 +23,8 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_DOCUMENT_BYTES = 16 * 2**20
 """Parsed JSON takes some 20 times the space of its text."""
 MAX_NESTING = 64
+_LARGEST = 1e30
+"""Largest number that a setting takes; float32, in which most of them are used, ends at 3.4e38."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 _MAX_INTEGER = 2**63
 
@@ -126,6 +128,36 @@ def validate(model: type[Model], content: object) -> Model:
         ValidationError: it is not what the model asks for.
     """
     return model.model_validate_json(json.dumps(content), strict=True)
+
+
+def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
+    """Build `model`, turning pydantic's report into one sentence.
+
+    Raises:
+        UserError: an unknown name, or a value of another kind, out of range or not finite.
+    """
+    try:
+        built = model(**values)
+    except ValidationError as error:
+        raise UserError(one_sentence(error, model, section, owner)) from None
+    for name, value in values.items():
+        given, taken = _numbers(value), _numbers(getattr(built, name))
+        problem = ""
+        if any(type(number) is int and abs(number) >= 2**63 for number in taken):
+            problem = "it has more than 64 bits"
+        elif not all(abs(number) <= _LARGEST for number in taken):  # false for NaN
+            problem = f"it has to be a finite number of at most {_LARGEST:g}"
+        elif sum(isinstance(x, bool) for x in given) > sum(isinstance(x, bool) for x in taken):
+            problem = "it has to be a number"  # pydantic takes true for 1
+        if problem:
+            raise UserError(f"bad value {shortened(str(value).lower())} for '{section}.{name}': {problem}")
+    return built
+
+
+def _numbers(value: object) -> list[bool | int | float]:
+    """Return the numbers and flags of a value, or of a list."""
+    items = value if isinstance(value, list | tuple) else [value]
+    return [item for item in items if isinstance(item, bool | int | float)]
 
 
 def encode(value: object, path: str | os.PathLike[str], error: type[UserError] = DocumentError) -> bytes:

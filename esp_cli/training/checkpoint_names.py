@@ -1,16 +1,66 @@
-"""The names of a run's checkpoint files, and which of them a newer one supersedes."""
+"""The checkpoint files of a run: their names, the run that they are of, and which of them a newer one supersedes."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from esp_cli.training.folder_names import CHECKPOINTS
+from esp_cli.training.checkpoint import CheckpointError, read_description
+from esp_cli.training.folder_names import CHECKPOINTS, CONFIG
+from esp_envs.mpe.frozen_prey import digest
 
 FILE_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
+RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"
+"""Keys of `config.json` and of a checkpoint's description; folders and checkpoints of esp 0.1 may lack them."""
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """What a checkpoint says of the run that it is of: the identity, and a digest of the configuration.
+
+    Example:
+        >>> Stamp.of("a1", {"task": "navigation", "device": "cpu"}) == Stamp.of("a1", {"task": "navigation"})
+        True
+    """
+
+    identity: str | None
+    config_sha256: str
+
+    @classmethod
+    def of(cls, identity: str | None, config: Mapping[str, Any]) -> Stamp:
+        """Return the stamp of a run; its device is left out, as a run may go on on another one."""
+        return cls(identity, digest({}, {key: value for key, value in config.items() if key != "device"}))
+
+    def entries(self) -> dict[str, Any]:
+        """Return the entries of a checkpoint's description."""
+        return {RUN_ID: self.identity, CONFIG_SHA256: self.config_sha256}
+
+    def require(self, file: Path, description: Mapping[str, Any]) -> None:
+        """Refuse a checkpoint of another run, or one that was written under another configuration.
+
+        Raises:
+            CheckpointError: it is one.
+        """
+        if description.get(RUN_ID) != self.identity:
+            raise CheckpointError(f"{file} is a checkpoint of another run; move it out of this folder")
+        if description.get(CONFIG_SHA256, self.config_sha256) != self.config_sha256:
+            config = file.parents[1] / CONFIG
+            raise CheckpointError(
+                f"{file} was written under another configuration than that in {config}; restore that file, or train "
+                "anew under another --out"
+            )
+
+    def is_foreign(self, file: Path) -> bool:
+        """Return whether a checkpoint is of another run; a damaged one does not say so."""
+        with suppress(CheckpointError):
+            return bool(read_description(file).get(RUN_ID) != self.identity)
+        return False
 
 
 def file_name(step: int, final: bool) -> str:

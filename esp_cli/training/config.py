@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, field_validator
 from pydantic_core import to_jsonable_python
 
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, one_sentence, parse_value, shortened
+from esp_cli.files.documents import Strict, parse_value, validated
 from esp_cli.files.suggesting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -158,28 +158,15 @@ def resolve_config(
         UserError: an unknown name or a value out of range, in one sentence.
     """
     sections = _preset_sections(task, algorithm, preset)
-    for dotted, value in (overrides or {}).items():
-        section, dot, key = dotted.rpartition(".")
-        if not dot or section not in sections:
-            raise UserError(_no_section(dotted, task, algorithm))
-        sections[section][key] = read = _read(value)
-        if isinstance(read, float) and not math.isfinite(read):
-            raise UserError(f"bad value {read} for '{dotted}': it has to be a finite number")
-
-    network_name = sections["network"].get("name", "mlp")
-    network = network_class(network_name)
-    for name in set(sections["network"]) - set(network.model_fields):
-        if f"network.{name}" not in (overrides or {}):  # of a preset, for a network that the user did not choose
-            del sections["network"][name]
-    if sections["prior"].get("kind") == "auto" and "prior.transforms" not in (overrides or {}):
-        sections["prior"].pop("transforms", None)  # of a preset, for a prior that trusts all of them alike
-
+    _override(sections, overrides or {}, task, algorithm)
     task_settings = resolve_task_settings(task, sections["task"])
     prior = validated(PriorConfig, sections["prior"], "prior")
     if prior.kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
         chosen = default_transforms(make(task, 1, (0,), task_settings).spec, not prior.needs_declaration)
         prior = prior.model_copy(update={"transforms": chosen})
-    algorithm_settings = validated(ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm)
+    _refuse_loss_without_terms(algorithm, prior)
+    network = network_class(sections["network"].get("name", "mlp"))
+    owner = f"the network {sections['network'].get('name', 'mlp')}"
     values = {
         "task": task,
         "algorithm": algorithm,
@@ -187,14 +174,38 @@ def resolve_config(
         "steps": steps,
         "seeds": tuple(seeds),
         "task_settings": task_settings,
-        "algorithm_settings": algorithm_settings.model_dump(),
-        "network": validated(network, sections["network"], "network", f"the network {network_name}"),
+        "algorithm_settings": validated(
+            ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm
+        ).model_dump(),
+        "network": validated(network, sections["network"], "network", owner),
         "prior": prior,
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
     }
-    _refuse_loss_without_terms(algorithm, values["prior"])
     return validated(RunConfig, values, "run")
+
+
+def _override(
+    sections: dict[str, dict[str, object]], overrides: Mapping[str, object], task: str, algorithm: str
+) -> None:
+    """Set what the user chose, and drop what a preset chose for another network or for declared transforms.
+
+    Raises:
+        UserError: a name is not SECTION.NAME, or a number is not finite.
+    """
+    for dotted, value in overrides.items():
+        section, dot, key = dotted.rpartition(".")
+        if not dot or section not in sections:
+            raise UserError(_no_section(dotted, task, algorithm))
+        sections[section][key] = read = _read(value)
+        if isinstance(read, float) and not math.isfinite(read):
+            raise UserError(f"bad value {read} for '{dotted}': it has to be a finite number")
+    known = network_class(sections["network"].get("name", "mlp")).model_fields
+    for name in set(sections["network"]) - set(known):
+        if f"network.{name}" not in overrides:
+            del sections["network"][name]
+    if sections["prior"].get("kind") == "auto" and "prior.transforms" not in overrides:
+        sections["prior"].pop("transforms", None)
 
 
 def _refuse_loss_without_terms(algorithm: str, prior: PriorConfig) -> None:
@@ -254,21 +265,17 @@ def completed(config: RunConfig) -> RunConfig:
     Raises:
         UserError: its task or algorithm is unknown.
     """
-    models = {
+    models: dict[str, type[BaseModel]] = {
         "task_settings": task_class(config.task).Settings,
         "algorithm_settings": ALGORITHMS[config.algorithm].config_class,
     }
-    gained = {
-        part: {
-            name: field.get_default(call_default_factory=True)
-            for name, field in model.model_fields.items()
-            if not field.is_required()
-        }
-        for part, model in models.items()
-    }
-    return config.model_copy(
-        update={part: to_jsonable_python(new) | getattr(config, part) for part, new in gained.items()}
-    )
+    return config.model_copy(update={part: _defaults(models[part]) | getattr(config, part) for part in models})
+
+
+def _defaults(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the defaults of a model, as JSON shows them."""
+    fields = {name: field for name, field in model.model_fields.items() if not field.is_required()}
+    return {name: to_jsonable_python(f.get_default(call_default_factory=True)) for name, f in fields.items()}
 
 
 def _read(value: object) -> object:
@@ -279,43 +286,3 @@ def _read(value: object) -> object:
         return parse_value(value)
     except ValueError:
         return value
-
-
-_LARGEST = 1e30
-"""Largest number that a setting takes; float32, in which most of them are used, ends at 3.4e38."""
-
-
-def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
-    """Build `model`, turning pydantic's report into one sentence.
-
-    Raises:
-        UserError: an unknown name, or a value of another kind, out of range or not finite.
-    """
-    try:
-        built = model(**values)
-    except ValidationError as error:
-        raise UserError(one_sentence(error, model, section, owner)) from None
-    for name, value in values.items():
-        taken = list(_numbers(getattr(built, name)))
-        if any(not abs(number) < 2**63 for number in taken if not isinstance(number, float)):
-            raise UserError(f"bad value {shortened(str(value))} for '{section}.{name}': it has more than 64 bits")
-        if not all(abs(number) <= _LARGEST for number in taken):  # false for what is no number
-            raise UserError(
-                f"bad value {shortened(str(value))} for '{section}.{name}': it has to be a finite number of at most "
-                f"{_LARGEST:g}"
-            )
-        # pydantic takes true for 1
-        if _count_flags(_numbers(value)) > _count_flags(taken):
-            raise UserError(f"bad value {json.dumps(value)} for '{section}.{name}': it has to be a number")
-    return built
-
-
-def _numbers(value: object) -> Iterator[bool | int | float]:
-    """Yield the numbers and flags of a value, or of a list."""
-    for item in value if isinstance(value, list | tuple) else [value]:
-        if isinstance(item, bool | int | float):
-            yield item
-
-
-def _count_flags(numbers: Iterable[object]) -> int:
-    return sum(isinstance(number, bool) for number in numbers)

@@ -126,7 +126,7 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
     """Rewrite a metrics file atomically without its torn last line and without the rows past a step.
 
-    What remains is kept byte for byte.
+    What remains is kept byte for byte. A missing file is made.
 
     Args:
         path: metrics file.
@@ -136,9 +136,11 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
         The number of whole rows removed.
 
     Raises:
-        MetricsError: the file is missing, damaged elsewhere than at its end, or cannot be written.
+        MetricsError: the file is damaged elsewhere than at its end, or cannot be written.
     """
     path, removed = Path(path), 0
+    with attempting("write", path, MetricsError):
+        os.close(open_own(path, os.O_WRONLY))
     with attempting("write", path, MetricsError), replacing(path) as write:
         for line, row in _rows(path):
             if row["step"] <= last_step:

@@ -20,7 +20,7 @@ import contextlib
 import json
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -39,12 +39,20 @@ from esp_cli.training.checkpoint import (
     read_description,
     save_checkpoint,
 )
-from esp_cli.training.checkpoint_names import checkpoints_in, file_name, is_final, place_of, step_of, superseded
+from esp_cli.training.checkpoint_names import (
+    RUN_ID,
+    Stamp,
+    checkpoints_in,
+    file_name,
+    is_final,
+    place_of,
+    step_of,
+    superseded,
+)
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
-from esp_cli.training.metrics import truncate_metrics
 from esp_cli.training.policy_file import write_policy
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT, digest
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 
 
 class RunFolderError(UserError):
@@ -52,8 +60,6 @@ class RunFolderError(UserError):
 
 
 RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolderError)
-_RUN_ID, _CONFIG_SHA256 = "run_id", "config_sha256"
-"""Keys of `config.json` and of a checkpoint's description; folders and checkpoints of esp 0.1 may lack them."""
 
 
 def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
@@ -63,9 +69,9 @@ def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
         RunFolderError: it is missing, damaged, foreign or newer.
     """
     config = RUN_FORMAT.read(path)
-    identity = config.pop(_RUN_ID, None)
+    identity = config.pop(RUN_ID, None)
     if not isinstance(identity, str | None):
-        raise RunFolderError(f"{path} is damaged: its {_RUN_ID} is not a text")
+        raise RunFolderError(f"{path} is damaged: its {RUN_ID} is not a text")
     return config, identity
 
 
@@ -76,30 +82,17 @@ class RunFolder:
         path: the folder.
         config: the resolved configuration that the run was made with.
         identity: of the run, drawn when it was made; None of a run of esp 0.1.
+        metrics_path: the file that a MetricsWriter appends to.
+        policy_path: the file of the trained policy.
+        initial_path: the file of the policy that the run started from.
+        lock_path: the file that the process which trains holds.
     """
 
     def __init__(self, path: Path, config: dict[str, Any], identity: str | None = None) -> None:
         self.path, self.config, self.identity = path, config, identity
-
-    @property
-    def metrics_path(self) -> Path:
-        """The file that a MetricsWriter appends to."""
-        return self.path / METRICS
-
-    @property
-    def policy_path(self) -> Path:
-        """The file of the trained policy."""
-        return self.path / POLICY
-
-    @property
-    def initial_path(self) -> Path:
-        """The file of the policy that the run started from."""
-        return self.path / INITIAL
-
-    @property
-    def lock_path(self) -> Path:
-        """The file that the process which trains holds."""
-        return self.path / LOCK
+        self.metrics_path, self.policy_path = path / METRICS, path / POLICY
+        self.initial_path, self.lock_path = path / INITIAL, path / LOCK
+        self._stamp = Stamp.of(identity, config)
 
     @classmethod
     def create(
@@ -119,7 +112,7 @@ class RunFolder:
             RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
         """
         path = Path(path)
-        if taken := {"format", "version", _RUN_ID} & set(config):
+        if taken := {"format", "version", RUN_ID} & set(config):
             raise RunFolderError(f"a configuration may not use the reserved key '{min(taken)}'")
         try:
             resolved = json.loads(json.dumps(dict(config), allow_nan=False))
@@ -141,7 +134,7 @@ class RunFolder:
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
                     write_policy(folder.initial_path, initial, {})
-                RUN_FORMAT.write(path / CONFIG, {_RUN_ID: folder.identity, **resolved})
+                RUN_FORMAT.write(path / CONFIG, {RUN_ID: folder.identity, **resolved})
         return folder
 
     @classmethod
@@ -183,7 +176,9 @@ class RunFolder:
             raise RunFolderError(str(error)) from None
         try:
             with attempting("tidy up", self.path, RunFolderError):
-                self._remove_half_written()
+                for folder in (self.path, self.path / CHECKPOINTS):
+                    for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
+                        remove_file(file)
                 if self.policy_path.is_file():  # a process was killed before it came to this
                     self._remove_superseded()
             yield
@@ -200,7 +195,7 @@ class RunFolder:
 
     def write_checkpoint(
         self, step: int, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], final: bool = False
-    ) -> Path:
+    ) -> None:
         """Write a checkpoint, then remove those that are not needed any more.
 
         Write the metrics of the step first: they are flushed to the disk before the checkpoint that stands for them.
@@ -213,39 +208,27 @@ class RunFolder:
             meta: JSON-able description; ``step``, the identity and the digest are added.
             final: training is done.
 
-        Returns:
-            The file.
-
         Raises:
-            RunFolderError: the file cannot be written (CheckpointError where the content cannot be stored).
+            UserError: the file cannot be written, or the folder is no longer the one that is held.
         """
         path = self.checkpoint_path(step, final)
         with attempting("write", path, RunFolderError):
             require_held(path)
             path.parent.mkdir(exist_ok=True)
             sync_file(self.metrics_path)
-        save_checkpoint(path, tensors, {**meta, **self._stamp(), "step": step})
-        with attempting("remove old checkpoints beside", path, RunFolderError):
-            for file in superseded(self.checkpoints(), step):
-                if not self._is_foreign(file):
-                    remove_file(file)
-        return path
+        save_checkpoint(path, tensors, {**meta, **self._stamp.entries(), "step": step})
+        self._remove(superseded(self.checkpoints(), step))
 
-    def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> Path:
+    def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
         """Write the trained policy as a file of its own that needs no run folder; training is done with that.
 
         Checkpoints before the final one go: with a replay they are large, and nothing goes on from them any more.
 
-        Returns:
-            The file.
-
         Raises:
-            RunFolderError: a checkpoint cannot be removed (CheckpointError where the content cannot be stored, or the
-                file cannot be written).
+            UserError: the file cannot be written, or a checkpoint cannot be removed.
         """
         write_policy(self.policy_path, tensors, meta)
         self._remove_superseded()
-        return self.policy_path
 
     def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         """Load the newest good checkpoint.
@@ -270,10 +253,10 @@ class RunFolder:
                 if file.exists():  # another process may have ended the run, and removed it, since it was listed
                     problem = problem or str(error)
                 continue
-            self._refuse_other(file, meta)
+            self._stamp.require(file, meta)
             if problem:
                 note(f"{problem}; going back to step {step_of(file)}")
-            return tensors, {key: value for key, value in meta.items() if key not in (_RUN_ID, _CONFIG_SHA256)}
+            return tensors, {key: value for key, value in meta.items() if key not in self._stamp.entries()}
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
         return None
@@ -288,58 +271,18 @@ class RunFolder:
                     return version
         return None
 
-    def truncate_metrics(self, after_step: int) -> int:
-        """Remove the rows of metrics past a checkpoint's step, and a torn last line, before a run goes on from it.
-
-        Returns:
-            The number of whole rows removed.
-
-        Raises:
-            MetricsError: the file is damaged elsewhere than at its end.
-        """
-        if not self.metrics_path.exists():
-            os.close(open_own(self.metrics_path, os.O_WRONLY))
-        return truncate_metrics(self.metrics_path, after_step)
-
-    def _stamp(self) -> dict[str, Any]:
-        """Return what a checkpoint says of the run that it is of; a run may go on on another device."""
-        decisive = {key: value for key, value in self.config.items() if key != "device"}
-        return {_RUN_ID: self.identity, _CONFIG_SHA256: digest({}, decisive)}
-
-    def _refuse_other(self, file: Path, meta: Mapping[str, Any]) -> None:
-        """Refuse a checkpoint of another run, or one that was written under another configuration.
-
-        Raises:
-            RunFolderError: it is one.
-        """
-        stamp = self._stamp()
-        if meta.get(_RUN_ID) != stamp[_RUN_ID]:
-            raise RunFolderError(f"{file} is a checkpoint of another run; move it out of this folder")
-        if meta.get(_CONFIG_SHA256, stamp[_CONFIG_SHA256]) != stamp[_CONFIG_SHA256]:
-            raise RunFolderError(
-                f"{file} was written under another configuration than that in {self.path / CONFIG}; restore that file, "
-                "or train anew under another --out"
-            )
-
-    def _is_foreign(self, file: Path) -> bool:
-        """Return whether a checkpoint is of another run; a damaged one says nothing of the kind."""
-        with contextlib.suppress(CheckpointError):
-            return read_description(file).get(_RUN_ID) != self.identity
-        return False
-
     def _remove_superseded(self) -> None:
         """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
         if any(map(is_final, files)):
-            with attempting("remove old checkpoints in", self.path / CHECKPOINTS, RunFolderError):
-                for file in files:
-                    if not is_final(file) and not self._is_foreign(file):
-                        remove_file(file)
+            self._remove([file for file in files if not is_final(file)])
 
-    def _remove_half_written(self) -> None:
-        for folder in (self.path, self.path / CHECKPOINTS):
-            for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
-                remove_file(file)
+    def _remove(self, checkpoints: Iterable[Path]) -> None:
+        """Remove checkpoints, but none of another run."""
+        for file in checkpoints:
+            with attempting("remove", file, RunFolderError):
+                if not self._stamp.is_foreign(file):
+                    remove_file(file)
 
 
 def _refuse_taken(path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import os
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
-from esp_cli.training.metrics import MetricsWriter, column, read_metrics
+from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
 from esp_cli.training.play import PolicyController, play
 from esp_cli.training.policy_file import describe_policy, read_initial
 from esp_cli.training.run_folder import RunFolder
@@ -33,13 +33,9 @@ def checkpoint_seconds() -> float:
         UserError: it is not a number of seconds.
     """
     text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 <= seconds < math.inf:
+    if not re.fullmatch(r"\d+(\.\d*)?", text):
         raise UserError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
-    return seconds
+    return float(text)
 
 
 CHECKPOINT_SECONDS = checkpoint_seconds()
@@ -104,7 +100,7 @@ class Trainer:
         self.notes: list[str] = []
         self._restore()
         self._good = self._snapshot()
-        self._eval_env = build_environment(config, config.evaluation.episodes, "evaluation")
+        self.evaluation_worlds = build_environment(config, config.evaluation.episodes, "evaluation")
 
     @property
     def step(self) -> int:
@@ -125,16 +121,6 @@ class Trainer:
     def all_stopped(self) -> bool:
         """Whether no seed has finite numbers any more."""
         return len(self.stopped_seeds) == len(self.config.seeds)
-
-    @property
-    def convention(self) -> str:
-        """The reward convention in which returns are counted."""
-        return self.learner.spec.convention
-
-    @property
-    def can_be_drawn(self) -> bool:
-        """Whether the task can be drawn."""
-        return self._eval_env.has("scene")
 
     def final_returns(self) -> dict[str, NDArray[np.float64]]:
         """Return the last evaluation of the run: greedy and stochastic, one return per seed (NaN where it stopped)."""
@@ -198,7 +184,7 @@ class Trainer:
 
     def _evaluate(self) -> dict[str, Tensor]:
         """Play greedy and stochastic episodes; every seed's worlds depend on its seed, the step and the mode."""
-        env, row = self._eval_env, {}
+        env, row = self.evaluation_worlds, {}
         for mode in ("greedy", "stochastic"):
             stream = ("evaluation", mode, self.step)
             for generator, seed in zip(env.generators, stream_seeds(self.config.seeds, *stream), strict=True):
@@ -282,7 +268,7 @@ class Trainer:
                 )
         elif self.config.init_from is not None:
             self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
-        self.folder.truncate_metrics(self.step if found else -1)
+        truncate_metrics(self.folder.metrics_path, self.step if found else -1)
 
     def _load(self, tensors: dict[str, Tensor]) -> None:
         """Load the state of the learner; refuse a checkpoint whose names, shapes or types are not the learner's."""

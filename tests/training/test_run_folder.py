@@ -14,7 +14,7 @@ import torch
 
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
-from esp_cli.training.metrics import MetricsWriter, read_metrics
+from esp_cli.training.metrics import MetricsWriter, read_metrics, truncate_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.faults import Fault
@@ -252,10 +252,10 @@ def test_metrics_past_the_checkpoint_go_before_a_run_goes_on(folder):
         for step in (100, 200, 300):
             writer.write(step, {"train/loss": [float(step)]})
     write_checkpoints(folder, 200)
-    assert folder.truncate_metrics(200) == 1
+    assert truncate_metrics(folder.metrics_path, 200) == 1
     assert [row["step"] for row in read_metrics(folder.metrics_path)] == [100, 200]
     folder.metrics_path.unlink()
-    assert folder.truncate_metrics(200) == 0
+    assert truncate_metrics(folder.metrics_path, 200) == 0
     assert read_metrics(folder.metrics_path) == []
 
 
@@ -320,7 +320,7 @@ RUNNER = """
 import sys
 import torch
 torch.set_num_threads(1)
-from esp_cli.training.metrics import MetricsWriter
+from esp_cli.training.metrics import MetricsWriter, truncate_metrics
 from esp_cli.training.run_folder import RunFolder
 
 folder, last = RunFolder.open(sys.argv[1]), int(sys.argv[2])
@@ -331,7 +331,7 @@ with folder.lock():
         tensors, meta = found
         step, x = meta["step"], tensors["x"]
         generator.set_state(tensors["generator"])
-    folder.truncate_metrics(step)
+    truncate_metrics(folder.metrics_path, step)
     print("running", flush=True)
     with MetricsWriter(folder.metrics_path) as writer:
         while step < last:
