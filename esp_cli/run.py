@@ -28,9 +28,9 @@ from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.evaluation import evaluate as evaluate_policy
-from esp_cli.policies.initial import describe, matching_weights
+from esp_cli.policies.initial import Start
 from esp_cli.policies.loaded import LoadedPolicy
-from esp_cli.policies.loading import TrainedPolicy, open_policy, register_own
+from esp_cli.policies.loading import TrainedPolicy, register_own
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.config_file import parse_config
@@ -182,7 +182,7 @@ def plan(
     preset: str,
     settings: Mapping[str, object] | None,
     device: str,
-    init_from: str | os.PathLike[str] | None,
+    init_from: str | os.PathLike[str] | Start | None,
 ) -> tuple[RunConfig, dict[str, Tensor] | None]:
     """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
 
@@ -195,8 +195,9 @@ def plan(
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    weights = matching_weights(learner.policy, open_policy(Path(init_from)))
-    return config.model_copy(update={"init_from": describe(os.fspath(init_from), weights)}), weights
+    start = init_from if isinstance(init_from, Start) else Start.open(init_from)
+    initial, weights = start.fit(learner.policy)
+    return config.model_copy(update={"init_from": initial}), weights
 
 
 def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:

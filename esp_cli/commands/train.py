@@ -119,7 +119,6 @@ def train(
 
     from esp_cli import run as runs
     from esp_cli.machine import resolve_device
-    from esp_cli.policies.initial import OwnCopy
     from esp_cli.training.config import resolve_config
     from esp_cli.training.run_folder import RUN_FORMAT
     from esp_cli.training.trackers import require
@@ -152,14 +151,10 @@ def train(
     said = set(overrides)
     if config is not None:
         choices, overrides, said = with_file(context, config, choices, overrides)
-    init_from = choices.pop("init_from")
-    kept = init_from if isinstance(init_from, OwnCopy) else None
+    start = choices.pop("init_from")
     choices["device"] = resolve_device(choices["device"])
     idle = said & resolve_config(**choices, overrides=overrides).without_effect()
-    init_from = None if kept else init_from
-    resolved, weights = runs.plan(algo=choices.pop("algorithm"), settings=overrides, init_from=init_from, **choices)
-    if kept is not None:
-        resolved, weights = kept.start(resolved)
+    resolved, weights = runs.plan(algo=choices.pop("algorithm"), settings=overrides, init_from=start, **choices)
     note_without_effect(idle)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))

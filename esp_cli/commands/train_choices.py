@@ -13,7 +13,7 @@ from esp_cli.commands.options import Device, was_given
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.policies.initial import OwnCopy
+    from esp_cli.policies.initial import Start
     from esp_cli.training.config import RunConfig
 
 _PARAMETERS = {"algorithm": "algo"}
@@ -83,26 +83,25 @@ def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict
     return left
 
 
-def _start_of(path: Path, config: RunConfig, source: str) -> OwnCopy | str:
+def _start_of(path: Path, config: RunConfig, source: str) -> Start:
     """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same.
 
     Raises:
         UserError: there is neither.
     """
-    from esp_cli.policies.initial import OwnCopy, is_start_of
-    from esp_cli.policies.loading import open_policy
+    from esp_cli.policies.initial import Start
 
-    if path.is_dir() and (own := OwnCopy.find(path, config)) is not None:
+    if path.is_dir() and (own := Start.find_copy(path, config)) is not None:
         return own
     started = f"the run of {path} started from the policy {source}"
     try:
-        trained = open_policy(Path(source))
+        start = Start.open(source)
     except UserError:
         raise UserError(f"{started}, which cannot be read here; add --init-from POLICY") from None
-    if not is_start_of(trained, config):
+    if not start.matches(config):
         folder = "" if path.is_dir() else ", or name the folder of the run, which holds a copy"
         raise UserError(f"{started}, which holds other weights now; add --init-from POLICY{folder}")
-    return source
+    return start
 
 
 def _read(path: Path, name: str, value: Any) -> Any:

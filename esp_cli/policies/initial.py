@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +11,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.policy import Policy
-from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_learner
+from esp_cli.policies.loading import open_policy
 from esp_cli.training.checkpoint import CheckpointError
 from esp_cli.training.config import InitialPolicy, RunConfig
 from esp_cli.training.policy_file import read_initial
@@ -20,63 +20,34 @@ from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest
 
 
-def matching_weights(policy: Policy, trained: TrainedPolicy) -> dict[str, Tensor]:
-    """Return the weights of a trained policy for the S seeds of a new one.
-
-    One seed serves all; as many seeds as the new policy has serve one each.
-
-    Args:
-        policy: the new one, which says what fits.
-        trained: the other one.
-
-    Raises:
-        UserError: numbers of seeds, names or shapes differ.
-    """
-    return _matching(policy, trained.policy.state_dict(), trained.config, trained.source)
-
-
-def _matching(policy: Policy, theirs: Mapping[str, Tensor], config: RunConfig, source: Path) -> dict[str, Tensor]:
-    """Return weights [S', ...] of a configuration's policy for the S seeds of a new one; see `matching_weights`."""
-    seeds, others = policy.num_seeds, len(next(iter(theirs.values())))
-    if others not in (1, seeds):
-        raise UserError(
-            f"cannot start {seeds} seed(s) from {source}, which holds {others}; "
-            f"train {others} seeds, or start from one of its seeds: 'esp export {source} --seed K -f policy' writes it"
-        )
-    own = policy.state_dict()
-    # names before shapes: those that differ are of another algorithm or network
-    for name in sorted(own.keys() | theirs.keys(), key=lambda name: (name in own and name in theirs, name)):
-        here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, theirs))
-        if here != there:
-            of_it = f"'{name}' is {'missing' if there is None else there} there"
-            of_this = "missing" if here is None else here
-            algorithm = "the algorithm, " if here is None or there is None else ""
-            raise UserError(
-                f"cannot start from {source}: it is a policy of {config.algorithm} on {config.task} with the network "
-                f"{config.network.name}, and {of_it} but {of_this} in this run; "
-                f"choose {algorithm}the task settings and the network of that policy"
-            )
-    return {name: _for_seeds(tensor, seeds) for name, tensor in theirs.items()}
-
-
 @dataclass(frozen=True)
-class OwnCopy:
-    """The weights that a run started from, as its folder holds them.
+class Start:
+    """Weights that a run may start from.
 
     Attributes:
-        folder: of the run.
-        config: of the run.
-        recorded: what its configuration says of them.
-        weights: [S, ...], or [1, ...] where one seed's serve all.
+        source: the policy, as a configuration records it.
+        holder: the file or folder that holds the weights.
+        config: of the run that trained the policy, or that started from it.
+        weights: [S', ...]; one seed's serve all, as many seeds as a new run has serve one each.
     """
 
-    folder: Path
+    source: str
+    holder: Path
     config: RunConfig
-    recorded: InitialPolicy
     weights: Mapping[str, Tensor]
 
     @classmethod
-    def find(cls, folder: Path, config: RunConfig) -> OwnCopy | None:
+    def open(cls, source: str | os.PathLike[str]) -> Start:
+        """Open a run folder, a policy file or a bundled policy.
+
+        Raises:
+            UserError: nothing there, damaged, or of another version.
+        """
+        trained = open_policy(Path(source))
+        return cls(os.fspath(source), trained.source, trained.config, trained.policy.state_dict())
+
+    @classmethod
+    def find_copy(cls, folder: Path, config: RunConfig) -> Start | None:
         """Return the copy in the folder of a run; None where the run started from nothing, or its copy is damaged."""
         if config.init_from is None:
             return None
@@ -86,31 +57,51 @@ class OwnCopy:
             return None
         if all(torch.equal(tensor, tensor[:1].expand_as(tensor)) for tensor in weights.values()):
             weights = {name: tensor[:1] for name, tensor in weights.items()}
-        return cls(folder, config, config.init_from, weights)
+        return cls(config.init_from.source, folder, config, weights)
 
-    def start(self, config: RunConfig) -> tuple[RunConfig, dict[str, Tensor]]:
-        """Return the configuration of another run that starts from these weights too, and its weights.
+    def fit(self, policy: Policy) -> tuple[InitialPolicy, dict[str, Tensor]]:
+        """Return what a new run's configuration records of this start, and the weights [S, ...] for its policy.
+
+        Args:
+            policy: of the new run, which says what fits.
 
         Raises:
-            UserError: they do not fit.
+            UserError: numbers of seeds, names or shapes differ.
         """
-        weights = _matching(build_learner(config).policy, self.weights, self.config, self.folder)
-        return config.model_copy(update={"init_from": describe(self.recorded.source, weights)}), weights
+        seeds, own = policy.num_seeds, policy.state_dict()
+        if self._num_seeds not in (1, seeds):
+            raise UserError(
+                f"cannot start {seeds} seed(s) from {self.holder}, which holds {self._num_seeds}; train "
+                f"{self._num_seeds} seeds, or start from one of its seeds: 'esp export {self.holder} --seed K -f "
+                "policy' writes it"
+            )
+        # names before shapes: those that differ are of another algorithm or network
+        for name in sorted(
+            own.keys() | self.weights.keys(), key=lambda name: (name in own and name in self.weights, name)
+        ):
+            here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, self.weights))
+            if here != there:
+                of_it = f"'{name}' is {'missing' if there is None else there} there"
+                of_this = "missing" if here is None else here
+                algorithm = "the algorithm, " if here is None or there is None else ""
+                raise UserError(
+                    f"cannot start from {self.holder}: it is a policy of {self.config.algorithm} on {self.config.task} "
+                    f"with the network {self.config.network.name}, and {of_it} but {of_this} in this run; "
+                    f"choose {algorithm}the task settings and the network of that policy"
+                )
+        weights = self._repeated(seeds)
+        return InitialPolicy(source=self.source, sha256=digest(weights, {})), weights
 
+    def matches(self, config: RunConfig) -> bool:
+        """Return whether these are the weights that the run of a configuration started from."""
+        seeds = len(config.seeds)
+        if config.init_from is None or self._num_seeds not in (1, seeds):
+            return False
+        return digest(self._repeated(seeds), {}) == config.init_from.sha256
 
-def is_start_of(trained: TrainedPolicy, config: RunConfig) -> bool:
-    """Return whether a policy has the weights that the run of this configuration started from."""
-    seeds, others = len(config.seeds), len(trained.config.seeds)
-    if config.init_from is None or others not in (1, seeds):
-        return False
-    theirs = trained.policy.state_dict().items()
-    return digest({name: _for_seeds(tensor, seeds) for name, tensor in theirs}, {}) == config.init_from.sha256
+    @property
+    def _num_seeds(self) -> int:
+        return len(next(iter(self.weights.values())))
 
-
-def _for_seeds(tensor: Tensor, seeds: int) -> Tensor:
-    return tensor.cpu().expand(seeds, *tensor.shape[1:]).contiguous()
-
-
-def describe(source: str, tensors: Mapping[str, Tensor]) -> InitialPolicy:
-    """Return what the configuration of a run records of the policy that it starts from."""
-    return InitialPolicy(source=source, sha256=digest(tensors, {}))
+    def _repeated(self, seeds: int) -> dict[str, Tensor]:
+        return {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in self.weights.items()}
