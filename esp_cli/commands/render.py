@@ -104,12 +104,10 @@ def render(
         console.note(text)
     with _progress() as watch:
         drawing = draw(request, opened, [where.name for where in named], watch)
-    if drawing.note:
-        console.note(drawing.note)
-    if request.kind == PICTURE:
-        console.note(f"episode of {drawing.steps} steps -> {out}")
-    else:
-        console.note(f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)")
+    film = f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)"
+    picture = f"episode of {drawing.steps} steps -> {out}"
+    for text in filter(None, (drawing.note, picture if request.kind == PICTURE else film)):
+        console.note(text)
 
 
 @contextmanager

@@ -76,9 +76,7 @@ class Start:
                 "policy' writes it"
             )
         # names before shapes: those that differ are of another algorithm or network
-        for name in sorted(
-            own.keys() | self.weights.keys(), key=lambda name: (name in own and name in self.weights, name)
-        ):
+        for name in [*sorted(own.keys() ^ self.weights.keys()), *sorted(own.keys() & self.weights.keys())]:
             here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, self.weights))
             if here != there:
                 of_it = f"'{name}' is {'missing' if there is None else there} there"
