@@ -162,6 +162,11 @@ class Convolution(Learned):
     kind = "convolution"
 
     @property
+    def filters(self) -> Floats:
+        """The weight as [outputs, channels, k, k]."""
+        return self.weight.T.reshape(self.outputs, self.channels, self.side, self.side)
+
+    @property
     def places(self) -> tuple[int, int]:
         """Rows h and columns w of the output."""
         return (self.rows - self.side) // self.stride + 1, (self.columns - self.side) // self.stride + 1

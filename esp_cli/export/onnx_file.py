@@ -44,10 +44,8 @@ _LAYERS: dict[type[layers.Layer], str] = {
         y = Add(candidate, step)""",
     layers.Slice: "y = Slice(x, [{0.begin}], [{0.end}], [1])",
     layers.Convolution: """
-        columns = Transpose<perm = [1, 0]>(w0)
-        filters = Reshape(columns, [{0.outputs},{0.channels},{0.side},{0.side}])
         pictures = Reshape(x, [-1,{0.channels},{0.rows},{0.columns}])
-        filtered = Conv<strides = [{0.stride}, {0.stride}]>(pictures, filters, w1)
+        filtered = Conv<strides = [{0.stride}, {0.stride}]>(pictures, w0, w1)
         y = Reshape(filtered, [-1,{0.width}])""",
     layers.GlobalMaxPool: """
         channels = Reshape(x, [-1,{0.channels},{0.places}])
@@ -183,7 +181,8 @@ class _Graph:
         """Add what layer k makes of x, and return its name."""
         index = _compact(others_of(layer.team)) if isinstance(layer, layers.MessageAggregation) else ""
         text = _LAYERS[type(layer)].format(layer, function=layer.kind.capitalize(), index=index)
-        self.constants |= {f"w{i}_{k}": array for i, array in enumerate(layer.arrays)}
+        arrays = (layer.filters, layer.bias) if isinstance(layer, layers.Convolution) else layer.arrays
+        self.constants |= {f"w{i}_{k}": array for i, array in enumerate(arrays)}
         names = [name for line in text.splitlines() for name in line.partition(" = ")[0].strip().split(", ")]
         names += [f"w{i}" for i in range(len(layer.arrays))]
         renamed = {name: f"{name}_{k}" for name in names} | {"x": x}
