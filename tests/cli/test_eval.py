@@ -17,7 +17,7 @@ from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
 BESIDE = {"esp_version", "source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
-BESIDE |= {"over_episodes"}
+BESIDE |= {"over_episodes", "parameters", "flops_per_action"}
 
 
 def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, tmp_path: Path) -> None:
