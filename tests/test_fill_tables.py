@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.reporting.collect import collect
+from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.study_figures import series_of
 from esp_cli.studies.paper import reported
 from esp_cli.studies.study import StudyFolder
@@ -27,7 +27,7 @@ BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
 @pytest.fixture
 def page(tmp_path):
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
-    found = collect(write_study(tmp_path / "s", small_study(), ends)).results.document()
+    found = collect_study(write_study(tmp_path / "s", small_study(), ends)).results.document()
     (tmp_path / "measured").mkdir()
     (tmp_path / "measured" / "a.json").write_text(json.dumps(found))
     page = tmp_path / "page.md"
@@ -100,7 +100,10 @@ def test_a_table_of_final_returns_takes_those_of_drawn_actions(page):
 def longer(page, seeds=(0, 1), **change):
     """Write the results of a second study, of more steps and fewer seeds, beside those of the page."""
     study = small_study(steps=((None, 400),), seeds=seeds)
-    found = collect(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})).results.document() | change
+    found = (
+        collect_study(write_study(page.parent / "longer", study, {"MAPPO": [-110.0, -112.0]})).results.document()
+        | change
+    )
     (page.parent / "measured" / "b.json").write_text(json.dumps(found))
     page.write_text("<!-- results: measured/a.json measured/b.json returns -->\n<!-- end of results -->\n")
 
@@ -139,7 +142,7 @@ def test_a_page_that_is_none_is_told_in_one_sentence(tmp_path):
 @pytest.mark.parametrize("fewer", ["MAPPO", "MAPPO-ESP"])
 def test_one_seed_proves_nothing_on_either_side(tmp_path: Path, fewer: str):
     ends = {"MAPPO": [-119.5, -119.5, -119.5], "MAPPO-ESP": [-119.0, -118.0, -119.0]}
-    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
     plain, esp = results.cells
     assert side(results, esp, plain) == "ahead"
     cut = {cell.variant: cell for cell in results.cells}
@@ -173,7 +176,7 @@ def test_a_method_behind_the_plain_learner_fails(tmp_path: Path):
         mean += 30 if wind == 0 and cell.variant == "relaxed weights" else 0
         ends = [mean + x for x in NOISE]
         write_run(worse, cell, [ends, ends, ends], ends)
-    found = {verdict.method: verdict for verdict in verdicts(collect(worse).results)}
+    found = {verdict.method: verdict for verdict in verdicts(collect_study(worse).results)}
     assert found["compass"].largest is False
     assert found["relaxed weights"].unbroken is True, "ahead of ESP is not behind it"
     assert found["measured weights"] == Verdict("measured weights", True, True, False)
@@ -211,7 +214,7 @@ def test_a_page_has_one_column_for_each_method_and_marks_the_best(material):
 
 def test_who_leads_early_is_told_by_the_early_returns(tmp_path: Path):
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-110.0, -120.0, -130.0]}
-    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
     cells = {cell.variant: cell.model_copy(update={"early": (-180.0, -190.0, -170.0)}) for cell in results.cells}
     assert leaders(results, cells, early=True) == {"MAPPO", "MAPPO-ESP"}
     assert leaders(results, cells, early=False) == {"MAPPO-ESP"}
@@ -228,15 +231,15 @@ def test_equal_runs_are_level_and_one_seed_says_nothing(material):
 
 def test_without_runs_nothing_is_said_and_other_studies_have_no_such_table(tmp_path: Path):
     empty = StudyFolder.create(tmp_path / "empty", study())
-    assert {(v.unbroken, v.largest, v.between) for v in verdicts(collect(empty).results)} == {(None, None, None)}
+    assert {(v.unbroken, v.largest, v.between) for v in verdicts(collect_study(empty).results)} == {(None, None, None)}
     other = write_study(tmp_path / "other", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
-    results = collect(other).results
+    results = collect_study(other).results
     assert methods_table(results).rows == verdicts_table(results).rows == ()
 
 
 def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(tmp_path):
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
-    results = collect(write_study(tmp_path / "s", small_study(), ends)).results
+    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
     first, second = results.cells
     begun = second.model_copy(update={"status": "not run", "returns": {}, "step": 0})
     early = results.model_copy(update={"cells": (first, begun)})
@@ -250,7 +253,7 @@ def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(tmp_path)
 def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
     study = small_study(steps=((None, 500_000),))
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
-    whole = paper_table(collect(write_study(tmp_path / "s", study, ends)).results)
+    whole = paper_table(collect_study(write_study(tmp_path / "s", study, ends)).results)
     assert len(whole.rows) == 12
     assert whole.headings[2:] == ("MADDPG>", "MADDPG-ESP>", "QMIX>", "QMIX-ESP>", "MAPPO>", "MAPPO-ESP>")
     place = next(k for k, row in enumerate(whole.rows) if row[0] == "navigation, 500k")

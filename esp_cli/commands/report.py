@@ -43,14 +43,10 @@ OutOption = Annotated[
     Path | None,
     typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
 ]
+_FILE = {"metavar": "FILE", "callback": not_over_a_run}
 ResultsOption = Annotated[
     Path | None,
-    typer.Option(
-        "--results",
-        help="Also write every seed's numbers and the configurations as JSON.",
-        metavar="FILE",
-        callback=not_over_a_run,
-    ),
+    typer.Option("--results", help="Also write every seed's numbers and the configurations as JSON.", **_FILE),
 ]
 AtOption = Annotated[
     list[str] | None,
@@ -71,13 +67,7 @@ LimitsOption = Annotated[
     typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
 ]
 CsvOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--csv",
-        help="Write every logged number of every seed as a table.",
-        metavar="FILE",
-        callback=not_over_a_run,
-    ),
+    Path | None, typer.Option("--csv", help="Write every logged number of every seed as a table.", **_FILE)
 ]
 PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")]
 
@@ -100,13 +90,16 @@ def report(
     json: JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
-    from esp_cli.reporting.collect import collect
+    from esp_cli.reporting.collect import collect_study
     from esp_cli.studies.study import StudyFolder
 
     register_named(task, algo, network)
     limits, lines = threshold or [], _references(reference or [])
     check_finite("--threshold", *limits)
-    _check_limits(y_limits)
+    check_finite("--y-limits", *(y_limits or ()))
+    if y_limits is not None and y_limits[0] >= y_limits[1]:
+        low, high = y_limits
+        raise UserError(f"--y-limits {low:g} {high:g} is empty; write the lowest return before the highest")
     _refuse_tuning(runs[0])
     if StudyFolder.is_one(Path(runs[0])):
         if len(runs) > 1 or at or reference or plot or y_limits:
@@ -114,9 +107,12 @@ def report(
                 "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
             )
         out = out or Path(runs[0]) / "report"
-        material = collect(StudyFolder.open(Path(runs[0])), mode, limits)
+        material = collect_study(StudyFolder.open(Path(runs[0])), mode, limits)
     else:
-        _refuse_idle(films and out is None, plot is None and bool(reference or y_limits))
+        if films and out is None:
+            raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
+        if plot is None and (reference or y_limits):
+            raise UserError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
         material = _side_by_side(runs, at or [], limits, mode, out)
 
     def show() -> None:
@@ -145,17 +141,17 @@ def _side_by_side(
     runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: Mode | None, out: Path | None
 ) -> Material:
     """Read runs that are given by hand, each as PATH or LABEL=PATH."""
-    from esp_cli.reporting.collect import put_together
+    from esp_cli.reporting.collect import collect_runs
     from esp_cli.reporting.curves import read_curve
 
-    steps, found = [parse_count(text) for text in at], []
+    steps, curves = [parse_count(text) for text in at], []
     for text in runs:
         label, path = _labelled(text)
-        found.append(read_curve(path, label, mode or "greedy"))
-    first, *others = (curve.config for curve in found)
+        curves.append(read_curve(path, label, mode or "greedy"))
+    first, *others = (curve.config for curve in curves)
     words = ["esp", "report", *runs, *first.own_words(*others), *(word for text in at for word in ("--at", text))]
     words += [*threshold_words(thresholds), *(["--mode", mode] if mode else []), *(["--out", str(out)] if out else [])]
-    return put_together(found, shlex.join(words), mode or "greedy", steps, thresholds)
+    return collect_runs(curves, shlex.join(words), mode or "greedy", steps, thresholds)
 
 
 def _refuse_tuning(path: str) -> None:
@@ -166,25 +162,6 @@ def _refuse_tuning(path: str) -> None:
     if TUNING_FORMAT.is_one(Path(path) / TUNING):
         fresh = shlex.quote(str(Path(path) / FRESH))
         raise UserError(f"{path} is a tuning with a report of its own; report its study by: esp report {fresh}")
-
-
-def _refuse_idle(films: bool, of_the_picture: bool) -> None:
-    """Refuse options of what is not written.
-
-    Raises:
-        UserError: films without a page, or lines and limits without a picture.
-    """
-    if films:
-        raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
-    if of_the_picture:
-        raise UserError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
-
-
-def _check_limits(limits: tuple[float, float] | None) -> None:
-    """Refuse limits of the picture that leave nothing to see."""
-    check_finite("--y-limits", *(limits or ()))
-    if limits is not None and limits[0] >= limits[1]:
-        raise UserError(f"--y-limits {limits[0]:g} {limits[1]:g} is empty; write the lowest return before the highest")
 
 
 def threshold_words(thresholds: Sequence[float]) -> list[str]:

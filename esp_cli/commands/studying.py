@@ -184,9 +184,9 @@ def follow(scheduler: Scheduler, title: str, requests: Sequence[int]) -> tuple[b
 def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
     """Print the table of a study and say what to do next."""
     from esp_cli.commands.report import print_tables, threshold_words
-    from esp_cli.reporting.collect import collect
+    from esp_cli.reporting.collect import collect_study
 
-    results = collect(folder, mode, thresholds).results
+    results = collect_study(folder, mode, thresholds).results
     console.result(json, results.document(statistics=True), lambda: print_tables(results))
     first, *others = (cell.config for cell in folder.study.cells)
     words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]

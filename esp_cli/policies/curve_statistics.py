@@ -17,19 +17,21 @@ _RESAMPLES = 2_000
 
 
 @dataclass(frozen=True)
-class StepsToThreshold:
-    """Env steps per seed at which a threshold is reached first.
+class Passing:
+    """Env steps per seed at which a learning curve first is at or above a threshold.
 
     Attributes:
+        threshold: e.g. a return.
         of_mean: by the mean over seeds, or None where it never is.
         per_seed: by each seed, likewise.
     """
 
+    threshold: float
     of_mean: int | None
     per_seed: tuple[int | None, ...]
 
 
-def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> StepsToThreshold:
+def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> Passing:
     """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
 
     A value that is not finite, as of a seed that was stopped, reaches nothing.
@@ -49,7 +51,7 @@ def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) ->
         return int(at[np.argmax(reached)]) if reached.any() else None
 
     per_seed = tuple(first(curve >= threshold) for curve in curves.T)
-    return StepsToThreshold(first(curves.mean(axis=1) >= threshold), per_seed)
+    return Passing(threshold, first(curves.mean(axis=1) >= threshold), per_seed)
 
 
 def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None]:
@@ -59,7 +61,7 @@ def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None
     to the ninth and holds the median with 97.9 %, at least 95 % being asked for. Fewer than six seeds have none.
 
     Args:
-        per_seed: as in `StepsToThreshold`, at least one.
+        per_seed: as in `Passing`, at least one.
     """
     ordered = sorted(np.inf if steps is None else float(steps) for steps in per_seed)
     rank = int(scipy.stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from esp_cli.policies.curve_statistics import area_under_curve, steps_to_thresho
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.statistics import summarise
 from esp_cli.reporting.curves import RunCurve, curve_of
-from esp_cli.reporting.results import CellResult, Passing, Results
+from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import returns_of, summarised
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
@@ -64,7 +64,7 @@ class RunState:
     at: int | None = None
 
 
-def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[float] = ()) -> Material:
+def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[float] = ()) -> Material:
     """Read the results of a study, finished or not.
 
     Args:
@@ -84,7 +84,7 @@ def collect(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[
     return Material(study, _results(study, states, mode, thresholds or kind.thresholds), curves, runs)
 
 
-def put_together(
+def collect_runs(
     curves: Sequence[RunCurve], command: str, mode: Mode, at: Sequence[int] = (), thresholds: Sequence[float] = ()
 ) -> Material:
     """Return runs of one task as a study whose panels are the steps at which they are compared.
@@ -145,7 +145,7 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> RunState:
     rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
     if folder.is_trained(cell) and (final := read_evaluation(run)) is not None:
         wanted = len(cell.config.seeds)
-        if any(len(found.per_seed) != wanted for found in (final.greedy, final.stochastic)):
+        if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
     try:
         curve = curve_of(rows, mode, run, cell.variant, cell.config)
@@ -181,30 +181,30 @@ def _results(study: Study, states: Mapping[str, RunState], mode: Mode, threshold
 def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonValue], mode: Mode) -> CellResult:
     curve, number, kind = state.curve, reported(cell.paper), kind_of(study.kind)
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
-    found = _returns(study, cell, state, compared, mode)
+    fields = _returns(study, cell, state, compared, mode)
     if curve is not None:
-        found["seconds"] = round(curve.seconds, 1)
+        fields["seconds"] = round(curve.seconds, 1)
         if kind.breakings and (early := curve.until(cell.config.steps // 5)):
-            found["early"] = _rounded(early.values[-1])
-    if "returns" in found and compared is not None:
-        found["evaluations"] = len(compared.steps)
+            fields["early"] = _rounded(early.values[-1])
+    if "returns" in fields and compared is not None:
+        fields["evaluations"] = len(compared.steps)
         if len(compared.steps) > 1:
-            found["area_under_curve"] = _rounded(area_under_curve(compared.steps, compared.values))
+            fields["area_under_curve"] = _rounded(area_under_curve(compared.steps, compared.values))
     if kind.network_cost and state.final is not None:
-        found |= {"parameters": state.final.parameters, "flops_per_action": state.final.flops_per_action}
+        fields |= {"parameters": state.final.parameters, "flops_per_action": state.final.flops_per_action}
     return CellResult(
         name=cell.name,
         panel=cell.panel,
         variant=cell.variant,
         reference=cell.reference,
         paper=None if number is None else (number.mean, number.sem),
-        status="finished" if "returns" in found else "unfinished" if curve is not None else "not run",
+        status="finished" if "returns" in fields else "unfinished" if curve is not None else "not run",
         step=state.step,
         at=state.at,
         steps=cell.config.steps,
         seeds=cell.config.seeds,
         config=dict(config),
-        **found,
+        **fields,
     )
 
 
@@ -240,11 +240,9 @@ def _timed(results: Results, cell: CellResult, curve: RunCurve | None, threshold
         mean = None if values is None else summarise(values).mean
         thresholds = [] if mean is None else [mean]
     rounded = np.round(curve.values, _DIGITS)  # as the returns are, from which thresholds are taken
-    passed = [(limit, steps_to_threshold(curve.steps, rounded, limit)) for limit in thresholds]
-    found = tuple(
-        Passing(threshold=round(limit, _DIGITS), of_mean=p.of_mean, per_seed=p.per_seed) for limit, p in passed
-    )
-    return cell.model_copy(update={"steps_to": found})
+    passings = [steps_to_threshold(curve.steps, rounded, limit) for limit in thresholds]
+    stated = tuple(replace(passing, threshold=round(passing.threshold, _DIGITS)) for passing in passings)
+    return cell.model_copy(update={"steps_to": stated})
 
 
 def _rounded(values: Iterable[float | None]) -> tuple[float | None, ...]:

@@ -125,10 +125,9 @@ def _refuse_foreign(out: Path) -> None:
 
 def _films(material: Material) -> list[tuple[str, str]]:
     """Return the films that are drawn: what they show, and the film for a page."""
-    found = {cell.name: _film(material.runs[cell.name] / FILM) for cell in material.study.cells}
-    titles = {cell.name: f"{cell.panel}: {cell.variant}" for cell in material.study.cells}
-    films = {film: titles[name] for name, film in found.items() if film}
-    return [(title, _data_uri(film, "image/gif")) for film, title in films.items()]
+    titles = {material.runs[cell.name]: f"{cell.panel}: {cell.variant}" for cell in material.study.cells}
+    films = [(title, _film(run / FILM)) for run, title in titles.items()]
+    return [(title, _data_uri(film, "image/gif")) for title, film in films if film]
 
 
 def _film(path: Path) -> bytes:

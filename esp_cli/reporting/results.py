@@ -14,22 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
+from esp_cli.policies.curve_statistics import Passing
 from esp_cli.policies.statistics import Estimate, SeedSummary
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
 Numbers = tuple[float | None, ...]
 """One number per seed; None where the seed stopped."""
 Side = Literal["ahead", "behind", "level"]
-
-
-class Passing(BaseModel):
-    """When a curve is first at or above a threshold: environment steps per seed, None for never."""
-
-    model_config = ConfigDict(frozen=True)
-
-    threshold: float
-    of_mean: int | None
-    per_seed: tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -53,7 +44,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class CellSummary:
-    """Everything that tables say about one cell; what cannot be said is None.
+    """Statistics of one cell; None where its seeds do not allow one.
 
     Attributes:
         returns: over seeds.

@@ -31,7 +31,7 @@ class Series:
 
 def series_of(results: Results) -> list[Series]:
     """Return the series of a study of broken symmetry; none of other studies."""
-    found: dict[tuple[str, str], dict[float, dict[str, CellResult]]] = {}
+    series: dict[tuple[str, str], dict[float, dict[str, CellResult]]] = {}
     heads = [
         (task, setting, strength, f"{task}, {setting} {strength:g}, " if strength else f"{task}, {UNBROKEN}, ")
         for task, settings in kind_of(results.kind).breakings.items()
@@ -42,8 +42,8 @@ def series_of(results: Results) -> list[Series]:
         for task, setting, strength, head in heads:
             if cell.panel.startswith(head):
                 name = f"{task}, {cell.panel.removeprefix(head)}"
-                found.setdefault((name, setting), {}).setdefault(strength, {})[cell.variant] = cell
-    whole = {key: dict(sorted(cells.items())) for key, cells in found.items() if set(cells) != {0.0}}
+                series.setdefault((name, setting), {}).setdefault(strength, {})[cell.variant] = cell
+    whole = {key: dict(sorted(cells.items())) for key, cells in series.items() if set(cells) != {0.0}}
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
@@ -67,16 +67,16 @@ def draw_curves(
     panels: dict[tuple[int, ...], Panel] = {}
     for name in material.study.panels:
         cells = [cell for cell in material.study.cells if cell.panel == name and cell.name in material.curves]
-        found = [material.curves[cell.name] for cell in cells]
+        drawn = [material.curves[cell.name] for cell in cells]
         anchors: dict[str, float] = next((dict(a) for cell in cells if (a := entries[cell.name].anchors)), {})
         if kind_of(material.study.kind).network_cost:
             own = (entries[cell.name] for cell in cells)
             anchors |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
-        if found:
+        if drawn:
             title = cells[0].config.task if entries[cells[0].name].at is not None else name
             title = title.rpartition(":")[2]  # of a task of the caller, the class
-            curves = [Curve(cell.variant, c.steps, c.values) for cell, c in zip(cells, found, strict=True)]
-            panels.setdefault(tuple(map(id, found)), Panel(title, curves, anchors, references or {}))
+            curves = [Curve(cell.variant, c.steps, c.values) for cell, c in zip(cells, drawn, strict=True)]
+            panels.setdefault(tuple(map(id, drawn)), Panel(title, curves, anchors, references or {}))
     conventions = {entry.convention for entry in entries.values() if entry.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
     return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", view)

@@ -27,13 +27,13 @@ MIN_SEEDS_TO_RANK = 3
 
 
 def summarised(results: Results) -> Results:
-    """Return results with everything that tables say about each cell and over all panels, computed from its numbers."""
+    """Return results with the statistics of each cell and over all panels, computed from its numbers."""
     cells = tuple(cell.model_copy(update={"summary": summarise_cell(results, cell)}) for cell in results.cells)
     return results.model_copy(update={"cells": cells, "aggregates": aggregates(results)})
 
 
 def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
-    """Return everything that tables say about one cell; None where it has no returns yet."""
+    """Return the statistics of one cell; None where it has no returns yet."""
     values = returns_of(cell, results.mode)
     if values is None:
         return None
@@ -97,11 +97,11 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
     if other is None or others is None or not (np.isfinite(values).all() and np.isfinite(others).all()):
         return None
     paired = cell.seeds == other.seeds
-    found, chance, of_all = difference(values, others, paired), None, None
+    gained, chance, of_all = difference(values, others, paired), None, None
     if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
         of_all = probability_of_improvement(values, others)
         chance = probability_of_improvement(values, others, paired=True) if paired else of_all
-    return Gap(found, paired, chance, of_all, None if of_all is None else side_of(found.ci95))
+    return Gap(gained, paired, chance, of_all, None if of_all is None else side_of(gained.ci95))
 
 
 def side_of(interval: tuple[float, float] | None) -> Side | None:

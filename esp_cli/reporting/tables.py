@@ -100,7 +100,7 @@ def comparison_table(results: Results) -> Table:
         columns["trained to>"] = lambda cell: format_count(cell.step)
     columns |= {
         "return>": return_text,
-        "95 % interval>": _known(lambda found: format_interval(found.returns.ci95)),
+        "95 % interval>": _known(lambda summary: format_interval(summary.returns.ci95)),
         "minus reference>": _beside(lambda gap: f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)}"),
         "P(improvement)>": _beside(lambda gap: _estimate(gap.probability)),
         "over all pairs>": _beside(lambda gap: _estimate(gap.over_all_pairs)),
@@ -109,9 +109,9 @@ def comparison_table(results: Results) -> Table:
     if has_paper:
         columns |= {
             "paper>": lambda cell: format_mean(*cell.paper) if cell.paper and _summary(cell) else NOTHING,
-            "ours or paper ahead": _known(lambda found: _LEADER[found.leader]),
+            "ours or paper ahead": _known(lambda summary: _LEADER[summary.leader]),
         }
-    by_seed = all(found.gap is None or found.gap.paired for cell in results.cells if (found := _summary(cell)))
+    by_seed = all(summary.gap is None or summary.gap.paired for cell in results.cells if (summary := _summary(cell)))
     welch = "Ours and the paper's means are compared by Welch's test at 5 %. " if has_paper else ""
     drawn = "Returns are those of drawn actions. " if results.mode == "stochastic" else ""
     caption = (
@@ -124,13 +124,13 @@ def comparison_table(results: Results) -> Table:
 
 
 def statistics_table(results: Results) -> Table:
-    """Return what else can be said of each cell: robust mean, scale, and how fast it learned."""
+    """Return further statistics of each cell: robust mean, scale, and how fast it learned."""
     columns: Columns[CellResult] = {
         **_NAMES,
-        "seeds>": _known(lambda found: str(sum(value is not None for value in found.returns.per_seed))),
-        "IQM>": _known(lambda found: _estimate(found.iqm)),
-        "normalised>": _known(lambda found: mean_text(found.normalised)),
-        "mean over the run>": _known(lambda found: mean_text(found.area)),
+        "seeds>": _known(lambda summary: str(sum(value is not None for value in summary.returns.per_seed))),
+        "IQM>": _known(lambda summary: _estimate(summary.iqm)),
+        "normalised>": _known(lambda summary: mean_text(summary.normalised)),
+        "mean over the run>": _known(lambda summary: mean_text(summary.area)),
         "training>": lambda cell: NOTHING if cell.seconds is None else format_duration(cell.seconds),
     }
     caption = (
@@ -176,15 +176,15 @@ def steps_table(results: Results) -> Table:
 
 def aggregates_table(results: Results) -> Table:
     """Return the numbers over all panels; no rows where no variant is finished in two."""
-    found = results.aggregates
+    numbers = results.aggregates
     columns: Columns[str] = {
         "run": str,
-        "IQM>": lambda variant: _estimate(found[variant].iqm),
-        "mean>": lambda variant: _estimate(found[variant].mean),
-        "P(improvement over the reference)>": lambda variant: _estimate(found[variant].improvement),
+        "IQM>": lambda variant: _estimate(numbers[variant].iqm),
+        "mean>": lambda variant: _estimate(numbers[variant].mean),
+        "P(improvement over the reference)>": lambda variant: _estimate(numbers[variant].improvement),
     }
     caption = "Of normalised returns over all panels; 95 % intervals by a bootstrap that is stratified by panel."
-    return _table("Over all panels", columns, found, caption)
+    return _table("Over all panels", columns, numbers, caption)
 
 
 def provenance_table(results: Results) -> Table:
@@ -248,17 +248,17 @@ def _summary(cell: CellResult) -> CellSummary | None:
 
 def _known(text: Callable[[CellSummary], str]) -> Callable[[CellResult], str]:
     """Return a column of the statistics of a cell, with a dash where it has none."""
-    return lambda cell: NOTHING if (found := _summary(cell)) is None else text(found)
+    return lambda cell: NOTHING if (summary := _summary(cell)) is None else text(summary)
 
 
 def _beside(text: Callable[[Gap], str]) -> Callable[[CellResult], str]:
     """Return a column of a cell beside its reference, empty for a reference itself."""
 
     def column(cell: CellResult) -> str:
-        found = _summary(cell)
-        if found is not None and cell.reference is None:
+        summary = _summary(cell)
+        if summary is not None and cell.reference is None:
             return ""
-        return NOTHING if found is None or found.gap is None else text(found.gap)
+        return NOTHING if summary is None or summary.gap is None else text(summary.gap)
 
     return column
 
@@ -292,7 +292,7 @@ def _within(steps: float, run: int) -> str:
     return format_count(steps) if math.isfinite(steps) else f"> {format_count(run)}"
 
 
-def _estimate(found: Estimate | None) -> str:
-    if found is None:
+def _estimate(estimate: Estimate | None) -> str:
+    if estimate is None:
         return NOTHING
-    return f"{found.value:.2f}" + (f" {format_interval(found.ci95)}" if found.ci95 else "")
+    return f"{estimate.value:.2f}" + (f" {format_interval(estimate.ci95)}" if estimate.ci95 else "")

@@ -33,26 +33,26 @@ def budget_table(tuning: Tuning, outcomes: Sequence[Outcome], title: str = "Budg
     headings = ("prior", "trials>", "complete>", "pruned>", "steps>", "time>", "default>", "best>", "trial>")
     rows = [
         (
-            NAMES[found.prior],
-            str(found.trials),
-            str(found.completed),
-            str(found.pruned),
-            format_count(found.env_steps),
-            format_duration(found.seconds),
-            _number(found.default_score),
-            _number(found.best_score),
-            "-" if found.best is None else str(found.best),
+            NAMES[outcome.prior],
+            str(outcome.trials),
+            str(outcome.completed),
+            str(outcome.pruned),
+            format_count(outcome.env_steps),
+            format_duration(outcome.seconds),
+            _number(outcome.default_score),
+            _number(outcome.best_score),
+            "-" if outcome.best is None else str(outcome.best),
         )
-        for found in outcomes
+        for outcome in outcomes
     ]
     return Table(title, headings, tuple(rows), budget_sentence(tuning))
 
 
 def settings_table(outcomes: Sequence[Outcome]) -> Table:
     """Return the best settings of each prior; no rows where no trial has a score."""
-    names = list(dict.fromkeys(name for found in outcomes for name in found.settings))
-    headings = ("setting", *(f"{NAMES[found.prior]}>" for found in outcomes))
-    rows = tuple((name, *(_setting(found.settings.get(name)) for found in outcomes)) for name in names)
+    names = list(dict.fromkeys(name for outcome in outcomes for name in outcome.settings))
+    headings = ("setting", *(f"{NAMES[outcome.prior]}>" for outcome in outcomes))
+    rows = tuple((name, *(_setting(outcome.settings.get(name)) for outcome in outcomes)) for name in names)
     return Table("Best settings", headings, rows)
 
 
@@ -84,7 +84,7 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
     """
     tuning = trials.tuning
     out.mkdir(parents=True, exist_ok=True)
-    document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(found) for found in outcomes]}
+    document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(outcome) for outcome in outcomes]}
     replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
     lines = [f"# {trials.folder.study.title}", "", f"`{tuning.command}`", ""]
     for table in (budget_table(tuning, outcomes), settings_table(outcomes)):
@@ -101,12 +101,12 @@ def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
 
 def _refused_lines(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield how many of the pruned trials were refused, and why, the most frequent reason first."""
-    for found in outcomes:
-        if found.refused:
-            count = len(found.refused)
+    for outcome in outcomes:
+        if outcome.refused:
+            count = len(outcome.refused)
             trials = "1 of the pruned trials was" if count == 1 else f"{count} of the pruned trials were"
-            yield from ("", f"{NAMES[found.prior]}: {trials} refused, as the settings do not go together:", "")
-            yield from (f"- {times} x {reason}" for reason, times in Counter(found.refused).most_common())
+            yield from ("", f"{NAMES[outcome.prior]}: {trials} refused, as the settings do not go together:", "")
+            yield from (f"- {times} x {reason}" for reason, times in Counter(outcome.refused).most_common())
 
 
 def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
@@ -133,9 +133,9 @@ def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
 
 
 def _importances(study: Any) -> None:
-    found = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+    importances = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
     _, axes = plt.subplots()
-    axes.barh(list(found), list(found.values()))
+    axes.barh(list(importances), list(importances.values()))
     axes.invert_yaxis()
     axes.set_xlabel("importance (PED-ANOVA)")
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from esp_cli.policies.curve_statistics import (
-    StepsToThreshold,
+    Passing,
     area_under_curve,
     curve_band,
     median_steps,
@@ -182,9 +182,9 @@ def test_steps_to_threshold_by_hand():
     steps = [0, 100, 200, 300]
     values = np.array([[-200.0, -200.0], [-110.0, -160.0], [-120.0, -130.0], [-110.0, -118.0]])
     # means -200 -135 -125 -114
-    assert steps_to_threshold(steps, values, -125) == StepsToThreshold(200, (100, 300))
-    assert steps_to_threshold(steps, values, -115) == StepsToThreshold(300, (100, None))
-    assert steps_to_threshold(steps, values, -100) == StepsToThreshold(None, (None, None))
+    assert steps_to_threshold(steps, values, -125) == Passing(-125, 200, (100, 300))
+    assert steps_to_threshold(steps, values, -115) == Passing(-115, 300, (100, None))
+    assert steps_to_threshold(steps, values, -100) == Passing(-100, None, (None, None))
 
 
 def test_median_steps_by_hand():
@@ -207,7 +207,7 @@ def test_the_interval_of_the_median_holds_it_as_often_as_it_says():
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_what_is_not_finite_reaches_nothing(bad):
     values = np.array([[0.0, 0.0], [2.0, bad], [2.0, bad]])
-    assert steps_to_threshold([1, 2, 3], values, 1.0) == StepsToThreshold(None, (2, None))
+    assert steps_to_threshold([1, 2, 3], values, 1.0) == Passing(1.0, None, (2, None))
 
 
 def test_area_under_curve_by_hand():

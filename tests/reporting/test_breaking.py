@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli.checking import measured
-from esp_cli.reporting.collect import Material, collect
+from esp_cli.reporting.collect import Material, collect_study
 from esp_cli.reporting.page import write_report
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.study_figures import series_of
@@ -131,7 +131,7 @@ def material(tmp_path_factory: pytest.TempPathFactory) -> Material:
         ends = [mean + x for x in NOISE]
         rows = [[x - 10.0 * (2 - k) for x in ends] for k in range(3)]
         write_run(made, cell, rows, ends)
-    return collect(made)
+    return collect_study(made)
 
 
 def test_the_report_has_returns_at_a_fifth_and_draws_them_over_the_strength(material: Material, tmp_path: Path):
@@ -143,11 +143,11 @@ def test_the_report_has_returns_at_a_fifth_and_draws_them_over_the_strength(mate
     again = read_results(tmp_path / "report" / "results.json")
     assert summarised(again) == material.results, "the file alone gives the tables again"
     other = write_study(tmp_path / "other", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
-    assert "return at 20 %>" not in statistics_table(collect(other).results).headings
+    assert "return at 20 %>" not in statistics_table(collect_study(other).results).headings
 
 
 def test_all_settings_of_a_task_share_its_unbroken_runs(tmp_path: Path):
     empty = StudyFolder.create(tmp_path / "empty", study(breakings=("wind", "mud"), variants=("plain", "ESP")))
-    mud, wind = sorted(series_of(collect(empty).results), key=lambda one: one.setting)
+    mud, wind = sorted(series_of(collect_study(empty).results), key=lambda one: one.setting)
     assert (list(wind.cells), list(mud.cells)) == ([0.0, 0.3, 0.6], [0.0, 0.5, 0.9])
     assert wind.cells[0.0] == mud.cells[0.0]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from esp_cli.reporting.collect import put_together
+from esp_cli.reporting.collect import collect_runs
 from esp_cli.reporting.curves import RunCurve, read_curve
 from esp_cli.reporting.study_figures import draw_curves
 from esp_cli.reporting.tables import TABLES
@@ -32,7 +32,7 @@ def curve(values, label="run", steps=STEPS, seeds=SEEDS, **choice) -> RunCurve:
 
 def gathered(curves, at=(), thresholds=()):
     """What a report of these runs is made from."""
-    return put_together(curves, "esp report", "greedy", at, thresholds)
+    return collect_runs(curves, "esp report", "greedy", at, thresholds)
 
 
 def compare(curves, at, thresholds) -> dict[str, dict[int, dict]]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 
-from esp_cli.reporting.collect import collect
+from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.exports import marl_eval
 from tests.studies.small_studies import small_study, write_study
 
 
 def written(path, study, ends):
-    return marl_eval(collect(write_study(path, study, ends)))
+    return marl_eval(collect_study(write_study(path, study, ends)))
 
 
 def test_environment_task_algorithm_run_step_and_metric(tmp_path):

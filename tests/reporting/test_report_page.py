@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from esp_cli.drawing.films import write_gif
-from esp_cli.reporting.collect import Material, collect
+from esp_cli.reporting.collect import Material, collect_study
 from esp_cli.reporting.page import write_report
 from esp_cli.reporting.tables import Table, markdown_text
 from tests.studies.small_studies import small_study, write_study
@@ -50,7 +50,7 @@ document.body.dataset.hints = hints.join();
 def material(path: Path, command: str = "esp reproduce table1") -> Material:
     study = small_study(command=command)
     folder = write_study(path / "s", study, {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]})
-    return collect(folder)
+    return collect_study(folder)
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 
+from esp_cli.policies.curve_statistics import Passing
 from esp_cli.policies.statistics import average_improvement, leader
-from esp_cli.reporting.collect import collect
-from esp_cli.reporting.results import Passing, read_results
+from esp_cli.reporting.collect import collect_study
+from esp_cli.reporting.results import read_results
 from esp_cli.reporting.summary import aggregates, summarise_cell, summarised
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.study import StudyFolder
@@ -30,7 +32,7 @@ def column(results, name, heading):
 
 @pytest.fixture
 def results(tmp_path):
-    return collect(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
+    return collect_study(write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
 
 
 def test_a_cell_by_hand(results):
@@ -90,7 +92,7 @@ def test_two_seeds_give_no_verdict(tmp_path):
     for count, verdict in ((2, "-"), (3, "yes")):
         ends = {"MAPPO": PLAIN[:count], "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN[:count])]}
         folder = write_study(tmp_path / str(count), small_study(seeds=tuple(range(count))), ends)
-        assert column(collect(folder).results, "comparison", "ahead of reference") == ["", verdict]
+        assert column(collect_study(folder).results, "comparison", "ahead of reference") == ["", verdict]
 
 
 def test_seeds_that_never_get_there_count_as_infinitely_late(results):
@@ -100,7 +102,7 @@ def test_seeds_that_never_get_there_count_as_infinitely_late(results):
     assert column(found, "steps", "mean>")[1] == "> 200"
     assert column(found, "steps", "median seed>")[1] == "200"
     assert column(found, "steps", "95 % interval>") == ["-", "[100, > 200]"]
-    slower = slow.model_copy(update={"per_seed": (100, None, None)})
+    slower = replace(slow, per_seed=(100, None, None))
     never = results.model_copy(update={"cells": (plain, esp.model_copy(update={"steps_to": (slower,), "step": 200}))})
     assert column(never, "steps", "median seed>")[1] == "> 200"
     assert column(never, "steps", "ratio of median steps>")[1] == "-"
@@ -109,14 +111,14 @@ def test_seeds_that_never_get_there_count_as_infinitely_late(results):
 @pytest.mark.parametrize(("seeds", "shown"), [((0, 1), "-"), ((0, 1, 2), "1.00")])
 def test_a_probability_of_improvement_needs_three_shared_seeds(tmp_path, seeds, shown):
     ends = {"MAPPO": PLAIN[: len(seeds)], "MAPPO-ESP": [x + 1.0 for x in PLAIN[: len(seeds)]]}
-    found = collect(write_study(tmp_path / "s", small_study(seeds=seeds), ends)).results
+    found = collect_study(write_study(tmp_path / "s", small_study(seeds=seeds), ends)).results
     assert column(found, "comparison", "P(improvement)>") == ["", shown]
     assert column(found, "comparison", "minus reference>")[1].startswith("+1.00")
 
 
 def test_other_thresholds_can_be_asked_for(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
-    plain = collect(folder, thresholds=[-180.0, 0.0]).results.cells[0]
+    plain = collect_study(folder, thresholds=[-180.0, 0.0]).results.cells[0]
     assert [(passed.threshold, passed.of_mean) for passed in plain.steps_to] == [(-180.0, 100), (0.0, None)]
 
 
@@ -124,14 +126,14 @@ def test_ahead_and_behind_are_on_either_side_of_0(tmp_path):
     better = {"MAPPO": PLAIN, "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN)]}
     worse = {"MAPPO": PLAIN, "MAPPO-ESP": [x - 5 - k for k, x in enumerate(PLAIN)]}
     for name, ends, side, word in (("b", better, "ahead", "yes"), ("w", worse, "behind", "no")):
-        found = collect(write_study(tmp_path / name, small_study(), ends)).results
+        found = collect_study(write_study(tmp_path / name, small_study(), ends)).results
         assert summarise_cell(found, found.cells[1]).gap.ahead == side
         assert column(found, "comparison", "ahead of reference") == ["", word]
 
 
 def test_the_paper_stands_beside_a_cell_and_is_compared_by_the_errors_of_both(tmp_path):
     ends = {"MAPPO": [-133.0, -132.0, -131.0], "MAPPO-ESP": [-100.0, -101.0, -102.0]}
-    found = collect(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends)).results
+    found = collect_study(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends)).results
     assert column(found, "comparison", "paper>") == ["-132.65 ± 2.89", "-122.25 ± 1.62"]
     assert column(found, "comparison", "ours or paper ahead") == ["not told apart", "ours"]
     assert found.cells[0].paper == (-132.65, 2.89)
@@ -156,7 +158,7 @@ def test_who_leads_with_few_seeds_beside_many():
 
 def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     study = small_study(tasks=("navigation", "predator-prey"))
-    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
+    found = collect_study(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     over = aggregates(found)
     assert list(over) == ["MAPPO", "MAPPO-ESP"]
     assert over["MAPPO"].mean.value == pytest.approx(0.5)
@@ -164,21 +166,21 @@ def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
     assert over["MAPPO-ESP"].iqm.value == pytest.approx(0.7)
     assert over["MAPPO-ESP"].improvement.value == pytest.approx(2.5 / 3)
     assert over["MAPPO"].improvement is None
-    one = collect(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
+    one = collect_study(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     assert aggregates(one) == {}
     assert TABLES["aggregates"](one).rows == ()
 
 
 def test_a_variant_that_has_not_finished_every_panel_has_no_numbers_over_all(tmp_path):
     ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
-    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
+    found = collect_study(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
     begun = found.cells[1].model_copy(update={"name": "third", "panel": "third", "returns": {}})
     assert list(aggregates(found.model_copy(update={"cells": (*found.cells, begun)}))) == ["MAPPO"]
 
 
 def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
     ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
-    found = collect(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
+    found = collect_study(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
     assert aggregates(found)["MAPPO-ESP"].improvement is not None
     fewer = [
         cell.model_copy(update={"seeds": cell.seeds[:2], "returns": {"greedy": cell.returns["greedy"][:2]}})
@@ -199,39 +201,39 @@ def test_the_mean_probability_of_improvement_by_hand():
 
 
 def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
-    found = collect(
+    found = collect_study(
         write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": [-130.0, None, -140.0]})
     ).results
     esp = summarise_cell(found, found.cells[1])
     assert (esp.returns.mean, esp.returns.per_seed, esp.gap) == (-135.0, (-130.0, None, -140.0), None)
     assert column(found, "statistics", "seeds>") == ["3", "2"]
-    gone = collect(write_study(tmp_path / "t", small_study(), {"MAPPO": [None] * 3})).results
+    gone = collect_study(write_study(tmp_path / "t", small_study(), {"MAPPO": [None] * 3})).results
     assert column(gone, "comparison", "return>")[0] == "every seed stopped"
 
 
 def test_what_is_unfinished_or_not_run_is_said(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
     folder.evaluation_path(folder.study.cells[0]).unlink()
-    found = collect(folder).results
+    found = collect_study(folder).results
     assert [cell.status for cell in found.cells] == ["unfinished", "not run"]
     assert column(found, "comparison", "return>") == ["at 200", "not run"]
     assert TABLES["statistics"](found).rows == ()
-    fresh = collect(StudyFolder.create(tmp_path / "fresh", small_study())).results
+    fresh = collect_study(StudyFolder.create(tmp_path / "fresh", small_study())).results
     assert next(table.title for table in all_tables(fresh)) == "Table 1 of the paper"
 
 
 def test_an_evaluation_beside_which_no_trained_policy_lies_does_not_count(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
     cell = folder.study.cells[0]
-    assert collect(folder).results.cells[0].status == "finished"
+    assert collect_study(folder).results.cells[0].status == "finished"
     (folder.run_path(cell) / POLICY).unlink()
     assert (folder.evaluation_path(cell).is_file(), folder.is_trained(cell)) == (True, False)
-    assert collect(folder).results.cells[0].status == "unfinished"
+    assert collect_study(folder).results.cells[0].status == "unfinished"
 
 
 def test_the_paper_stands_below_ours(tmp_path):
     study = small_study(steps=((None, 500_000),))
-    found = collect(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
+    found = collect_study(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
     assert returns_table(found).rows == (
         ("navigation, 500k", "ours", "-150.00 ± 5.77", "-130.00 ± 5.77"),
         ("", "paper", "-132.65 ± 2.89", "-122.25 ± 1.62"),
@@ -297,7 +299,7 @@ def test_what_is_no_results_file_is_told_in_one_sentence(tmp_path, content, sent
 
 def test_an_ablation_has_its_variants_as_rows(tmp_path):
     study = small_study("ablate-modules")
-    found = collect(write_study(tmp_path / "s", study, {"none": PLAIN, "both": ESP})).results
+    found = collect_study(write_study(tmp_path / "s", study, {"none": PLAIN, "both": ESP})).results
     assert returns_table(found).rows == (
         ("none", "-150.00 ± 5.77"),
         ("loss", "not run"),
@@ -312,7 +314,7 @@ def test_the_reference_is_called_the_plain_learner_only_where_it_is(tmp_path):
         ("both", "none", "the first run"),
     ):
         study = small_study("ablate-modules", variants=(first, other))
-        found = collect(write_study(tmp_path / first, study, {first: PLAIN, other: ESP})).results
+        found = collect_study(write_study(tmp_path / first, study, {first: PLAIN, other: ESP})).results
         assert TABLES["comparison"](found).caption.startswith(f"The reference is {name} of the same panel, compared")
     silent = found.model_copy(
         update={"config": {}, "cells": tuple(c.model_copy(update={"config": {}}) for c in found.cells)}
@@ -330,12 +332,12 @@ def test_damaged_metrics_are_not_taken_for_a_run_that_has_only_begun(tmp_path):
     ):
         metrics.write_text(damaged)
         with pytest.raises(ValueError, match=f"{metrics}.* {sentence}"):
-            collect(folder)
+            collect_study(folder)
     for young in ("", '{"step": 50}\n'):
         metrics.write_text(young)
-        assert collect(folder).results.cells[0].step <= 50
+        assert collect_study(folder).results.cells[0].step <= 50
     metrics.unlink()
-    assert collect(folder).results.cells[0].step == 0
+    assert collect_study(folder).results.cells[0].step == 0
 
 
 def test_runs_of_other_seeds_than_the_study_are_told(tmp_path):
@@ -345,7 +347,7 @@ def test_runs_of_other_seeds_than_the_study_are_told(tmp_path):
     (folder.path / "study.json").write_text(json.dumps(document))
     more = StudyFolder.open(folder.path)
     with pytest.raises(ValueError, match="its final evaluation has not the 4 seeds of the run"):
-        collect(more)
+        collect_study(more)
     folder.evaluation_path(folder.study.cells[0]).unlink()
     with pytest.raises(ValueError, match="its metrics have 3 seeds, its configuration 4"):
-        collect(more)
+        collect_study(more)
