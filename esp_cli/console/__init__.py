@@ -17,7 +17,7 @@ from rich.text import Text
 
 from esp_cli.console.progress import TrainingProgress as TrainingProgress
 from esp_cli.console.progress import live_progress as live_progress
-from esp_cli.console.streams import SafeConsole, escaped
+from esp_cli.console.streams import SafeConsole
 from esp_cli.console.streams import err as err
 from esp_cli.console.streams import error as error
 from esp_cli.console.streams import fit_encoding as fit_encoding
@@ -27,6 +27,7 @@ from esp_cli.console.streams import paged as paged
 from esp_cli.console.streams import say as say
 from esp_cli.console.streams import text as text
 from esp_cli.console.tables import lay_out
+from esp_cli.files.formatting import escaped
 from esp_cli.files.formatting import format_count as format_count  # also console's
 from esp_cli.files.formatting import format_duration as format_duration  # also console's
 from esp_cli.files.formatting import format_interval as format_interval  # also console's

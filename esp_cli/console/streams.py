@@ -9,7 +9,6 @@ import codecs
 import io
 import os
 import pydoc
-import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
@@ -20,14 +19,10 @@ from rich.console import Console
 from rich.segment import Segment
 from rich.text import Text
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+from esp_cli.files.formatting import escaped
+
 _IN_ASCII = {"±": "+-", "━": "=", "╌": "-", "→": "->", "–": "-", "…": "...", "²": "2"}
 """What is written for a character that a terminal cannot show; a question mark for any other."""
-
-
-def escaped(text: str) -> str:
-    r"""Return a text whose control characters, line breaks and tabs aside, are written as "\x1b"."""
-    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
 
 
 class SafeConsole(Console):

@@ -1,1 +1,1 @@
-"""What studies say: results, tables, figures and pages."""
+"""Reports of studies, runs and tunings: results, tables, figures and pages."""

@@ -18,6 +18,7 @@ from jinja2 import Environment, FileSystemLoader
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
+from esp_cli.files.formatting import escaped
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
@@ -87,8 +88,8 @@ def write_report(material: Material, out: Path) -> list[Path]:
     templates = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     names = [picture.png.stem for picture in pictures]
     files = {
-        PAGE: templates.get_template("report.html").render(content).encode(),
-        MARKDOWN: _markdown(material, tables, names, runs).encode(),
+        PAGE: escaped(templates.get_template("report.html").render(content)).encode(),
+        MARKDOWN: escaped(_markdown(material, tables, names, runs)).encode(),
         RESULTS: encode(material.results.document(), out / RESULTS),
         MARL_EVAL: encode(marl_eval(material), out / MARL_EVAL),
     }

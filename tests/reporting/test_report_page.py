@@ -155,10 +155,13 @@ def test_a_hostile_label_stays_text_in_markdown(tmp_path):
     assert markdown_text("a|b <i>*c*</i> `d` [e](f)\ng") == r"a\|b \<i>\*c\*\</i> \`d\` [e\](f) g"
     table = Table("t", ("a|b",), (("c|d",),), "e|f").markdown()
     assert table == "| a\\|b |\n| --- |\n| c\\|d |\n\ne\\|f"
-    made = material(tmp_path, "esp report '```\n# heading'")
+    made = material(tmp_path, "esp report '```\n# heading'\x1b]52;c;eA==\x07")
     write_report(made, tmp_path / "out")
     text = (tmp_path / "out" / "report.md").read_text()
-    assert "````sh\nesp report '```\n# heading'\n````" in text
+    for page in (text, (tmp_path / "out" / "report.html").read_text()):
+        assert "\x1b" not in page
+        assert r"\x1b]52;c;eA==\x07" in page
+    assert "````sh\nesp report '```\n# heading'" in text
 
 
 def browse(page: Path, profile: Path, *options: str) -> subprocess.CompletedProcess[str]:
