@@ -30,9 +30,22 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
-    from esp_cli.studies.study import StudyFolder
 
 DEFAULT_PRESET = "default"
+
+
+def _changed(annotation: Any, **changes: object) -> Any:
+    """Return an annotation whose option of typer has other attributes."""
+    kind, option = get_args(annotation)
+    option = copy.copy(option)
+    vars(option).update(changes)
+    return Annotated[kind, option]
+
+
+if TYPE_CHECKING:
+    StudySeedsOption = tuple[int, ...] | None
+else:
+    StudySeedsOption = _changed(SeedsOption, show_default=str(len(STUDY_SEEDS)))
 
 TasksOption = Annotated[
     list[str] | None,
@@ -130,7 +143,8 @@ class StudyChoices:
     tasks: TasksOption = None
     algos: AlgosOption = None
     steps: StudyStepsOption = None
-    seeds: Annotated[tuple[int, ...], SeedsOption] = STUDY_SEEDS
+    seeds: StudySeedsOption = None
+    seed_list: SeedListOption = None
     out: StudyOutOption = None
     preset: PresetOption = DEFAULT_PRESET
     settings: SetOption = None
@@ -144,19 +158,18 @@ class StudyChoices:
     reuse: ReuseOption = None
     json: JsonOption = None
 
+    @property
+    def all_seeds(self) -> tuple[int, ...]:
+        """The seeds of every run.
+
+        Raises:
+            UserError: they are both counted and listed.
+        """
+        return chosen_seeds(self.seeds, self.seed_list, STUDY_SEEDS)
+
     def folder(self, kind: str) -> Path:
         """Return the study folder of a kind of study."""
         return self.out or Path("runs") / kind
-
-    def reused(self) -> list[StudyFolder]:
-        """Open the studies whose finished runs are taken over.
-
-        Raises:
-            UserError: one is missing or damaged.
-        """
-        from esp_cli.studies.study import StudyFolder
-
-        return [StudyFolder.open(path) for path in self.reuse or ()]
 
     def running_words(self) -> str:
         """Return the options that say how the study is run and not what, as the end of a command line."""
@@ -195,7 +208,7 @@ class StudyChoices:
             tasks=parse_names(self.tasks),
             algorithms=parse_names(self.algos),
             steps=parse_study_steps(self.steps),
-            seeds=self.seeds,
+            seeds=self.all_seeds,
             preset=self.preset,
             overrides=overrides,
             device=self.device_of_runs(),
@@ -211,7 +224,7 @@ class StudyChoices:
         for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
             names = parse_names(items)
             words += [flag, ",".join(names)] if names else []
-        words += seed_words(self.seeds) if self.seeds != STUDY_SEEDS else []
+        words += seed_words(self.all_seeds) if self.all_seeds != STUDY_SEEDS else []
         words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
         words += [word for item in self.settings or [] for word in ("--set", item)]
         words += ["--device", self.device] if self.device != "cpu" else []
@@ -230,22 +243,13 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     own = dict(inspect.signature(command, eval_str=True).parameters)
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
-    counted = copy.copy(get_args(SeedsOption)[1])
-    counted.show_default = str(len(STUDY_SEEDS))
-    shared["seeds"] = shared["seeds"].replace(annotation=Annotated[tuple | None, counted], default=None)
     for name, text in helps.items():
-        kind, option = get_args(shared[name].annotation)
-        option = copy.copy(option)
-        option.help = text
-        shared[name] = shared[name].replace(annotation=Annotated[kind, option])
-    named = inspect.Parameter("seed_list", shared["seeds"].kind, default=None, annotation=SeedListOption)
-    parameters = [*own.values(), *shared.values(), named]
-    parameters.sort(key=lambda parameter: parameter.default is not parameter.empty)
+        shared[name] = shared[name].replace(annotation=_changed(shared[name].annotation, help=text))
+    parameters = sorted([*own.values(), *shared.values()], key=lambda one: one.default is not one.empty)
 
     @functools.wraps(command)
     def with_options(**given: Any) -> None:
         arguments = {name: given.pop(name) for name in own}
-        given["seeds"] = chosen_seeds(given["seeds"], given.pop("seed_list"), STUDY_SEEDS)
         command(choices=StudyChoices(**given), **arguments)
 
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

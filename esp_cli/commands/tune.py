@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import itertools
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from esp_cli import console
 from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
+from esp_cli.commands.study_costs import forecast_search
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import follow, measuring, open_engine, refuse_failed, report_study, run_cells, say_disk
+from esp_cli.commands.studying import follow, open_resources, refuse_failed, report_study, run_cells, stopped
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
-    from esp_cli.studies.engine import Engine
-    from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuner import Outcome, Trials
+    from esp_cli.studies.search import Outcome, Search
     from esp_cli.studies.tuning import Goal, Tuning
-    from esp_cli.studies.tuning_forecast import SearchForecast
 
 EPILOG = """Examples:\n
     esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
@@ -73,16 +70,12 @@ def tune(
     words += ["--trial-seeds", str(trial_seeds)]
     request = choices.request("tune", "tune", *words)
     tuning = _tuning(request, priors, budget, space, goal, reach, trial_seeds)
-    out = choices.folder("tune")
-    with open_engine(choices, out) as engine:
-        jobs = choices.jobs or engine.places(tuning.device)
-        others = choices.reused()
-        idle = frozenset.intersection(*map(tuning.without_effect, priors))
-        note_without_effect([name for name in tuning.overrides if name in idle])
-        if choices.dry_run:
-            _dry_run(tuning, request.seeds, request.episodes, jobs, out, choices.json)
-            return
-        _tune(tuning, request, choices, others, engine, jobs)
+    idle = frozenset.intersection(*map(tuning.without_effect, priors))
+    note_without_effect([name for name in tuning.overrides if name in idle])
+    if choices.dry_run:
+        forecast_search(tuning, request, choices, choices.folder("tune"))
+    else:
+        _tune(tuning, request, choices)
 
 
 def _tuning(
@@ -135,100 +128,61 @@ def _tuning(
     return tuning
 
 
-def _tune(
-    tuning: Tuning,
-    request: Request,
-    choices: StudyChoices,
-    others: Sequence[StudyFolder],
-    engine: Engine,
-    jobs: int,
-) -> None:
+def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     """Search, then judge the best settings; report both.
 
     Raises:
         UserError: the folder holds something else or is in use, Optuna is not installed, or runs failed.
     """
     try:
-        from esp_cli.studies.tuner import Trials, Tuner, write_presets
+        from esp_cli.studies.search import Search
     except ImportError:
         raise UserError(f"Optuna is not installed: {install('tune')}") from None
+    from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuning import TuningFolder, fresh_study
+    from esp_cli.studies.tuning import fresh_study
     from esp_cli.training.folder_names import FRESH
 
     out, fresh = choices.folder("tune"), None
     judged = out / FRESH
-    with TuningFolder.held(out), stop_requests("stopping every run after its iteration") as requests:
+    with (
+        open_resources(choices, out, tuning.device) as resources,
+        Search.held(out),
+        stop_requests("stopping every run after its iteration") as requests,
+    ):
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
             StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
-        trials = Trials(TuningFolder.begin(out, tuning))
-        complete, failed = follow(Tuner(trials, jobs, engine), trials.folder.study.title, requests)
-        outcomes = [trials.outcome(prior) for prior in tuning.priors]
+        search = Search.create(out, tuning)
+        failed = follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
+        outcomes = [search.outcome(prior) for prior in tuning.priors]
         best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
-        _report(trials, outcomes, write_presets(trials.folder, outcomes), quiet=choices.json == "-")
-        if complete and not failed and best:
+        _report(search, outcomes, quiet=choices.json == "-")
+        if best and not (requests or failed):
             study = fresh_study(tuning, best, request.seeds, request.episodes)
             fresh = StudyFolder.create(judged, study)
-            complete, failed = run_cells(fresh, study, others, jobs, engine, requests)
-    if fresh is not None and complete:
+            failed = run_cells(fresh, study, resources, requests)
+    if requests:
+        raise stopped(tuning.command, choices)
+    if fresh is not None:
         report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
-    if not complete:
-        console.note(f"stopped; go on with: {tuning.command}{choices.running_words()}")
-        raise typer.Exit(130)
     refuse_failed(failed, out)
     if not best:
         raise UserError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 
 
-def _report(trials: Trials, outcomes: Sequence[Outcome], presets: Sequence[Path], quiet: bool) -> None:
+def _report(search: Search, outcomes: Sequence[Outcome], quiet: bool) -> None:
     """Write the page of the search and say what to do next; print what it found, unless standard output is for JSON."""
     from esp_cli.reporting.tuning_page import budget_table, settings_table, write_page
 
     if not quiet:
-        for table in (budget_table(trials.tuning, outcomes, trials.folder.study.title), settings_table(outcomes)):
+        for table in (budget_table(search.tuning, outcomes, search.title), settings_table(outcomes)):
             if table.rows:
                 console.table(table.headings, table.rows, title=table.title, caption=table.caption)
     refused = [reason for found in outcomes for reason in found.refused]
     if refused:
         console.note(f"{len(refused)} trials had settings that do not go together, the first: {refused[0]}")
-    console.note(f"report -> {write_page(trials, outcomes, trials.folder.path / 'report')}")
-    own = trials.tuning.config("none", {}).own_words()
+    presets = search.write_presets(outcomes)
+    console.note(f"report -> {write_page(search, outcomes, search.path / 'report')}")
+    own = search.tuning.config("none", {}).own_words()
     for path in presets:
         console.note(f"next: {shlex.join(['esp', 'train', *own, '--config', str(path)])}")
-
-
-def _dry_run(tuning: Tuning, seeds: Sequence[int], episodes: int, jobs: int, out: Path, json: str | None) -> None:
-    """Print what the search costs at most, what it costs as others did, and what it needs on the disk."""
-    from esp_cli.studies.tuning_forecast import forecast_search
-    from esp_cli.studies.tuning_space import space_of
-
-    with measuring(sum(len(space_of(tuning.space, prior)) for prior in tuning.priors)) as listener:
-        done = itertools.count(1)
-        searches = [
-            forecast_search(tuning, prior, seeds, episodes, lambda: listener(next(done))) for prior in tuning.priors
-        ]
-    found = {name: sum(getattr(one, name) for one in searches) for name in ("likely_s", "at_most_s", "disk_bytes")}
-    found["disk_peak_bytes"] = found["disk_bytes"] + jobs * max(one.peak_bytes for one in searches)
-    document = {"command": tuning.command, "searches": searches, **found, "jobs": jobs}
-    console.result(json, document, lambda: _print_forecast(searches, found, tuning.command, jobs, out))
-
-
-def _print_forecast(
-    searches: Sequence[SearchForecast], found: Mapping[str, Any], title: str, jobs: int, out: Path
-) -> None:
-    rows = [
-        (
-            one.prior,
-            str(one.trials),
-            *(console.format_duration(seconds) for seconds in (one.default_s, one.mean_s, one.longest_s)),
-            ", ".join(one.settings),
-        )
-        for one in searches
-    ]
-    console.table(("prior", "trials>", "default>", "mean>", "longest>", "settings"), rows, title=title)
-    console.say(
-        f"on one core about {console.format_duration(found['likely_s'])} if pruning saves half of the steps, at most "
-        f"{console.format_duration(found['at_most_s'])}, the best settings on fresh seeds included; {jobs} runs side "
-        "by side"
-    )
-    say_disk(found["disk_bytes"], found["disk_peak_bytes"], out)

@@ -21,7 +21,8 @@ from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import returns_of, summarised
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
-from esp_cli.studies.study import Cell, Study, StudyFolder, read_evaluation
+from esp_cli.studies.run_set import Cell
+from esp_cli.studies.study import Study, StudyFolder, read_evaluation
 from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import NoMetricError, read_metrics
 from esp_envs.errors import UserError

@@ -20,7 +20,7 @@ from esp_cli.files.formatting import format_count
 from esp_cli.files.writing import write_file
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.curves import RunCurve
-from esp_cli.studies.study import Cell
+from esp_cli.studies.run_set import Cell
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.registry import task_class

@@ -18,7 +18,7 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from esp_cli.files.formatting import format_count, format_duration
 from esp_cli.files.writing import replace_file
 from esp_cli.reporting.tables import Table
-from esp_cli.studies.tuner import Outcome, Trials
+from esp_cli.studies.search import Outcome, Search
 from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
 
 _MEANING = {
@@ -71,27 +71,27 @@ def budget_sentence(tuning: Tuning) -> str:
     )
 
 
-def write_page(trials: Trials, outcomes: Sequence[Outcome], out: Path) -> Path:
+def write_page(search: Search, outcomes: Sequence[Outcome], out: Path) -> Path:
     """Write `tuning.md`, the same numbers as `tuning.json`, and Optuna's figures.
 
     Args:
-        trials: the record.
+        search: with its record.
         outcomes: of each prior.
         out: folder, made if missing.
 
     Returns:
         The page.
     """
-    tuning = trials.tuning
+    tuning = search.tuning
     out.mkdir(parents=True, exist_ok=True)
     document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(outcome) for outcome in outcomes]}
     replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
-    lines = [f"# {trials.folder.study.title}", "", f"`{tuning.command}`", ""]
+    lines = [f"# {search.title}", "", f"`{tuning.command}`", ""]
     for table in (budget_table(tuning, outcomes), settings_table(outcomes)):
         lines += [f"## {table.title}", "", table.markdown(), ""]
     lines += _refused_lines(outcomes)
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` evaluates them on others."]
-    for prior, study in trials.studies.items():
+    for prior, study in search.trials.studies.items():
         for name, title in _draw(study, out, prior):
             lines += ["", f"## {NAMES[prior]}: {title}", "", f"![{title}]({name})"]
     page = out / "tuning.md"

@@ -11,7 +11,9 @@ from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
-from esp_cli.studies.study import Cell, Study
+from esp_cli.studies.run_set import Cell
+from esp_cli.studies.study import Study
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_envs.errors import UserError
 from esp_envs.registry import task_names
@@ -61,14 +63,25 @@ def plan(name: str, request: Request) -> Study:
         UserError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
     """
     kind = KINDS[name]
+    cells = tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request))
     return Study(
         kind=name,
         title=kind.title,
         command=request.command,
         episodes=request.episodes,
         rows=kind.rows,
-        cells=tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request)),
+        cells=cells,
     )
+
+
+def refuse_untrainable(study: Study) -> None:
+    """Refuse a study of which a run cannot be built, before there is a folder; a GPU need not be here.
+
+    Raises:
+        UserError: parts of a run do not go together.
+    """
+    for cell in study.cells:
+        build_learner(cell.config.of_one_seed().model_copy(update={"device": "cpu"}))
 
 
 def without_effect(name: str, request: Request) -> list[str]:

@@ -19,7 +19,10 @@ _SET_PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux's prctl."""
 _PARENT = "ESP_PARENT_PROCESS"
 _TAIL_BYTES = 8192
-_BOOT = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); from esp_cli.app import main; main()"
+_BOOT = (
+    "import sys; sys.path[:] = filter(None, sys.path); "  # a file called random.py in the user's folder is not imported
+    "from esp_cli.studies.engine_local import follow_parent; follow_parent(); from esp_cli.app import main; main()"
+)
 APPLICATION = (sys.executable, "-c", _BOOT)
 """The application as a child process: it stops cleanly when the study that started it ends."""
 
@@ -29,10 +32,11 @@ class LocalEngine:
 
     Args:
         program: the application as a command line; it has to call `follow_parent` first.
+        folder: in which it runs; by default that of this process.
     """
 
-    def __init__(self, program: Sequence[str] = APPLICATION) -> None:
-        self.program = tuple(program)
+    def __init__(self, program: Sequence[str] = APPLICATION, folder: Path | None = None) -> None:
+        self.program, self.folder = tuple(program), folder
 
     def places(self, device: str) -> int:
         """Return how many jobs this machine runs side by side by default: one a core, or one on its GPU."""
@@ -45,7 +49,7 @@ class LocalEngine:
         environment = os.environ | {
             "OMP_NUM_THREADS": "1",
             "PYTHONPATH": path,
-            "PYTHONSAFEPATH": "1",  # a file called random.py in the user's folder is not imported
+            "PYTHONSAFEPATH": "1",  # nor by a process that the job starts, from Python 3.11 on
             "PYTHONUNBUFFERED": "1",
             _PARENT: str(os.getpid()),
         }
@@ -58,6 +62,7 @@ class LocalEngine:
                 stdout=file,
                 stderr=file,
                 env=environment,
+                cwd=self.folder,
                 start_new_session=True,  # Ctrl-C reaches the study alone, which then asks its jobs to stop
             )
         return LocalJob(process, log)

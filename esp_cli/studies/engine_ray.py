@@ -1,8 +1,7 @@
-"""The engine of a Ray cluster: each job in a worker on any node, its run folder mirrored in the driver's study folder.
+"""The engine of a Ray cluster whose machines share a file system: each job is a task that Ray places on a node.
 
-No file system is shared. Each job has a thread here that finds or makes its worker, sends the run folder, and fetches
-what the job writes. A worker is found by its name, so a driver that is started again goes on with the workers of the
-one before it, and no job has two workers. A lost worker is replaced by one that goes on from the last checkpoint here.
+A job works on its run folder as on one machine, so what is done stands in the study folder at any moment. Ray starts
+the task of a lost node again on another one, where the run goes on from its last checkpoint.
 """
 
 from __future__ import annotations
@@ -11,65 +10,73 @@ import hashlib
 import os
 import platform
 import secrets
-import threading
+import socket
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import ray
-from ray.exceptions import RayActorError, RayError
+from ray.exceptions import RayError, TaskCancelledError
 
+import esp_envs
+from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import sentence
-from esp_cli.studies.mirror import FileGoneError, Mirror
-from esp_cli.studies.ray_cluster import NAMESPACE, ClusterError, connect, offers, refuse_what_no_node_has
-from esp_cli.studies.versions import refuse_difference
-from esp_cli.studies.worker import SILENCE_S, CellWorker, Lease, LeaseLostError, News
+from esp_cli.files.locking import is_held
+from esp_cli.studies.engine import Job
+from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.training.build import spec_of
 from esp_cli.training.config_file import parse_config
+from esp_cli.training.folder_names import LOCK
 from esp_cli.training.memory import process_bytes
 from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
+from esp_envs.installed import available_cores
 
-BEAT_S = 0.5
-"""Seconds between two looks at a worker."""
-END_S = 5.0
-"""Seconds that a worker is given to remove its files; one without a node has none."""
-START_S = 60.0
-"""Seconds in which workers may fail to start, one after the other."""
-MAX_LOSSES = 3
-"""Workers that a job may lose without a new checkpoint."""
-_FORWARDED = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")
-_CLUSTER = "cluster.json"
-CLUSTER_FORMAT = DocumentFormat("esp-cluster", 1, "the name of a study on a cluster", ClusterError)
+MAX_RETRIES = 3
+"""Times that Ray starts a job again whose node or worker is lost."""
+POLL_S = 0.5
+"""Seconds between two looks at the process of a job."""
+CONNECT_S = 10.0
+"""Seconds in which a cluster has to answer."""
+_OBJECT_STORE_BYTES = 256 * 2**20
+_LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
+_RAY_ENVIRONMENT = {
+    "RAY_AUTH_MODE": "token",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+"""Of Ray, unless the user sets it."""
+_JOB_ENVIRONMENT = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")
+"""Handed on from the driver to the jobs."""
 
 
-class _StoppedError(Exception):
-    """The job is to stop, and has no worker yet."""
+class ClusterError(UserError):
+    """The cluster cannot be used; the text is one sentence for the user."""
+
+
+CLUSTER_FORMAT = DocumentFormat("esp-cluster", 1, "what a driver tells the nodes of a cluster", ClusterError)
 
 
 class RayEngine:
     """Starts every job on a node of a Ray cluster.
 
     Args:
-        folder: of the study; workers are named after an identity that is kept there.
+        folder: of the study, on a file system that all nodes share.
         address: of the cluster; by default that of RAY_ADDRESS, or a cluster of this machine alone.
         gpus: share of a GPU that a run on "cuda" takes.
-        silence_s: see `CellWorker`.
 
     Raises:
-        ClusterError: no cluster answers, or a node cannot run esp.
-        UserError: a node has other versions than this machine.
+        ClusterError: no cluster answers.
     """
 
-    def __init__(
-        self, folder: Path, address: str | None = None, gpus: float = 1.0, silence_s: float = SILENCE_S
-    ) -> None:
-        self.folder, self.gpus, self.silence_s = folder, gpus, silence_s
-        self.owner = f"process {os.getpid()} on {platform.node()} ({secrets.token_hex(4)})"
-        connect(address)
-        self._offers = offers()  # of nodes that were ever there: a lost one may come back
+    def __init__(self, folder: Path, address: str | None = None, gpus: float = 1.0) -> None:
+        _connect(address)
+        self.folder, self.gpus, self._identity = folder, gpus, secrets.token_hex(16)
+        self._nodes: list[Mapping[str, float]] = []  # what nodes offer that were ever there: a lost one may come back
 
     def __enter__(self) -> RayEngine:
         return self
@@ -87,182 +94,193 @@ class RayEngine:
         run = RunFolder.open(log.parent)
         config = parse_config(run.config, run.path)
         gpus, memory = self.gpus if config.device == "cuda" else 0.0, process_bytes(config, spec_of(config))
-        self._offers += [offer for offer in offers() if offer not in self._offers]
-        refuse_what_no_node_has({"CPU": 1, "GPU": gpus, "memory": memory}, run.path.name, self._offers)
-        key = f"{self._identity()}/{run.path.name}/{arguments[0]}"
-        actor = ray.remote(CellWorker).options(
-            name=f"esp-{hashlib.sha256(key.encode()).hexdigest()[:32]}",
-            namespace=NAMESPACE,
-            lifetime="detached",
-            get_if_exists=True,
-            max_restarts=0,
-            num_cpus=1,
-            num_gpus=gpus,
-            memory=memory,
-        )
-        return RayJob(self.owner, lambda: actor.remote(silence_s=self.silence_s), arguments, run)
-
-    def _identity(self) -> str:
-        """Return the identity of the study, which a driver that is started again finds in its folder."""
-        path = self.folder / _CLUSTER
-        if not path.exists():
-            CLUSTER_FORMAT.write(path, {"identity": secrets.token_hex(16)})
-        return str(CLUSTER_FORMAT.read(path).get("identity"))
+        self._nodes += [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        refuse_what_no_node_has({"CPU": 1, "GPU": gpus, "memory": memory}, run.path.name, self._nodes)
+        told = {
+            "identity": self._identity,
+            "working_folder": str(Path.cwd()),
+            "versions": dict(versions()),
+            "environment": {name: os.environ[name] for name in _JOB_ENVIRONMENT if name in os.environ},
+        }
+        CLUSTER_FORMAT.write(self.folder / "cluster.json", told)
+        task = ray.remote(run_job).options(num_cpus=1, num_gpus=gpus, memory=memory, max_retries=MAX_RETRIES)
+        file = self.folder.absolute() / "cluster.json"
+        return RayJob(task.remote(tuple(arguments), log.absolute(), file, self._identity), log.parent)
 
 
 class RayJob:
-    """A job on some node, followed by a thread here.
+    """A job on some node.
 
     Args:
-        owner: name of this driver.
-        find: returns the worker of the job, which is made if there is none.
-        arguments: of the command line, with the paths of this machine.
-        folder: of the run, on this machine.
+        result: reference to its exit code and to why it failed.
+        folder: of the run.
     """
 
-    def __init__(self, owner: str, find: Callable[[], Any], arguments: Sequence[str], folder: RunFolder) -> None:
-        self._owner, self._find, self._arguments, self._folder = owner, find, tuple(arguments), folder
-        self._stopping, self._killed = threading.Event(), threading.Event()
-        self._actor: Any = None
+    def __init__(self, result: Any, folder: Path) -> None:
+        self._result, self._folder = result, folder
         self._code: int | None = None
         self._words = ""
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
 
     def poll(self) -> int | None:
         """Return the exit code, or None while the job runs."""
-        return None if self._thread.is_alive() else self._code
+        if self._code is None and ray.wait([self._result], timeout=0)[0]:
+            try:
+                self._code, self._words = ray.get(self._result)
+            except TaskCancelledError:
+                self._code, self._words = 130, "stopped"
+            except RayError as error:
+                self._code, self._words = 1, str(error).strip().splitlines()[-1]
+            list(self._folder.iterdir())  # a network file system shows new files once their folder is read
+        return self._code
 
     def ask_to_stop(self) -> None:
         """Ask the job to end after its iteration, with a checkpoint."""
-        self._stopping.set()
+        ray.cancel(self._result)
 
     def kill(self) -> None:
-        """End the job at once and wait until it is gone."""
-        self._killed.set()
-        self._stopping.set()
-        self._thread.join()
+        """End the task at once; its process, which is told of that, ends after its iteration."""
+        ray.cancel(self._result, force=True)
 
     def last_words(self) -> str:
         """Return why the job failed: its last error message, or its last line."""
         return self._words
 
-    def _work(self) -> None:
-        try:
-            with self._folder.lock():
-                self._code = self._run()
-        except _StoppedError:
-            self._code, self._words = 130, "stopped"
-        except OSError as error:
-            self._code, self._words = 1, sentence(error)
-        except (ValueError, RayError) as error:
-            self._code, self._words = 2, str(error).strip().splitlines()[-1]
-        finally:
-            if self._code is None:
-                self._code, self._words = 1, "its thread ended by a bug; see the traceback"
-            self._release()
 
-    def _run(self) -> int:
-        """Run the job to its end, on as many workers as it takes."""
-        losses, before = 0, -1
-        while True:
-            lease, mirror = self._leased(), Mirror(self._folder.path)
-            losses, before = 0 if mirror.newest_step > before else losses, mirror.newest_step
-            try:
-                return self._follow(mirror, lease)
-            except LeaseLostError:  # another driver goes on with it; wait for that one
-                self._actor = None
-            except RayActorError:
-                self._actor = None
-                losses += 1
-                mirror.say(f"lost the worker on {lease['node']}; going on from step {max(0, mirror.newest_step)}")
-                if losses == MAX_LOSSES:
-                    self._words = f"it lost {losses} workers one after the other without a new checkpoint"
-                    return 1
-            if self._stopping.is_set():
-                raise _StoppedError
+def run_job(arguments: Sequence[str], log: Path, cluster: Path, identity: str) -> tuple[int, str]:
+    """Run the application on this node to its end; Ray's cancel asks it to stop.
 
-    def _leased(self) -> Lease:
-        """Lease the worker of the job; wait for a free node, or for another driver that holds it."""
-        failing_since: float | None = None
-        while True:
-            try:
-                self._actor = self._find()
-                lease: Lease = self._ask(self._actor.attach.remote(self._owner), waiting=True)
-            except RayActorError:  # its name is still that of the worker that was lost
-                failing_since = failing_since or time.monotonic()
-                if time.monotonic() - failing_since > START_S:
-                    raise
-            else:
-                if not lease["holder"]:
-                    refuse_difference(lease["node"], lease["versions"])
-                    return lease
-                failing_since = None
-            self._actor = None
-            if self._stopping.wait(BEAT_S):
-                raise _StoppedError
+    Args:
+        arguments: of the command line.
+        log: file to which all that it prints is appended.
+        cluster: file in which the driver tells what a node has to know.
+        identity: that the driver wrote into this file; a node that reads another one does not share the folder.
 
-    def _follow(self, mirror: Mirror, lease: Lease) -> int:
-        """Start the job on its worker, unless it runs already, and fetch what it writes until it ends."""
-        actor, owner, told = self._actor, self._owner, False
-        if lease["begun"]:
-            mirror.log_offset = lease["log_offset"]
-        else:
-            for name, part in mirror.outgoing():
-                self._ask(actor.put.remote(owner, name, part))
-            environment = {name: os.environ[name] for name in _FORWARDED if name in os.environ}
-            arguments = _moved(self._arguments, self._folder.path, lease)
-            mirror.know(self._ask(actor.begin.remote(owner, arguments, environment)))
-        while True:
-            reference = actor.look.remote(owner, mirror.log_offset, mirror.metrics_id, mirror.metrics_offset)
-            news: News = self._ask(reference)
-            mirror.take(news)
-            complete = self._fetch(mirror, news, lease["folder"])
-            if complete and news["code"] is not None:
-                self._words = f"{news['words']} (on the node {lease['node']})"
-                if news["code"] < 0:  # the process could not say it itself
-                    mirror.say(self._words)
-                return news["code"]
-            if self._stopping.is_set() and not told:
-                self._ask(actor.stop.remote(owner))
-                told = True
-            (time.sleep if told else self._stopping.wait)(BEAT_S)
-
-    def _fetch(self, mirror: Mirror, news: News, remote: str) -> bool:
-        """Fetch the files that are new; return False where one was superseded on the way."""
-        actor = self._actor
-        try:
-            for name in mirror.wanted(news["files"]):
-                read = partial(lambda name, offset: self._ask(actor.read.remote(self._owner, name, offset)), name)
-                mirror.fetch(name, news["files"][name], read, remote)
-        except FileGoneError:
-            return False
-        return True
-
-    def _ask(self, reference: Any, waiting: bool = False) -> Any:
-        """Return the answer of a worker; give up when the job is killed, or stopped while it waits for a node."""
-        while not ray.wait([reference], timeout=0.2)[0]:
-            if self._killed.is_set() or (waiting and self._stopping.is_set()):
-                raise _StoppedError
-        if self._killed.is_set():
-            raise _StoppedError
-        return ray.get(reference)
-
-    def _release(self) -> None:
-        """End the worker, if this driver has it."""
-        actor, self._actor = self._actor, None
-        if actor is None:
-            return
-        try:
-            ready, _ = ray.wait([actor.end.remote(self._owner)], timeout=END_S)
-            ray.get(ready)
-            ray.kill(actor)
-        except (RayError, LeaseLostError):  # it is gone, or another driver's
-            pass
+    Returns:
+        The exit code, and why it failed.
+    """
+    node = platform.node()
+    try:
+        told = CLUSTER_FORMAT.read(cluster) if cluster.is_file() else {}
+        if told.get("identity") != identity:
+            raise ClusterError(
+                f"the node {node} does not see {cluster.parent} of this machine; put the study on a file system that "
+                "all nodes share"
+            )
+        refuse_difference(node, versions(), told["versions"])
+        while is_held(log.parent / LOCK):  # by the process of a lost worker, which ends with a checkpoint
+            time.sleep(POLL_S)
+        os.environ.update(told["environment"])
+        folder = Path(told["working_folder"])
+        job = LocalEngine(folder=folder if folder.is_dir() else None).start(arguments, log)
+    except OSError as error:
+        return 1, f"{sentence(error)} (on the node {node})"
+    except UserError as error:
+        return 2, str(error)
+    while (code := _waited(job)) is None:
+        pass
+    return code, f"{job.last_words()} (on the node {node})" if code else ""
 
 
-def _moved(arguments: Sequence[str], here: Path, lease: Lease) -> list[str]:
-    """Return arguments with the run folder here replaced by that of the worker."""
-    local = str(here)
-    inside = [text == local or text.startswith(f"{local}{os.sep}") for text in arguments]
-    return [lease["folder"] + t[len(local) :] if i else t for t, i in zip(arguments, inside, strict=True)]
+def _waited(job: Job) -> int | None:
+    """Return the exit code of a job that has ended, or None where it was asked to stop meanwhile."""
+    try:
+        while (code := job.poll()) is None:
+            time.sleep(POLL_S)
+        return code
+    except KeyboardInterrupt:
+        job.ask_to_stop()
+        return None
+
+
+def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Sequence[Mapping[str, float]]) -> None:
+    """Refuse a run that would wait for ever, since no node offers what it needs.
+
+    Args:
+        needed: resources by Ray's name: "CPU", "GPU", and "memory" in bytes.
+        name: of the run.
+        nodes: what each node offers.
+
+    Raises:
+        ClusterError: there is no such node.
+    """
+    if any(all(node.get(kind, 0.0) >= amount for kind, amount in needed.items()) for node in nodes):
+        return
+    asked = ", ".join(["a core", *(["a GPU"] if needed["GPU"] else []), f"{needed['memory'] / 1e9:.1f} GB of memory"])
+    # a run of fewer seeds needs less memory, and nothing else
+    fewer = any(all(node.get(kind, 0.0) >= needed[kind] for kind in ("CPU", "GPU")) for node in nodes)
+    advice = "add one, or use fewer seeds" if fewer else "add one"
+    raise ClusterError(f"no node of the cluster offers what {name} needs ({asked}); {advice}")
+
+
+@cache
+def versions() -> Mapping[str, str]:
+    """Return what decides whether two machines compute the same: versions by name, with a digest of esp's source."""
+    digest = hashlib.sha256()
+    for root in (Path(__file__).parents[1], Path(esp_envs.__path__[0])):
+        for file in sorted(root.rglob("*.py")):
+            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+    found = {"esp": f"{__version__} ({digest.hexdigest()[:10]})", "Python": platform.python_version()}
+    return found | {name: _version(name) for name in _LIBRARIES}
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, str]) -> None:
+    """Refuse a node whose versions are not those of the driver.
+
+    Args:
+        node: its name.
+        theirs: versions of the node.
+        ours: versions of the driver.
+
+    Raises:
+        ClusterError: they differ; the message names all that do.
+    """
+    unlike = [name for name in ours if theirs.get(name) != ours[name]]
+    if unlike:
+        there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)
+        here = ", ".join(ours[name] for name in unlike)
+        raise ClusterError(f"the node {node} has {there}, but the driver has {here}; install the same versions on both")
+
+
+def _connect(address: str | None) -> None:
+    """Connect to a cluster, or start one of this machine alone that no other machine reaches.
+
+    Raises:
+        ClusterError: none answers, or it is of another version of Ray or Python.
+    """
+    for name, text in _RAY_ENVIRONMENT.items():
+        os.environ.setdefault(name, text)
+    ray._private.worker._worker_logs_enabled = False  # Ray prints the loss of a node to standard output
+    choice: dict[str, Any] = {"address": address, "log_to_driver": False, "logging_level": "ERROR"}
+    if address is None and not os.environ.get("RAY_ADDRESS"):
+        choice |= {"address": "local", "num_cpus": available_cores(), "include_dashboard": False}
+        choice |= {"object_store_memory": _OBJECT_STORE_BYTES, "_node_ip_address": "127.0.0.1"}
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))  # of this cluster alone, in no file
+        # else Ray replaces 127.0.0.1 by an address that other machines reach
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+        ray._private.ray_constants.ENABLE_RAY_CLUSTER = False
+    ray._raylet.Config.initialize("")  # reads RAY_AUTH_MODE again, which may have been set since the import
+    try:
+        _knock(address or os.environ.get("RAY_ADDRESS", ""))
+        ray.init(**choice)
+    except (OSError, RuntimeError, ValueError, RayError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise ClusterError(
+            f"cannot use the Ray cluster at {address or 'RAY_ADDRESS'} ({reason}); check --address, "
+            "RAY_AUTH_MODE, and that the nodes have the same versions of Ray and Python"
+        ) from None
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where nothing answers, for which Ray would wait for minutes, and one of Ray's client."""
+    if address.startswith("ray://"):
+        raise UserError("the driver has to be a machine of the cluster; Ray's client is not supported")
+    host, colon, port = address.rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()

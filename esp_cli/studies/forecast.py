@@ -1,15 +1,23 @@
-"""What is left of a study: time and disk of each run, and of all runs on a number of cores."""
+"""What is left of a study, or what a search costs, by probes of its runs: time on a number of cores, and disk."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 
-from esp_cli.studies.cost import Cost, cost_key, probe
-from esp_cli.studies.scheduler import Run, Status, makespan
+from esp_cli.studies.probe import Cost, Probes
+from esp_cli.studies.run_set import Cell
+from esp_cli.studies.scheduler import Status, makespan
 from esp_cli.studies.study import StudyFolder
+from esp_cli.studies.tuning import Tuning
+from esp_cli.studies.tuning_space import space_of
 from esp_cli.training.config import RunConfig
+
+LIKELY_SHARE = 0.5
+"""What a search takes of the steps of its trials; 0.44 to 0.56 where it was measured (docs/measurements/tuned.md)."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +72,39 @@ class Forecast:
     runs: tuple[RunForecast, ...]
 
 
-def forecast(
+@dataclass(frozen=True)
+class SearchForecast:
+    """What the search with one kind of prior costs, on one core.
+
+    Attributes:
+        prior: its kind.
+        trials: of the search.
+        settings: names of what is searched.
+        default_s: seconds of a whole trial with the default settings.
+        mean_s: of one as the space has them on average, where what each setting costs multiplies.
+        longest_s: of one with the values that take longest.
+        likely_s: of the search with pruning, and of the runs on fresh seeds.
+        at_most_s: of both, where every trial takes longest and none is pruned.
+        disk_bytes: of the trials and the runs on fresh seeds when all is done, at most.
+        peak_bytes: of what one run has on the disk on the way beyond that, at most.
+    """
+
+    prior: str
+    trials: int
+    settings: tuple[str, ...]
+    default_s: float
+    mean_s: float
+    longest_s: float
+    likely_s: float
+    at_most_s: float
+    disk_bytes: int
+    peak_bytes: int
+
+
+def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of a study by probes of runs that are not finished, without writing anything.
-
-    Runs that cost the same, whatever the numbers in their settings, are measured once.
+    """Measure what is left of a study by probes of runs that are not finished.
 
     Args:
         folder: of the study; need not exist.
@@ -77,18 +112,15 @@ def forecast(
         jobs: runs side by side.
         listener: told how many runs have been looked at.
     """
-    study, costs = folder.study, dict[str, Cost]()
+    study, probes = folder.study, Probes(folder.study.episodes)
     found: list[RunForecast] = []
     for cell in study.cells:
-        run = Run.found(folder, cell)
-        twin = folder.run_path(cell) if run.status == "finished" else folder.find_twin(cell, others)
+        twin = folder.run_path(cell) if folder.is_finished(cell) else folder.find_twin(cell, others)
+        again = any(cell.config == earlier.config for earlier in found)  # an earlier run trains the same
         if twin is not None:
-            found.append(_finished(run, twin))
+            found.append(_nothing_left(cell, _bytes_in(twin)))
         else:
-            if (key := cost_key(cell.config)) not in costs:
-                costs[key] = probe(cell.config, study.episodes)
-            again = any(cell.config == earlier.config for earlier in found)
-            found.append(_measured(run, costs[key], again))
+            found.append(_left(cell, folder.progress(cell)[0], probes.cost(cell.config), again))
         listener(len(found))
     disk = sum(run.disk_bytes for run in found)
     extra = sorted((run.peak_bytes - run.disk_bytes for run in found), reverse=True)
@@ -105,17 +137,61 @@ def forecast(
     )
 
 
-def _finished(run: Run, path: Path) -> RunForecast:
-    size = sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
-    config = run.cell.config
-    return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, size, size, config)
-
-
-def _measured(run: Run, cost: Cost, again: bool) -> RunForecast:
-    """Return the forecast of a run by what one costs; `again`: an earlier run trains the same."""
-    config = run.cell.config
-    if again and not run.step:
-        return RunForecast(run.cell.name, "finished", config.steps, 0.0, None, cost.disk_bytes, cost.disk_bytes, config)
-    left = cost.training_s * (1 - run.step / config.steps) + cost.evaluation_s
+def _left(cell: Cell, step: int, cost: Cost, again: bool) -> RunForecast:
+    """Return what is left of a run at a step by what one costs; `again`: another one trains the same."""
+    if again and not step:
+        return _nothing_left(cell, cost.disk_bytes)
     whole = cost.training_s + cost.evaluation_s
-    return RunForecast(run.cell.name, run.status, run.step, left, whole, cost.disk_bytes, cost.peak_bytes, config)
+    left = cost.training_s * (1 - step / cell.config.steps) + cost.evaluation_s
+    return RunForecast(cell.name, "waiting", step, left, whole, cost.disk_bytes, cost.peak_bytes, cell.config)
+
+
+def _nothing_left(cell: Cell, size: int) -> RunForecast:
+    return RunForecast(cell.name, "finished", cell.config.steps, 0.0, None, size, size, cell.config)
+
+
+def _bytes_in(folder: Path) -> int:
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+def forecast_search(
+    tuning: Tuning, prior: str, seeds: Sequence[int], episodes: int, listener: Callable[[], object]
+) -> SearchForecast:
+    """Measure what a search costs by probes of the default trial and of the ends of each setting's range.
+
+    Args:
+        tuning: what is asked for.
+        prior: the kind of prior.
+        seeds: of the runs that judge the best settings.
+        episodes: per seed, of their final evaluations.
+        listener: told after each setting.
+    """
+    probes, space = Probes(episodes), space_of(tuning.space, prior)
+    default = longest = largest = probes.cost(tuning.config(prior, {}))
+    mean_s, slowest = default.training_s, dict[str, object]()
+    for name, dimension in space.items():
+        costs = [(probes.cost_if_trained(tuning.config(prior, {name: v})), v) for v in dimension.corners()]
+        tried = [(cost, value) for cost, value in costs if cost is not None]
+        if tried:
+            mean_s *= fmean(cost.training_s for cost, _ in tried) / default.training_s
+            slowest[name] = max(tried, key=lambda one: one[0].training_s)[1]
+        longest = max([longest, *(cost for cost, _ in tried)], key=lambda cost: cost.training_s)
+        largest = max([largest, *(cost for cost, _ in tried)], key=lambda cost: cost.peak_bytes)
+        listener()
+    longest = probes.cost_if_trained(tuning.config(prior, slowest)) or longest
+    longest_s = max(longest.training_s, mean_s)
+    judged = probes.cost(tuning.config(prior, {}, seeds))
+    judged_s = judged.training_s + judged.evaluation_s
+    growth = math.ceil(len(seeds) / len(tuning.trial_seeds))
+    return SearchForecast(
+        prior=prior,
+        trials=tuning.budget,
+        settings=tuple(space),
+        default_s=default.training_s,
+        mean_s=mean_s,
+        longest_s=longest_s,
+        likely_s=LIKELY_SHARE * tuning.budget * mean_s + judged_s * (1 + mean_s / default.training_s),
+        at_most_s=tuning.budget * longest_s + judged_s * (1 + longest_s / default.training_s),
+        disk_bytes=(tuning.budget + growth) * max(longest.disk_bytes, largest.disk_bytes) + judged.disk_bytes,
+        peak_bytes=growth * max(one.peak_bytes - one.disk_bytes for one in (longest, largest)),
+    )

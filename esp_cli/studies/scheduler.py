@@ -1,8 +1,4 @@
-"""The one scheduler of all studies: runs side by side in processes of their own, resumed, skipped and reported.
-
-What is done and what is not is read off the run folders alone, so a study may be killed at any moment, and
-the next scheduler goes on with what is there.
-"""
+"""The one scheduler of studies and searches: runs side by side in processes of their own, resumed and skipped."""
 
 from __future__ import annotations
 
@@ -12,14 +8,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from esp_cli.files.failures import sentence
-from esp_cli.files.locking import is_held
 from esp_cli.files.opening import require_held
-from esp_cli.files.writing import remove_file
 from esp_cli.studies.engine import Engine, Job
-from esp_cli.studies.study import Cell, StudyFolder
-from esp_cli.training.folder_names import METRICS
-from esp_cli.training.metrics import read_last_row
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.studies.run_set import Cell, RefusedError, RunSet
+from esp_envs.errors import UserError
 
 Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
 POLL_S = 0.5
@@ -31,11 +23,13 @@ class Run:
     """Where one cell stands.
 
     Attributes:
-        cell: of the study.
+        cell: of the study or search.
         status: "elsewhere" is in use by a process that an earlier, killed scheduler left; it is waited for.
         step: environment steps per seed so far.
         trained_s: seconds of training behind these steps, summed over interruptions.
-        message: why it failed.
+        message: why it failed, or why there was nothing to run.
+        job: its process, if this scheduler started it.
+        asked: whether the process was asked to stop.
     """
 
     cell: Cell
@@ -44,21 +38,13 @@ class Run:
     trained_s: float = 0.0
     message: str = ""
     job: Job | None = field(default=None, repr=False)
+    asked: bool = field(default=False, repr=False)
 
-    @classmethod
-    def found(cls, folder: StudyFolder, cell: Cell) -> Run:
-        """Return where a cell stands by its folder alone."""
-        run = cls(cell, "finished" if folder.is_finished(cell) else "waiting")
-        run.look(folder)
-        return run
-
-    def look(self, folder: StudyFolder) -> None:
-        """Read from its folder how far the run is; rows past its last checkpoint may go when it is resumed."""
-        row = read_last_row(folder.run_path(self.cell) / METRICS)
-        self.step = min(int(row.get("step", 0)), self.cell.config.steps)
-        elapsed = row.get("time/elapsed_s")
-        if isinstance(elapsed, int | float):
-            self.trained_s = float(elapsed)
+    def ask_to_stop(self) -> None:
+        """Ask its process, once, to end after its iteration: a second request would interrupt it."""
+        if self.job is not None and not self.asked:
+            self.asked = True
+            self.job.ask_to_stop()
 
     @property
     def is_active(self) -> bool:
@@ -93,18 +79,18 @@ Listener = Callable[[Snapshot], bool]
 
 
 class Scheduler:
-    """Runs the cells of a study side by side; an engine trains each of them, then evaluates it.
+    """Runs the cells of a study or search side by side; the set of runs says what each of them does next.
 
     Args:
-        folder: of the study, held by the caller's lock.
-        cells: those of its cells that are wanted, in order.
+        folder: of the runs, held by the caller's lock.
+        cells: those that are wanted, in order.
         jobs: at once.
         engine: starts them.
     """
 
-    def __init__(self, folder: StudyFolder, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
+    def __init__(self, folder: RunSet, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
         self.folder, self.jobs, self.engine = folder, jobs, engine
-        self.runs = [Run.found(folder, cell) for cell in cells]
+        self.runs = [Run(cell, "finished" if folder.is_finished(cell) else "waiting") for cell in cells]
 
     def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
         """Run everything that is not finished.
@@ -122,6 +108,10 @@ class Scheduler:
             FolderLostError: the folder of the study was moved, replaced or deleted; its processes are ended.
         """
         going = True
+        for run in self.runs:
+            run.step, run.trained_s = self.folder.progress(run.cell)
+            if run.status == "finished":  # a kill may have left something behind
+                self.folder.end(run.cell)
         try:
             while True:
                 require_held(self.folder.path)
@@ -151,17 +141,13 @@ class Scheduler:
         return makespan(running, waiting, self.jobs)
 
     def _seconds_left(self, run: Run) -> float | None:
-        """Estimate what is left of a run by its own speed, or by that of the runs that are most like it."""
+        """Estimate what is left of a run by its own speed, or by that of runs like it."""
         steps = max(0, run.cell.config.steps - run.step)
-        own = run.trained_s / run.step if run.step and run.trained_s else None
-        if own is None:
-            known = [r for r in self.runs if r.step and r.trained_s]
-            if not known:
-                return None
-            best = max(likeness(run.cell, r.cell) for r in known)
-            alike = [r.trained_s / r.step for r in known if likeness(run.cell, r.cell) == best]
-            own = sum(alike) / len(alike)
-        return steps * own
+        if run.step and run.trained_s:
+            return steps * run.trained_s / run.step
+        known = [other for other in self.runs if other.step and other.trained_s]
+        alike = [other for other in known if _kind(other) == _kind(run)] or known
+        return steps * sum(other.trained_s / other.step for other in alike) / len(alike) if alike else None
 
     def _fill(self) -> None:
         """Start waiting runs while there is room."""
@@ -173,59 +159,58 @@ class Scheduler:
 
     def _start(self, run: Run) -> None:
         """Start the next process of a run, if anything is left to do."""
-        cell, folder = run.cell, self.folder
-        run.job = None
-        if folder.is_finished(cell):
-            run.status = "finished"
-            return
         try:
-            run_folder = folder.prepare(cell)
-            if is_held(run_folder.lock_path):
+            run.cell = self.folder.begin(run.cell)
+            if self._is_over(run):
+                return
+            if self.folder.is_in_use(run.cell):
                 run.status = "elsewhere"
                 return
-            path = str(run_folder.path)
-            if folder.is_trained(cell):
-                run.status = "evaluating"
-                arguments = ["eval", path, "--episodes", str(folder.study.episodes)]
-                arguments += ["--json", str(folder.evaluation_path(cell))]
-            else:
-                run.status, arguments = "training", ["train", "--resume", path]
-            arguments += cell.config.own_words()  # a job imports what the study's command line names, not its folder
-            if run.status != "training":  # a damaged evaluation is made again, and a link there is not followed
-                remove_file(folder.evaluation_path(cell))
-            run.job = self.engine.start(arguments, folder.log_path(cell))
+            arguments = self.folder.next_command(run.cell)
+            run.status = "training" if arguments[0] == "train" else "evaluating"
+            run.job, run.asked = self.engine.start(arguments, self.folder.log_path(run.cell)), False
+        except RefusedError as reason:
+            run.status, run.message = "finished", str(reason)
         except OSError as error:
             run.status, run.message = "failed", sentence(error)
-        except ValueError as error:
+        except UserError as error:
             run.status, run.message = "failed", str(error)
 
+    def _is_over(self, run: Run) -> bool:
+        """Return whether nothing is left to do for a run, and then say so and tidy up."""
+        if self.folder.goes_on(run.cell):
+            return False
+        run.status = "finished"
+        self.folder.end(run.cell)
+        return True
+
     def _follow(self, run: Run, going: bool) -> None:
-        """Look at a run: how far it is, and whether its process has ended."""
-        run.look(self.folder)
+        """Look at a run: how far it is, whether it is to go on, and whether its process has ended."""
+        before = run.step
+        run.step, run.trained_s = self.folder.progress(run.cell)
+        if run.step != before and not run.asked and not self.folder.goes_on(run.cell):
+            run.ask_to_stop()
         if run.job is None:  # in use by a process that is not ours
-            if not is_held(RunFolder.open(self.folder.run_path(run.cell)).lock_path):
-                run.status = "waiting"
+            if not self.folder.is_in_use(run.cell):
+                run.status = "waiting" if going else "stopped"
         elif (code := run.job.poll()) is not None:
-            done = self.folder.is_trained if run.status == "training" else self.folder.is_finished
-            if code == 0 and done(run.cell):
-                if going:
-                    self._start(run)  # what comes after training, or nothing
-                else:
-                    run.status = "finished" if self.folder.is_finished(run.cell) else "stopped"
-            elif going:
-                run.status, run.message = "failed", run.job.last_words()
-            else:
-                run.status = "stopped"
-            if not run.is_active:
-                run.job = None
-        if not going and run.job is None and run.status in ("elsewhere", "waiting"):
-            run.status = "stopped"
+            self._ended(run, code, run.job.last_words(), going)
+
+    def _ended(self, run: Run, code: int, words: str, going: bool) -> None:
+        """Say where a run stands whose process has ended, and start the next one."""
+        run.job, trained = None, run.status == "training" and self.folder.is_trained(run.cell)
+        if self._is_over(run):
+            return
+        if going and code == 0 and trained:
+            self._start(run)
+        else:
+            run.status, run.message = ("failed", words) if going else ("stopped", "")
 
     def _stop(self) -> None:
         """Ask every process to stop; what waits stays as it is."""
         for run in self.runs:
             if run.job is not None:
-                run.job.ask_to_stop()
+                run.ask_to_stop()
             elif run.status in ("waiting", "elsewhere"):
                 run.status = "stopped"
 
@@ -244,15 +229,7 @@ def makespan(running: Sequence[float], waiting: Sequence[float], jobs: int) -> f
     return max(places, default=0.0)
 
 
-def likeness(a: Cell, b: Cell) -> int:
-    """Return how alike two runs are in what decides their speed, the heaviest first."""
-    first, second = a.config, b.config
-    same = (
-        first.task == second.task,
-        first.algorithm == second.algorithm,
-        first.network == second.network,
-        len(first.seeds) == len(second.seeds),
-        first.prior.augments == second.prior.augments,
-        first.prior.copies == second.prior.copies and first.prior.transforms == second.prior.transforms,
-    )
-    return sum(2 ** (len(same) - k) for k, equal in enumerate(same) if equal)
+def _kind(run: Run) -> tuple[object, ...]:
+    """Return what decides the speed of a run most."""
+    config = run.cell.config
+    return config.task, config.algorithm, config.network.name, len(config.seeds)

@@ -14,56 +14,34 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentFormat, Strict, parse_object, shortened, validate
-from esp_cli.files.locking import acquire, release
+from esp_cli.files.documents import (
+    MAX_DOCUMENT_BYTES,
+    DocumentError,
+    DocumentFormat,
+    Strict,
+    parse_object,
+    shortened,
+    validate,
+)
 from esp_cli.files.opening import open_own, read_regular, require_held
-from esp_cli.files.writing import TEMPORARY_PREFIX
+from esp_cli.files.writing import remove_file
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.training.build import spec_of
+from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet, StudyError
 from esp_cli.training.config import RunConfig, completed
-from esp_cli.training.config_file import parse_config
-from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOG, POLICY, STUDY, STUDY_LOCK
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.folder_names import FINAL, LOG, STUDY
 from esp_envs.errors import UserError
+from esp_envs.registry import make
 
-_FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
 _OLD_FINAL = "judgement.json"
-
-
-class StudyError(UserError):
-    """A study folder cannot be made, opened or used; the text is one sentence for the user."""
-
-
 STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
-
-
-class Cell(Strict):
-    """One run of a study, and where it stands in tables and pictures.
-
-    Attributes:
-        name: of its folder.
-        panel: the picture that its curve is in, and one axis of the table.
-        variant: its name in that picture, and the other axis.
-        config: what is run.
-        reference: name of the cell that it is compared with; None for such a cell itself.
-        paper: place of the paper's number, see `paper.reported`; None where there is none that compares.
-    """
-
-    name: str
-    panel: str
-    variant: str
-    config: RunConfig
-    reference: str | None = None
-    paper: tuple[str, ...] | None = None
 
 
 class Study(Strict):
@@ -94,38 +72,31 @@ class Study(Strict):
 
 def _completed(cell: Cell) -> Cell:
     """Return a stored cell with the settings that came later; one whose task is not at hand stays as it is."""
-    with contextlib.suppress(ValueError):
+    with contextlib.suppress(UserError):
         return cell.model_copy(update={"config": completed(cell.config)})
     return cell
 
 
-class StudyFolder:
+class StudyFolder(RunSet):
     """A folder that holds a study; use :meth:`create` or :meth:`open`.
 
     Attributes:
-        path: the folder.
         study: all that was ever planned in it.
-        document: name of the file that makes a folder one.
-        runs: name of the folder of its run folders.
-        noun: what messages call what it holds.
+
+    Example:
+        >>> folder = StudyFolder.open(Path("runs/table1"))  # doctest: +SKIP
+        >>> [cell.name for cell in folder.study.cells if not folder.is_finished(cell)]  # doctest: +SKIP
     """
 
-    document: ClassVar[str] = STUDY
-    runs: ClassVar[str] = "runs"
-    noun: ClassVar[str] = "study"
+    document, runs, noun = STUDY, "runs", "study"
 
     def __init__(self, path: Path, study: Study) -> None:
         names = [cell.name for cell in study.cells]
         for name in names:
-            # A name is that of a folder inside the study: nothing is written outside it.
-            if not _FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
+            if not FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
                 raise StudyError(f"{path / STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
-        self.path, self.study = path, study
-
-    @classmethod
-    def is_one(cls, path: Path) -> bool:
-        """Return whether a folder holds one."""
-        return (path / cls.document).is_file()
+        super().__init__(path, study.title)
+        self.study = study
 
     @classmethod
     def create(cls, path: Path, study: Study) -> StudyFolder:
@@ -191,85 +162,69 @@ class StudyFolder:
     def _refuse_old_rules(self, cell: Cell) -> None:
         """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""
         final = read_evaluation(self.run_path(cell))
-        if final is not None and final.task_version != (version := spec_of(cell.config).version):
+        if final is not None and final.task_version != (version := _task_version(cell.config)):
             raise StudyError(
                 f"{self.run_path(cell)} was evaluated on {final.task} version {final.task_version}, but this is "
                 f"version {version}; choose another --out"
             )
 
-    @classmethod
-    def make(cls, path: Path) -> None:
-        """Make the folder, empty, unless it is there.
-
-        Raises:
-            StudyError: as `refuse_foreign`.
-        """
-        cls.refuse_foreign(path)
-        path.mkdir(parents=True, exist_ok=True)
-
-    @classmethod
-    def refuse_foreign(cls, path: Path) -> None:
-        """Refuse a folder that is neither new nor empty nor one of these.
-
-        Raises:
-            StudyError: it holds something foreign, or a link where its runs belong.
-        """
-        if path.is_file():
-            raise StudyError(f"{path} is a file; choose another --out")
-        if (path / cls.runs).is_symlink():
-            raise StudyError(f"{path / cls.runs} is a link, which is not followed; put the folder itself there")
-        if not cls.is_one(path) and path.is_dir():
-            names = (entry.name for entry in path.iterdir())
-            foreign = [name for name in names if name != STUDY_LOCK and not name.startswith(TEMPORARY_PREFIX)]
-            if foreign:
-                raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
-
-    @classmethod
-    @contextlib.contextmanager
-    def held(cls, path: Path) -> Iterator[None]:
-        """Hold the folder, made if missing, so that no second process plans or works in it.
-
-        Half-written documents that a killed process left are removed, those of the fresh study of a tuning too.
-
-        Raises:
-            StudyError: it holds something foreign.
-            LockError: another process holds it.
-        """
-        cls.make(path)
-        descriptor = acquire(path / STUDY_LOCK)
-        try:
-            for folder in (path, path / FRESH):
-                for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
-                    file.unlink(missing_ok=True)
-            yield
-        finally:
-            release(descriptor)
-
-    def run_path(self, cell: Cell) -> Path:
-        """Return the run folder of a cell."""
-        return self.path / self.runs / cell.name
-
-    def log_path(self, cell: Cell) -> Path:
-        """Return the file that the processes of a cell write to."""
-        return self.run_path(cell) / LOG
-
     def evaluation_path(self, cell: Cell) -> Path:
         """Return the file that the final evaluation of a cell's trained policy is written to."""
         return self.run_path(cell) / FINAL
 
-    def prepare(self, cell: Cell) -> RunFolder:
-        """Make the run folder of a cell, or open the one that is there.
+    def is_finished(self, cell: Cell) -> bool:
+        """Return whether a cell is trained, and its policy evaluated."""
+        return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
+
+    def begin(self, cell: Cell) -> Cell:
+        """Make the run folder of a cell; return the cell.
 
         Raises:
             UserError: what is there is damaged or another run.
         """
-        path, wanted = self.run_path(cell), cell.config.model_dump(mode="json")
-        if not (path / CONFIG).exists():
-            return RunFolder.create(path, wanted)
-        folder = RunFolder.open(path)
-        if parse_config(folder.config, path) != cell.config:
-            raise StudyError(f"{path} holds a run of another configuration; move it away, or choose another --out")
-        return folder
+        self.prepare(cell)
+        return cell
+
+    def goes_on(self, cell: Cell) -> bool:
+        """Return whether anything is left to do for a cell."""
+        return not self.is_finished(cell)
+
+    def end(self, cell: Cell) -> None:
+        """Leave a finished cell as it is: training has removed what nothing goes on from."""
+
+    def next_command(self, cell: Cell) -> list[str]:
+        """Return the arguments that train a cell, or that evaluate it once it is trained."""
+        if not self.is_trained(cell):
+            return super().next_command(cell)
+        final = self.evaluation_path(cell)
+        remove_file(final)  # a damaged one is made again, and a link there is not followed
+        words = ["eval", str(self.run_path(cell)), "--episodes", str(self.study.episodes), "--json", str(final)]
+        return words + cell.config.own_words()
+
+    def cells_of(self, study: Study) -> list[Cell]:
+        """Return the cells here that a study names, with the settings and references that they have here."""
+        names = {cell.name for cell in study.cells}
+        return [cell for cell in self.study.cells if cell.name in names]
+
+    def unlike(self, cells: Sequence[Cell]) -> list[Cell]:
+        """Return the cells to run: of those that train the same, the first, and any that has begun."""
+        return [
+            cell
+            for k, cell in enumerate(cells)
+            if self.run_path(cell).exists() or all(cell.config != earlier.config for earlier in cells[:k])
+        ]
+
+    def adopt_finished(self, cells: Sequence[Cell], others: Sequence[StudyFolder]) -> list[tuple[Cell, Path]]:
+        """Take finished runs of the same configuration over; return the cells that have one now, and where it is from.
+
+        Args:
+            cells: that may take one.
+            others: studies that may have one.
+        """
+        twins = [(cell, twin) for cell in cells if (twin := self.find_twin(cell, others)) is not None]
+        for cell, twin in twins:
+            self.adopt(cell, twin)
+        return twins
 
     def find_twin(self, cell: Cell, others: Sequence[StudyFolder]) -> Path | None:
         """Return the folder of a finished run of the same configuration and number of episodes in other studies.
@@ -287,7 +242,7 @@ class StudyFolder:
         )
         for path in alike:
             final = read_evaluation(path)
-            if final is not None and final.task_version == spec_of(cell.config).version:
+            if final is not None and final.task_version == _task_version(cell.config):
                 return path
         return None
 
@@ -304,19 +259,16 @@ class StudyFolder:
             log.write(f"taken over from {twin}\n")
         part.rename(self.run_path(cell))
 
-    def is_trained(self, cell: Cell) -> bool:
-        """Return whether a cell's training is done; the policy file is the last that a run writes."""
-        return (self.run_path(cell) / POLICY).is_file()
-
-    def is_finished(self, cell: Cell) -> bool:
-        """Return whether nothing is left to do for a cell."""
-        return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
-
 
 def read_evaluation(run: Path) -> FinalEvaluation | None:
     """Read the final evaluation of the trained policy in a run folder; None where there is none, or half of one."""
     for name in (FINAL, _OLD_FINAL):
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(OSError, DocumentError, ValidationError):
             text = read_regular(run / name, MAX_DOCUMENT_BYTES) or b""
             return validate(FinalEvaluation, parse_object(text, "text"))
     return None
+
+
+def _task_version(config: RunConfig) -> int:
+    """Return the version of the rules of a run's task."""
+    return make(config.task, 1, (0,), config.task_settings).spec.version

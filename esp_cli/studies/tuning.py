@@ -14,11 +14,11 @@ from pydantic import Field, JsonValue
 from esp_cli.checking.measured import planned
 from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.files.formatting import file_name, format_count
-from esp_cli.studies.study import Cell, Study, StudyError, StudyFolder
+from esp_cli.studies.run_set import Cell, StudyError
+from esp_cli.studies.study import Study
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.folder_names import METRICS, TUNING
 from esp_cli.training.metrics import column, elapsed_s, read_metrics
 from esp_envs.errors import UserError
 
@@ -169,90 +169,12 @@ class Tuning(Strict):
         """Return why no learner can be built with these settings, or nothing where it can."""
         try:
             build_learner(self.config(prior, settings).of_one_seed())
-        except ValueError as error:
+        except UserError as error:
             return str(error)
         return ""
 
 
 TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyError)
-
-
-class TuningFolder(StudyFolder):
-    """The folder of a tuning; a cell is a trial.
-
-    Layout::
-
-        tuning.json         what is asked for
-        journal.jsonl       Optuna's record of all trials
-        trials/PRIOR-NUMBER/    a run folder per trial
-        preset-PRIOR.json   the best settings, for esp train --config
-        fresh/              the study that evaluates them on seeds that no trial had
-        report/             table and figures
-        study.lock          held by the process that works on it
-    """
-
-    document = TUNING
-    runs = "trials"
-    noun = "tuning"
-
-    def __init__(self, path: Path, tuning: Tuning) -> None:
-        title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
-        super().__init__(
-            path, Study(kind="tuning", title=title, command=tuning.command, episodes=1, rows="variants", cells=())
-        )
-        self.tuning = tuning
-
-    @classmethod
-    def begin(cls, path: Path, tuning: Tuning) -> TuningFolder:
-        """Make the folder, or go on with the one that is there, whose budget may grow.
-
-        Raises:
-            StudyError: the folder holds another tuning, or something foreign.
-        """
-        cls.make(path)
-        file = path / cls.document
-        if cls.is_one(path):
-            there = TUNING_FORMAT.parse(file, Tuning)
-            same = {"budget": there.budget, "command": there.command}
-            if tuning.model_copy(update=same) != there or tuning.budget < there.budget:
-                raise StudyError(
-                    f"{path} holds another tuning; go on with it by '{there.command}', or choose another --out"
-                )
-        TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))
-        return cls(path, tuning)
-
-    def trial_path(self, prior: str, number: int) -> Path:
-        """Return the run folder of a trial."""
-        return self.path / self.runs / f"{prior}-{number:03d}"
-
-    def cell(self, prior: str, number: int, settings: Mapping[str, object]) -> Cell:
-        """Return the run of a trial."""
-        name = self.trial_path(prior, number).name
-        return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
-
-    def is_finished(self, cell: Cell) -> bool:
-        """Return whether a trial is trained to its end; it has no evaluation beside its curve."""
-        return self.is_trained(cell)
-
-    def curve(self, cell: Cell) -> list[Point]:
-        """Return the evaluations of a trial; none before it has begun.
-
-        Raises:
-            MetricsError: its metrics are damaged.
-        """
-        path = self.run_path(cell) / METRICS
-        rows = [row for row in read_metrics(path) if "eval/return_greedy" in row] if path.exists() else []
-        if not rows:
-            return []
-        steps, returns = column(rows, "eval/return_greedy")
-        means = returns.mean(1).tolist()
-        seconds = [elapsed_s(row) for row in rows]
-        return [
-            Point(
-                int(step), seconds[k], mean, math.fsum(means[max(0, k + 1 - SMOOTHED) : k + 1]) / min(k + 1, SMOOTHED)
-            )
-            for k, (step, mean) in enumerate(zip(steps, means, strict=True))
-        ]
 
 
 @dataclass(frozen=True)
@@ -270,6 +192,23 @@ class Point:
     seconds: float
     mean: float
     value: float
+
+
+def curve_of(metrics: Path) -> list[Point]:
+    """Return the evaluations of a trial by its metrics file; none before it has begun.
+
+    Raises:
+        MetricsError: the file is damaged.
+    """
+    rows = [row for row in read_metrics(metrics) if "eval/return_greedy" in row] if metrics.exists() else []
+    if not rows:
+        return []
+    steps, returns = column(rows, "eval/return_greedy")
+    means, seconds = returns.mean(1).tolist(), [elapsed_s(row) for row in rows]
+    recent = [means[max(0, k + 1 - SMOOTHED) : k + 1] for k in range(len(means))]
+    return [
+        Point(int(step), seconds[k], means[k], math.fsum(recent[k]) / len(recent[k])) for k, step in enumerate(steps)
+    ]
 
 
 def score(curve: Sequence[Point], tuning: Tuning) -> float | None:

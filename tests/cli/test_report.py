@@ -13,8 +13,9 @@ from PIL import Image
 from esp_cli.files.formatting import format_mean
 from esp_cli.policies.statistics import mean_and_sem
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
-from esp_cli.studies.tuning import TUNING_FORMAT, TuningFolder
+from esp_cli.studies.tuning import TUNING_FORMAT
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
+from esp_cli.training.folder_names import TUNING
 from esp_cli.training.metrics import read_metrics
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
@@ -219,8 +220,8 @@ def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path
 
 
 def test_the_document_of_a_tuning_is_not_overwritten_either(tmp_path: Path) -> None:
-    TUNING_FORMAT.write(tmp_path / TuningFolder.document, {})
-    assert "belongs to the run or study" in refused("settings", "--json", tmp_path / TuningFolder.document)
+    TUNING_FORMAT.write(tmp_path / TUNING, {})
+    assert "belongs to the run or study" in refused("settings", "--json", tmp_path / TUNING)
 
 
 def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(finished: Path, copied: Path) -> None:
@@ -235,9 +236,9 @@ def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(fin
 
 
 def test_the_report_of_a_tuning_is_not_taken_for_a_tuning(tmp_path: Path) -> None:
-    TUNING_FORMAT.write(tmp_path / TuningFolder.document, {})
+    TUNING_FORMAT.write(tmp_path / TUNING, {})
     assert f"is a tuning with a report of its own; report its study by: esp report {tmp_path}/fresh" in refused(
         "report", tmp_path
     )
-    (tmp_path / TuningFolder.document).write_text("{}")
+    (tmp_path / TUNING).write_text("{}")
     assert "is no run folder" in refused("report", tmp_path)

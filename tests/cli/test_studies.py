@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import app, console
-from esp_cli.commands import studying
+from esp_cli.commands import study_costs, studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.files.locking import acquire, release
@@ -22,6 +22,7 @@ from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
 from esp_cli.training.metrics import read_metrics
+from esp_envs.installed import install
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
 from tests.forks import fork, said, wait
 from tests.studies.small_studies import small_study, stand_in
@@ -55,7 +56,7 @@ def test_names_and_steps_are_read_from_lists() -> None:
 def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load: float, unreliable: bool
 ) -> None:
-    monkeypatch.setattr(studying, "busy_with", lambda: load)
+    monkeypatch.setattr(study_costs, "busy_with", lambda: load)
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "s", "--dry-run", "--jobs", 2)
     assert ("this machine was busy (load 3.0 per core)" in told.stderr) == unreliable
     assert ("the times are unreliable" in told.stderr) == unreliable
@@ -175,7 +176,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
         (["reproduce", "table1", "--jobs", "0"], "--jobs"),
         (["ablate", "modules", "--reuse", "none"], "none is no study"),
         (["ablate", "modules", "--address", "auto"], "--address is that of a Ray cluster; add --engine ray"),
-        (["report"], "there is nothing to report"),
+        (["report"], "Missing argument"),
     ],
 )
 def test_what_is_wrong_is_told_before_there_is_a_folder(tmp_path: Path, arguments: list[str], sentence: str) -> None:
@@ -188,7 +189,7 @@ def test_without_ray_a_cluster_is_refused_in_one_sentence(tmp_path: Path, monkey
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "esp_cli.studies.engine_ray", raising=False)
     told = refused(*TINY, "--steps", 200, *TINY_OPTIONS, "--out", tmp_path / "s", "--engine", "ray")
-    assert told == "Ray is not installed: pip install 'ray>=2.40', or use --engine local"
+    assert told == f"Ray is not installed: {install('cluster')}, or use --engine local"
     assert not (tmp_path / "s").exists()
 
 
@@ -247,7 +248,7 @@ def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
 def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    terminal = console.Console(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
+    terminal = console.streams.SafeConsole(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
     monkeypatch.setattr(console.progress, "err", terminal)
     folder = StudyFolder.create(tmp_path / "s", small_study())
     runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from esp_cli.studies.catalogue import Request, plan
-from esp_cli.studies.study import Cell, Study, StudyFolder
+from esp_cli.studies.run_set import Cell
+from esp_cli.studies.study import Study, StudyFolder
 from tests.training.runs import TINY
 
 ANCHORS = {"random": -200.0, "heuristic": -100.0}
@@ -37,10 +39,10 @@ def write_run(folder: StudyFolder, cell: Cell, rows: list[list[float | None]], f
     ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     run.policy_path.write_bytes(b"weights")
-    folder.evaluation_path(cell).write_text(json.dumps(final_evaluation(finals)))
+    folder.evaluation_path(cell).write_text(json.dumps(final_evaluation(finals, cell.config.seeds)))
 
 
-def final_evaluation(finals: list[float | None]) -> dict[str, Any]:
+def final_evaluation(finals: list[float | None], seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
     """The smallest final evaluation that is read."""
     returns = {"mean": None, "sem": None, "ci95": None, "per_seed": finals}
     return {
@@ -49,7 +51,7 @@ def final_evaluation(finals: list[float | None]) -> dict[str, Any]:
         "task_version": 1,
         "convention": "by hand",
         "step": 200,
-        "seeds": list(SEEDS),
+        "seeds": list(seeds),
         "episodes": 4,
         "greedy": returns,
         "stochastic": returns,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import resource
+import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,22 +20,29 @@ pytest.importorskip("ray", reason="needs Ray, of the extra cluster")
 import ray
 from ray.cluster_utils import Cluster
 
+from esp_cli.files.locking import is_held
 from esp_cli.run import Run
-from esp_cli.studies import engine_ray, versions
+from esp_cli.studies import engine_ray
 from esp_cli.studies.engine import Engine
 from esp_cli.studies.engine_local import LocalEngine
-from esp_cli.studies.engine_ray import RayEngine
-from esp_cli.studies.mirror import Mirror
-from esp_cli.studies.ray_cluster import ClusterError, refuse_what_no_node_has
+from esp_cli.studies.engine_ray import (
+    CLUSTER_FORMAT,
+    ClusterError,
+    RayEngine,
+    refuse_difference,
+    refuse_what_no_node_has,
+    run_job,
+    versions,
+)
+from esp_cli.studies.run_set import Cell
 from esp_cli.studies.scheduler import Scheduler, Snapshot
-from esp_cli.studies.study import Cell, Study, StudyFolder
-from esp_cli.studies.tuning import TuningFolder
+from esp_cli.studies.study import Study, StudyFolder
+from esp_cli.training.checkpoint_names import checkpoints_in, step_of
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
 from tests.studies.test_tuning import tuning
-from tests.studies.test_worker import wait_for
 from tests.training.runs import TINY
 
 pytestmark = pytest.mark.slow
@@ -47,7 +55,8 @@ STEPS = 6000
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     """A head that runs nothing, and two nodes of one core each."""
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0123456789abcdef" * 4}
+    ray._raylet.Config.initialize("")
     head = {"num_cpus": 0, "object_store_memory": STORE, "include_dashboard": False}
     head["_system_config"] = {"health_check_period_ms": 1000, "health_check_initial_delay_ms": 0}
     made = Cluster(initialize_head=True, head_node_args=head)
@@ -68,8 +77,15 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StudyFolder:
 
 @pytest.fixture
 def engine(cluster: Cluster, folder: StudyFolder) -> Iterator[RayEngine]:
-    with RayEngine(folder.path, cluster.address, silence_s=2.0) as made:
+    with RayEngine(folder.path, cluster.address) as made:
         yield made
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 240
+    while not condition():
+        assert time.monotonic() < deadline, "it did not come true"
+        time.sleep(0.01)
 
 
 @pytest.fixture(scope="module")
@@ -110,10 +126,6 @@ def same(folder: StudyFolder, cell: Cell, alone: Path) -> bool:
     return rows[0] == rows[1] and policies[0] == policies[1]
 
 
-def workers() -> list[str]:
-    return [actor["name"] for actor in ray.util.list_named_actors(all_namespaces=True)]
-
-
 def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(
     cluster: Cluster, folder: StudyFolder, engine: RayEngine, alone: dict[str, Path]
 ) -> None:
@@ -127,23 +139,24 @@ def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(
             cluster.nodes_of_work = [cluster.add_node(num_cpus=1, object_store_memory=STORE) for _ in range(2)]
             lost.append("nodes")
         elif lost == ["nodes"] and "resuming at" in log(folder, cell):
-            ray.kill(ray.get_actor(*workers(), namespace="esp"))
+            lock = json.loads((folder.run_path(cell) / "run.lock").read_text())
+            os.kill(int(re.search(r"PPid:\t(\d+)", Path(f"/proc/{lock['pid']}/status").read_text())[1]), signal.SIGKILL)
             lost.append("worker")
         return True
 
     scheduler = scheduled(folder, engine, lose, cells=[cell])
-    assert lost == ["nodes", "worker"], log(folder, cell)
-    assert log(folder, cell).count("lost the worker on ") == 2
+    assert lost == ["nodes", "worker"], (scheduler.runs[0], log(folder, cell))
+    assert log(folder, cell).count("$ esp train") == 3
     assert scheduler.runs[0].status == "finished", scheduler.runs[0].message
     assert same(folder, cell, alone[cell.name])
     here = Run(alone[cell.name]).evaluate(folder.study.episodes).model_dump(mode="json")
     there = json.loads(folder.evaluation_path(cell).read_text())
     assert here | {"source": str(folder.run_path(cell))} == there
-    assert workers() == []
 
 
 def steps_here(folder: StudyFolder) -> list[int]:
-    return [Mirror(folder.run_path(cell)).newest_step for cell in folder.study.cells]
+    paths = (folder.run_path(cell) for cell in folder.study.cells)
+    return [max(map(step_of, checkpoints_in(path)), default=-1) for path in paths]
 
 
 def command(out: Path, cluster: Cluster) -> list[str]:
@@ -152,7 +165,7 @@ def command(out: Path, cluster: Cluster) -> list[str]:
     return [sys.executable, "-c", "from esp_cli.app import main; main()", *map(str, words)]
 
 
-def test_a_killed_driver_goes_on_with_its_workers_and_an_interrupted_one_leaves_none(
+def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_on(
     cluster: Cluster, tmp_path: Path, alone: dict[str, Path]
 ) -> None:
     out = tmp_path / "s"
@@ -182,10 +195,7 @@ def test_a_killed_driver_goes_on_with_its_workers_and_an_interrupted_one_leaves_
         told = process.communicate()[1]
     assert process.returncode == 130, told
     assert f"--engine ray --address {cluster.address}" in told
-    for cell in folder().study.cells:
-        assert log(folder(), cell).count("$ esp train") == 1, "a second worker trained it"
-    with RayEngine(out, cluster.address):
-        assert workers() == []
+    assert not any(is_held(folder().run_path(cell) / "run.lock") for cell in folder().study.cells)
     with started() as process:
         told = process.communicate()[1]
     assert process.returncode == 0, told
@@ -193,21 +203,63 @@ def test_a_killed_driver_goes_on_with_its_workers_and_an_interrupted_one_leaves_
         assert same(folder(), cell, alone[cell.name])
 
 
-def test_a_full_disk_of_the_driver_fails_a_run_that_the_same_command_finishes(
-    folder: StudyFolder, engine: RayEngine, alone: dict[str, Path]
-) -> None:
-    plain = folder.study.cells[0]
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, limits[1]))
-    try:
-        scheduler = scheduled(folder, engine, lambda _: True, cells=[plain])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert scheduler.runs[0].status == "failed"
-    assert "file too large" in scheduler.runs[0].message
-    assert workers() == []
-    assert scheduled(folder, engine, lambda _: True, cells=[plain]).runs[0].status == "finished"
-    assert same(folder, plain, alone[plain.name])
+def test_a_node_that_does_not_see_the_folder_of_the_driver_is_refused_before_it_trains(folder: StudyFolder) -> None:
+    run, file = folder.prepare(folder.study.cells[0]).path, folder.path / "cluster.json"
+    told = {"working_folder": str(folder.path), "versions": dict(versions()), "environment": {}}
+
+    def job(*arguments: str) -> tuple[int, str]:
+        return run_job(arguments, run / "log.txt", file, "mine")
+
+    missing = job("train", "--resume", str(run))
+    assert missing[0] == 2
+    assert f"does not see {folder.path} of this machine; put the study on a file system that all" in missing[1]
+    CLUSTER_FORMAT.write(file, told | {"identity": "theirs"})
+    assert job("train", "--resume", str(run)) == missing
+    CLUSTER_FORMAT.write(file, told | {"identity": "mine", "versions": {"torch": "0.1"}})
+    assert "but the driver has 0.1; install the same versions on both" in job("train", "--resume", str(run))[1]
+    assert not (run / "log.txt").exists()
+    CLUSTER_FORMAT.write(file, told | {"identity": "mine"})
+    assert job("train", "--no-such-option")[0] == 2
+    assert "$ esp train --no-such-option" in (run / "log.txt").read_text()
+
+
+def test_a_node_of_another_version_is_refused_in_one_sentence() -> None:
+    refuse_difference("n1", versions(), versions())
+    other = {**versions(), "torch": "1.0", "numpy": "1.0"}
+    with pytest.raises(ValueError, match=r"the node n1 has torch 1.0, numpy 1.0, but the driver has .*; install"):
+        refuse_difference("n1", other, versions())
+    with pytest.raises(ValueError, match="has esp missing"):
+        refuse_difference("n1", {name: text for name, text in versions().items() if name != "esp"}, versions())
+
+
+def test_a_cluster_of_this_machine_alone_has_a_token_and_no_other_machine_reaches_it(tmp_path: Path) -> None:
+    code = (
+        "import os, pathlib, subprocess\n"
+        "from esp_cli.studies.engine_ray import RayEngine\n"
+        "with RayEngine(pathlib.Path('s')):\n"
+        "    from ray._raylet import AuthenticationMode, get_authentication_mode\n"
+        "    assert get_authentication_mode() == AuthenticationMode.TOKEN\n"
+        "    table = ''.join(pathlib.Path(f'/proc/net/{name}').read_text() for name in ('tcp', 'tcp6'))\n"
+        "    inodes = set()\n"
+        "    for link in pathlib.Path('/proc').glob('[0-9]*/fd/*'):\n"
+        "        try:\n"
+        "            mine = b'RAY_AUTH_TOKEN=' + os.environ['RAY_AUTH_TOKEN'].encode()\n"
+        "            if mine in (link.parents[1] / 'environ').read_bytes():\n"
+        "                inodes.add(os.readlink(link))\n"
+        "        except OSError:\n"
+        "            pass\n"
+        "    rows = [row.split() for row in table.splitlines()]\n"
+        "    print(*(row[1].split(':')[0] for row in rows if row[3] == '0A' and f'socket:[{row[9]}]' in inodes))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "environments")])}
+    environment = {name: text for name, text in environment.items() if not name.startswith("RAY_")}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    loopback = {"0100007F", "0000000000000000FFFF00000100007F"}
+    assert len(done.stdout.split()) > 3
+    assert set(done.stdout.split()) <= loopback
 
 
 def test_a_run_that_no_node_has_room_for_fails_at_once(
@@ -238,13 +290,7 @@ def test_fewer_seeds_are_advised_only_where_memory_is_what_is_missing(node: dict
     refuse_what_no_node_has(needed, "esp", [node, {"CPU": 1, "GPU": 1, "memory": 2e9}])
 
 
-def test_a_cluster_of_another_version_or_none_is_refused_in_one_sentence(
-    cluster: Cluster, folder: StudyFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(versions, "versions", lambda: {"torch": "0.1"})
-    with pytest.raises(ValueError, match=r"the node .* has torch .*, but this machine has 0.1; install"):
-        RayEngine(folder.path, cluster.address)
-    assert not ray.is_initialized()
+def test_a_cluster_that_does_not_answer_is_refused_in_one_sentence(folder: StudyFolder) -> None:
     for address, reason in (("127.0.0.1:1", "refused"), ("ray://127.0.0.1:1", "client is not supported")):
         with pytest.raises(
             ClusterError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
@@ -256,24 +302,23 @@ def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machin
     cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
-    from esp_cli.studies.tuner import Outcome, Trials, Tuner
+    from esp_cli.studies.search import Outcome, Search
 
     monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
     asked = tuning(priors=("esp",), budget=3, steps=STEPS // 2)
 
-    def searched(folder: TuningFolder, engine: Engine) -> Outcome:
+    def searched(path: Path, engine: Engine) -> Outcome:
         """Search; stop at the first checkpoint, and go on."""
-        first = folder.run_path(folder.cell("esp", 0, {}))
+        first = path / "trials" / "esp-000"
         for until in (lambda _: not any(first.glob("checkpoints/step-*.safetensors")), lambda _: True):
             assert not (first / "policy.safetensors").exists()
-            trials = Trials(TuningFolder.begin(folder.path, asked))
-            Tuner(trials, 1, engine).run(until, 0.05)
-        return trials.outcome("esp")
+            search = Search.create(path, asked)
+            Scheduler(search, search.cells, 1, engine).run(until, 0.05)
+        return search.outcome("esp")
 
-    here = searched(TuningFolder(tmp_path / "here", asked), LocalEngine())
-    with RayEngine(tmp_path / "there", cluster.address, silence_s=2.0) as engine:
-        there = searched(TuningFolder(tmp_path / "there", asked), engine)
-        assert workers() == []
+    here = searched(tmp_path / "here", LocalEngine())
+    with RayEngine(tmp_path / "there", cluster.address) as engine:
+        there = searched(tmp_path / "there", engine)
     assert there.trials == 3
     # a trial that is pruned ends some steps after it was judged
     assert replace(there, seconds=0.0, env_steps=0) == replace(here, seconds=0.0, env_steps=0)

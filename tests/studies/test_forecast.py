@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from esp_cli.studies import forecast as module
-from esp_cli.studies.cost import Cost
-from esp_cli.studies.forecast import forecast
-from esp_cli.studies.scheduler import Run
+from esp_cli.studies import probe as probing
+from esp_cli.studies.forecast import forecast_study as forecast
+from esp_cli.studies.probe import Cost
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, write_run
 
@@ -23,7 +23,7 @@ def probed(monkeypatch) -> list[str]:
         seen.append(config.prior.kind)
         return Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
 
-    monkeypatch.setattr(module, "probe", probe)
+    monkeypatch.setattr(probing, "probe", probe)
     return seen
 
 
@@ -40,8 +40,8 @@ def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed
 
 def test_a_run_that_has_begun_takes_what_is_left_of_its_training_and_its_evaluation() -> None:
     cell = small_study().cells[0]
-    run = Run(cell, step=cell.config.steps // 4)
-    found = module._measured(run, Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70), again=False)
+    cost = Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
+    found = module._left(cell, cell.config.steps // 4, cost, again=False)
     assert found.seconds_left == 75.0 + 4.0
 
 

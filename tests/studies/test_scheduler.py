@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.studies.engine_local import LocalEngine
-from esp_cli.studies.scheduler import Run, Scheduler, likeness, makespan
+from esp_cli.studies.engine_local import APPLICATION, LocalEngine
+from esp_cli.studies.scheduler import Scheduler, makespan
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, stand_in, write_part, write_study
 
+ROOT = Path(__file__).parents[2]
 FOUR = ("navigation", "predator-prey")
 
 
@@ -134,7 +135,7 @@ def test_a_stop_lets_the_running_ones_end_and_starts_no_other(folder):
     assert not scheduler.complete
     assert statuses(scheduler) == ["stopped"] * 4
     assert trace(folder) == [f"train {folder.study.cells[0].name}"]
-    assert Run.found(folder, folder.study.cells[0]).step >= 100
+    assert folder.progress(folder.study.cells[0])[0] >= 100
     resumed = run(folder)
     assert statuses(resumed) == ["finished"] * 4
     steps = (folder.run_path(folder.study.cells[0]) / "metrics.jsonl").read_text().splitlines()
@@ -174,7 +175,7 @@ def test_a_job_ends_with_the_process_that_started_it(tmp_path):
     waiter = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); import time; time.sleep(60)"
     parent = (
         "import os, signal, sys, pathlib, time\n"
-        "from esp_cli.studies.engine_local import LocalEngine\n"
+        "from esp_cli.studies.engine_local import APPLICATION, LocalEngine\n"
         f"engine = LocalEngine([sys.executable, '-c', {waiter!r}])\n"
         f"print(engine.start([], pathlib.Path({str(tmp_path / 'log')!r})).pid, flush=True)\n"
         "time.sleep(60)\n"
@@ -188,6 +189,20 @@ def test_a_job_ends_with_the_process_that_started_it(tmp_path):
             return
         time.sleep(0.05)
     pytest.fail(f"process {child} outlived its parent")
+
+
+def test_a_job_imports_nothing_from_the_folder_in_which_it_runs(tmp_path):
+    for name in ("json", "torch", "random", "esp_cli"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('planted')")
+    environment = {name: text for name, text in os.environ.items() if name != "PYTHONSAFEPATH"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), str(ROOT / "environments")])
+
+    def said(*words: str) -> str:
+        done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        return done.stderr
+
+    assert said(*APPLICATION, "--version") == ""
+    assert "planted" in said(sys.executable, "-c", "import json")  # negative control
 
 
 def test_the_last_words_of_a_job_are_its_error_or_its_last_line(tmp_path):
@@ -274,11 +289,10 @@ def test_when_the_last_job_ends():
 def test_time_left_is_that_of_the_runs_most_alike(folder):
     scheduler = Scheduler(folder, folder.study.cells, 1, LocalEngine(()))
     assert scheduler.left_s() is None
-    plain, esp, hunt, hunt_esp = scheduler.runs
+    plain, _, hunt, _ = scheduler.runs
     plain.step, plain.trained_s = 100, 10.0  # of 200 steps, 0.1 s a step
     assert scheduler.left_s() == pytest.approx(0.1 * 700)
     hunt.step, hunt.trained_s = 200, 40.0
     hunt.status = "finished"
     # plain 100 steps and esp 200 of 0.1 s; the hunt with the prior like the hunt, 0.2 s
     assert scheduler.left_s() == pytest.approx(10 + 20 + 40)
-    assert likeness(hunt_esp.cell, hunt.cell) > likeness(hunt_esp.cell, esp.cell)

@@ -11,9 +11,9 @@ from esp_cli.files.locking import LockError, is_held
 from esp_cli.files.opening import FolderLostError
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.scheduler import Scheduler
-from esp_cli.studies.study import StudyError, StudyFolder, read_evaluation
-from esp_cli.studies.tuning import TuningFolder
+from esp_cli.studies.study import StudyFolder, read_evaluation
 from tests.studies.small_studies import small_study, stand_in, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
@@ -258,23 +258,21 @@ def test_planted_links_at_the_lock_and_the_log_are_not_written_to(tmp_path):
     assert mine.read_text() == "mine"
 
 
-@pytest.mark.parametrize("kind", [StudyFolder, TuningFolder])
-def test_a_study_killed_while_its_first_document_is_written_goes_on(tmp_path, kind):
+def test_a_study_killed_while_its_first_document_is_written_goes_on(tmp_path):
     (tmp_path / f"{TEMPORARY_PREFIX}0").write_text("half")
-    with kind.held(tmp_path):
+    with StudyFolder.held(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == ["study.lock"]
     (tmp_path / "fresh").mkdir()
     (tmp_path / "fresh" / f"{TEMPORARY_PREFIX}0").write_text("half")
-    (tmp_path / kind.document).write_text("{}")
-    with kind.held(tmp_path):
+    (tmp_path / StudyFolder.document).write_text("{}")
+    with StudyFolder.held(tmp_path):
         StudyFolder.create(tmp_path / "fresh", small_study())
         assert [path.name for path in (tmp_path / "fresh").iterdir()] == ["study.json"]
 
 
-@pytest.mark.parametrize(("kind", "name"), [(StudyFolder, "runs"), (TuningFolder, "trials")])
-def test_runs_are_not_written_through_a_link(tmp_path, kind, name):
+def test_runs_are_not_written_through_a_link(tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "s").mkdir()
-    (tmp_path / "s" / name).symlink_to(tmp_path / "outside")
-    with pytest.raises(StudyError, match=f"{name} is a link, which is not followed"), kind.held(tmp_path / "s"):
+    (tmp_path / "s" / "runs").symlink_to(tmp_path / "outside")
+    with pytest.raises(StudyError, match="runs is a link, which is not followed"), StudyFolder.held(tmp_path / "s"):
         pass

@@ -9,12 +9,12 @@ import re
 import pytest
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.studies import tuning_forecast
-from esp_cli.studies.cost import Cost
-from esp_cli.studies.study import StudyError
-from esp_cli.studies.tuning import Point, Tuning, TuningFolder, fresh_study, score
+from esp_cli.studies import forecast, probe
+from esp_cli.studies.probe import Cost
+from esp_cli.studies.tuning import Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
 from esp_cli.training.metrics import MetricsError
+from esp_envs.errors import UserError
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
@@ -177,35 +177,20 @@ def test_a_curve_is_scored_by_its_end_or_by_when_it_reaches_a_return():
 
 
 def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
-    folder = TuningFolder.begin(tmp_path / "t", tuning())
-    cell = folder.cell("esp", 3, {})
-    path = folder.run_path(cell)
-    path.mkdir(parents=True)
+    path = tmp_path / "metrics.jsonl"
     rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0], "time/elapsed_s": k} for k in range(5)]
     rows.insert(1, {"step": 50})
     rows[-1]["time/elapsed_s"] = [4.0]
-    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    found = folder.curve(cell)
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = curve_of(path)
     assert [point.step for point in found] == [0, 100, 200, 300, 400]
     assert [point.mean for point in found] == [0.0, -4.0, -8.0, -12.0, -16.0]
     assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
     assert [point.seconds for point in found] == [0.0, 1.0, 2.0, 3.0, 0.0], "a list is no number of seconds"
-    assert folder.curve(folder.cell("esp", 4, {})) == []
-    (path / "metrics.jsonl").write_text('{"step": 0}\nno row\n{"step": 1}\n')
+    assert curve_of(tmp_path / "none") == []
+    path.write_text('{"step": 0}\nno row\n{"step": 1}\n')
     with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2"):
-        folder.curve(cell)
-
-
-def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
-    TuningFolder.begin(tmp_path / "t", tuning())
-    assert TuningFolder.begin(tmp_path / "t", tuning(budget=8)).tuning.budget == 8
-    for other in (tuning(budget=2), tuning(budget=8, steps=100), tuning(budget=8, priors=("esp",))):
-        with pytest.raises(StudyError, match="holds another tuning"):
-            TuningFolder.begin(tmp_path / "t", other)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.tex").touch()
-    with pytest.raises(StudyError, match="is not empty and no tuning"):
-        TuningFolder.begin(tmp_path / "mine", tuning())
+        curve_of(path)
 
 
 def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
@@ -249,16 +234,16 @@ def test_the_forecast_of_a_search_by_hand(monkeypatch):
     bytes, and 100 bytes of the default settings on 4 seeds.
     """
 
-    def probe(config, episodes):
+    def measured(config, episodes):
         if config.algorithm_settings["num_minibatches"] == 3:
-            raise ValueError("does not go together")
+            raise UserError("does not go together")
         judged = len(config.seeds) == 4
         wide, epochs = config.network.hidden == (16,), config.algorithm_settings["num_epochs"]
         seconds = 25.0 if judged else 10.0 * (4 if wide else 1) * epochs
         disk = 100 if judged else 40 if wide else 10
         return Cost(training_s=seconds, evaluation_s=5.0, disk_bytes=disk, peak_bytes=disk + 7)
 
-    monkeypatch.setattr(tuning_forecast, "probe", probe)
+    monkeypatch.setattr(probe, "probe", measured)
     space = {
         "network.hidden": Dimension(choices=([8], [16])),
         "mappo.num_epochs": Dimension(low=1, high=2),
@@ -266,9 +251,8 @@ def test_the_forecast_of_a_search_by_hand(monkeypatch):
         "mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True),
     }
     told = []
-    found = tuning_forecast.forecast_search(
-        tuning(budget=6, space=space), "none", (0, 1, 2, 3), 2, lambda: told.append(1)
-    )
+    asked = tuning(budget=6, space=space)
+    found = forecast.forecast_search(asked, "none", (0, 1, 2, 3), 2, lambda: told.append(1))
     assert len(told) == 4
     assert (found.default_s, found.mean_s, found.longest_s) == (10.0, 37.5, 80.0)
     assert (found.likely_s, found.at_most_s) == (255.0, 750.0)

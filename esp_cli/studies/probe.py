@@ -1,4 +1,4 @@
-"""What a study costs before it is started: time from a short measured probe of each run, and disk."""
+"""What one run costs on this machine: time from a short measured probe, and disk; nothing is written."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
 from esp_cli.training.play import PolicyController, play
 from esp_cli.training.streams import generators
+from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
 PROBE_SECONDS = 1.0
@@ -44,6 +45,36 @@ class Cost:
     evaluation_s: float
     disk_bytes: int
     peak_bytes: int
+
+
+class Probes:
+    """Measures runs, once those that cost the same.
+
+    Args:
+        episodes: per seed, of a final evaluation.
+    """
+
+    def __init__(self, episodes: int) -> None:
+        self._episodes = episodes
+        self._known: dict[str, Cost] = {}
+
+    def cost(self, config: RunConfig) -> Cost:
+        """Return what a run costs.
+
+        Raises:
+            UserError: its parts do not go together.
+        """
+        key = cost_key(config)
+        if key not in self._known:
+            self._known[key] = probe(config, self._episodes)
+        return self._known[key]
+
+    def cost_if_trained(self, config: RunConfig) -> Cost | None:
+        """Return what a run costs; None where its parts do not go together, so that it is not trained."""
+        try:
+            return self.cost(config)
+        except UserError:
+            return None
 
 
 def cost_key(config: RunConfig) -> str:
@@ -78,12 +109,12 @@ def probe(config: RunConfig, episodes: int) -> Cost:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the runs of a study do
     try:
-        return _probe(config, episodes)
+        return _measured(config, episodes)
     finally:
         torch.set_num_threads(threads)
 
 
-def _probe(config: RunConfig, episodes: int) -> Cost:
+def _measured(config: RunConfig, episodes: int) -> Cost:
     learner = build_learner(config)
     clock = _clock(config)
     iterations = -(-config.steps // learner.steps_per_iteration)
