@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from esp_envs.epuck import gl
-from esp_envs.epuck.painter import open_painter
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 FRAMES = 26
@@ -136,7 +135,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_robots_are_drawn_in_space_and_from_above(robots: Path, tmp_path: Path) -> None:
     try:
-        with open_painter(64):
+        with gl.open_painter(64):
             pass
     except ValueError as error:
         pytest.skip(str(error))

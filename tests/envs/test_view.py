@@ -22,7 +22,7 @@ from esp_envs.drawing import BACKGROUND
 from esp_envs.epuck import gl
 from esp_envs.epuck.looks import WALL_HEIGHT_M
 from esp_envs.epuck.robot import BODY_HEIGHT_M, BODY_RADIUS_M
-from esp_envs.epuck.view import Camera, SpacePainter, space_painter
+from esp_envs.epuck.view import Camera, SpacePainter
 
 WINDOW = (-1.0, 1.0, -1.0, 1.0)
 RED, BLUE, GREEN = "#d01010", "#1010d0", "#10a010"
@@ -35,7 +35,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def painter() -> Iterator[SpacePainter]:
     try:
-        opened = space_painter(480)
+        opened = gl.open_painter(480)
         painter = opened.__enter__()
     except gl.NoGraphicsError as error:
         pytest.skip(str(error))
@@ -161,7 +161,7 @@ def test_other_bodies_and_other_arenas_are_drawn_after_the_first(painter: SpaceP
 
 def test_two_painters_do_not_draw_into_each_other(painter: SpacePainter) -> None:
     before = painter.draw(scene(ROBOT))
-    with space_painter(64) as other:
+    with gl.open_painter(64) as other:
         small = other.draw(scene(replace(ROBOT, color=BLUE)))
         assert small.shape == (48, 64, 3)
         assert np.array_equal(painter.draw(scene(ROBOT)), before)
@@ -176,7 +176,7 @@ def test_what_cannot_be_drawn_is_told(painter: SpacePainter) -> None:
         painter.draw(scene(replace(ROBOT, model=None)))
     with pytest.raises(ValueError, match="use a real window"):
         painter.draw(scene(ROBOT, window=(0.0, 0.0, 0.0, 1.0)))
-    with pytest.raises(ValueError, match="use 16 or more"), space_painter(8):
+    with pytest.raises(ValueError, match="use 16 or more"), gl.open_painter(8):
         pass
     assert painter.draw(scene(ROBOT)).any(), "it draws on"
 
@@ -193,9 +193,8 @@ ctypes.CDLL.__init__ = init
 _DRAW = """
 from esp_envs import Body, Scene
 from esp_envs.epuck import gl
-from esp_envs.epuck.painter import open_painter
 try:
-    with open_painter(64) as painter:
+    with gl.open_painter(64) as painter:
         picture = painter.draw(Scene((Body((0, 0), 0.5, "#ff0000", model="robot"),), (-1, 1, -1, 1)))
         print("drawn", picture[20, 32, 0] > 150 > picture[20, 32, 1], painter.note)
 except gl.NoGraphicsError as error:
@@ -264,16 +263,16 @@ def test_a_variable_is_forgotten_only_where_its_library_is_missing(monkeypatch: 
 def test_the_library_that_the_user_names_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:
     tried = []
 
-    def refuse(backend: str, width: int, height: int) -> None:
+    def refuse(backend: str) -> None:
         tried.append(backend)
         raise RuntimeError(f"{backend} is\nbroken")
 
     monkeypatch.setattr(gl, "is_installed", lambda backend: True)
-    monkeypatch.setattr(gl, "_open", refuse)
+    monkeypatch.setattr(gl, "_draw_with", refuse)
     for value, order in (("", ["osmesa", "egl"]), ("egl", ["egl", "osmesa"]), ("glfw", ["osmesa", "egl"])):
         tried.clear()
         monkeypatch.setenv("MUJOCO_GL", value)
-        with pytest.raises(gl.NoGraphicsError) as refused, gl.context(32, 32):
+        with pytest.raises(gl.NoGraphicsError) as refused, gl.open_painter(32):
             pass
         assert tried == order
     assert str(refused.value).endswith("(OSMesa: osmesa is broken; EGL: egl is broken)"), "installing would not help"

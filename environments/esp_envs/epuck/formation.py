@@ -15,8 +15,8 @@ from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.epuck import steering
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
+from esp_envs.epuck.gl import open_painter
 from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
-from esp_envs.epuck.painter import open_painter
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within

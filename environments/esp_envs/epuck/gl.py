@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
 
 from esp_envs.errors import UserError
+from esp_envs.scene import Painter
 
 _LIBRARIES = {
     "osmesa": ("OSMesa", ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")),
@@ -50,22 +49,28 @@ def forget_missing_backend() -> None:
         del os.environ[_VARIABLE]
 
 
-@dataclass(frozen=True)
-class Context:
-    """An open OpenGL context.
-
-    Attributes:
-        make_current: directs all that MuJoCo draws in this thread to this context.
-        note: a sentence for the user where a better library is missing, else None.
-    """
-
-    make_current: Callable[[], None]
-    note: str | None
-
-
 @contextmanager
-def context(width: int, height: int) -> Iterator[Context]:
-    """Open a context for pictures of this size (pixels), the current one until another is, and close it at the end.
+def open_painter(size: int) -> Iterator[Painter]:
+    """Open a painter of scenes in space, `size` pixels wide; MuJoCo is imported when it is opened.
+
+    Raises:
+        NoGraphicsError: MuJoCo is not installed, or no library here can draw.
+        UserError: the size is below 16 pixels.
+    """
+    forget_missing_backend()
+    try:
+        from esp_envs.epuck.view import SpacePainter  # noqa: PLC0415
+    except ImportError as error:
+        raise NoGraphicsError(f"a view in space needs the package {error.name}; pip install {error.name}") from None
+    painter = SpacePainter(size, _first_that_draws())
+    try:
+        yield painter
+    finally:
+        painter.close()
+
+
+def _first_that_draws() -> str | None:
+    """Let `mujoco.Renderer` draw with the first library that can; return a note where a better one cannot.
 
     Raises:
         NoGraphicsError: nothing here can draw.
@@ -78,33 +83,23 @@ def context(width: int, height: int) -> Iterator[Context]:
             reasons[label] = _MISSING
             continue
         try:
-            opened = _open(backend, width, height)
+            _draw_with(backend)
         except Exception as error:  # drivers fail in ways of their own
             reasons[label] = " ".join(f"{error}".split()) or type(error).__name__
             continue
-        note = f"{label} draws{_told(reasons)}" if reasons else None
-        try:
-            yield Context(opened.make_current, note)
-        finally:
-            opened.free()
-        return
+        return f"{label} draws{_told(reasons)}" if reasons else None
     raise NoGraphicsError(f"nothing here can draw a view in space{_told(reasons)}")
+
+
+def _draw_with(backend: str) -> None:
+    """Make a library MuJoCo's own, and prepare a first picture with it."""
+    mujoco = import_module("mujoco")
+    chosen = import_module(mujoco.Renderer.__module__).gl_context  # by default what MUJOCO_GL named at the import
+    chosen.GLContext = import_module(f"mujoco.{backend}").GLContext
+    mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
 
 
 def _told(reasons: dict[str, str]) -> str:
     """Return why libraries cannot draw, and what to do where that is known."""
     listed = "; ".join(f"{label}: {reason}" for label, reason in reasons.items())
     return f" ({listed})" + (f"; {_ADVICE}" if _MISSING in reasons.values() else "")
-
-
-def _open(backend: str, width: int, height: int) -> Any:
-    """Return a current context of this library, after MuJoCo has prepared a first picture in it."""
-    mujoco = import_module("mujoco")
-    made = import_module(f"mujoco.{backend}").GLContext(width, height)
-    try:
-        made.make_current()
-        mujoco.MjrContext(mujoco.MjSpec().compile(), mujoco.mjtFontScale.mjFONTSCALE_100.value).free()
-    except Exception:
-        made.free()
-        raise
-    return made

@@ -7,8 +7,7 @@ scene says. The camera looks along the y axis and down, so x points right as in 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from esp_envs.drawing import TRAIL_WIDTH, fade, trails
-from esp_envs.epuck import gl
 from esp_envs.epuck.looks import GLOW, TRAIL_LAYER_M, WALL_HEIGHT_M, WALL_WIDTH_M, model_of
 from esp_envs.errors import UserError
 from esp_envs.scene import Scene
@@ -91,44 +89,29 @@ class Camera:
         return x, y * down + z * along, y * along - z * down
 
 
-@contextmanager
-def space_painter(size: int) -> Iterator[SpacePainter]:
-    """Open a painter of scenes in space; what it holds is given back at the end of the block.
+class SpacePainter:
+    """Draws scenes whose bodies say what they are models of; `esp_envs.epuck.gl.open_painter` makes one.
 
     Args:
         size: width of a picture, pixels; the height is three quarters of it.
+        note: a sentence for the user about how pictures are drawn, or None.
+
+    Attributes:
+        camera: where the last picture was taken from.
 
     Raises:
         UserError: the size is below 16 pixels.
-        NoGraphicsError: no library on this machine can draw.
-    """
-    if size < 16:
-        raise UserError(f"cannot draw on {size} pixels; use 16 or more")
-    height = round(size * _ASPECT)
-    with gl.context(size, height) as context:
-        painter = SpacePainter(size, height, context)
-        try:
-            yield painter
-        finally:
-            painter.close()
-
-
-class SpacePainter:
-    """Draws scenes whose bodies say what they are models of; made by `space_painter`.
-
-    Attributes:
-        note: a sentence for the user about how pictures are drawn, or None.
-        camera: where the last picture was taken from.
     """
 
     camera: Camera
 
-    def __init__(self, width: int, height: int, context: gl.Context) -> None:
-        self.note = context.note
-        self._size = width, height
-        self._make_current = context.make_current
+    def __init__(self, size: int, note: str | None) -> None:
+        if size < 16:
+            raise UserError(f"cannot draw on {size} pixels; use 16 or more")
+        self.note = note
+        self._size = size, round(size * _ASPECT)
         self._looks: object = None
-        self._renderer: mujoco.MjrContext | None = None
+        self._renderer: mujoco.Renderer | None = None
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
         """Draw one scene.
@@ -143,49 +126,37 @@ class SpacePainter:
         Raises:
             UserError: the window is empty, or a body has an unknown model or none.
         """
-        self._make_current()
         looks = scene.window, [(body.model, body.radius, body.color) for body in scene.bodies]
-        if looks != self._looks:
-            self._build(scene)
-            self._looks = looks
+        if self._renderer is None or looks != self._looks:
+            self._renderer, self._looks = self._build(scene), looks
         for k, body in enumerate(scene.bodies):
             half = (body.heading or 0.0) / 2
             self._data.mocap_pos[k, :2] = body.position
             self._data.mocap_quat[k] = math.cos(half), 0, 0, math.sin(half)
         mujoco.mj_forward(self._model, self._data)
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, self._data, self._option, None, self._eye, everything, self._geoms)
-        self._add_trails(scene, trail)
-        width, height = self._size
-        picture = np.empty((height, width, 3), dtype=np.uint8)
-        rectangle = mujoco.MjrRect(0, 0, width, height)
-        mujoco.mjr_render(rectangle, self._geoms, self._renderer)
-        mujoco.mjr_readPixels(picture, None, rectangle, self._renderer)
-        return picture[::-1].copy()  # OpenGL counts rows from below
+        self._renderer.update_scene(self._data, self._eye)
+        self._add_trails(self._renderer.scene, scene, trail)
+        picture: NDArray[np.uint8] = self._renderer.render()
+        return picture
 
     def close(self) -> None:
         """Free what the renderer holds."""
         if self._renderer is not None:
-            self._make_current()
-            self._renderer.free()
+            self._renderer.close()
             self._renderer = None
 
-    def _build(self, scene: Scene) -> None:
+    def _build(self, scene: Scene) -> mujoco.Renderer:
         """Make the model, camera and renderer for scenes that look like this one."""
         model = model_of(scene, *self._size, _FIELD_OF_VIEW)  # first, so that what cannot be drawn changes nothing
         self.close()
-        self._model = model
-        self._data = mujoco.MjData(self._model)
-        self._geoms = mujoco.MjvScene(self._model, _MAX_GEOMS)
-        self._option = mujoco.MjvOption()
+        self._model, self._data = model, mujoco.MjData(model)
         self.camera = Camera.facing(scene.window, *self._size)
         self._eye = mujoco.MjvCamera()
         self._eye.azimuth, self._eye.elevation = 90, -math.degrees(_ELEVATION)
         self._eye.lookat[:], self._eye.distance = self.camera.target, self.camera.distance
-        self._renderer = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._renderer)
+        return mujoco.Renderer(model, self._size[1], self._size[0], _MAX_GEOMS)
 
-    def _add_trails(self, scene: Scene, trail: Sequence[Scene]) -> None:
+    def _add_trails(self, geoms: mujoco.MjvScene, scene: Scene, trail: Sequence[Scene]) -> None:
         """Lay the ways that bodies have come on the floor, fading towards their beginnings."""
         for body, path in trails(scene, trail):
             points = np.array(_thinned(path, body.radius * _TRAIL_STEP))
@@ -201,21 +172,22 @@ class SpacePainter:
                 # Two triangles take a tenth of the time of a box. They are longer than the way by a width, so that
                 # no gap shows where it bends.
                 reach = np.array([length + 2 * half, 2 * half, 0.0])
-                self._add_triangle(start - half * (along + left), along, left, reach, color)
-                self._add_triangle(end + half * (along + left), -along, -left, reach, color)
+                _add_triangle(geoms, start - half * (along + left), along, left, reach, color)
+                _add_triangle(geoms, end + half * (along + left), -along, -left, reach, color)
 
-    def _add_triangle(
-        self, corner: _Array, along: _Array, left: _Array, reach: _Array, color: NDArray[np.float32]
-    ) -> None:
-        """Lay a right-angled triangle on the floor, if there is room for one more shape."""
-        if self._geoms.ngeom == self._geoms.maxgeom:
-            return
-        geom = self._geoms.geoms[self._geoms.ngeom]
-        turn = np.array([along[0], left[0], 0.0, along[1], left[1], 0.0, 0.0, 0.0, 1.0])
-        place = np.array([*corner, TRAIL_LAYER_M])
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_TRIANGLE, reach, place, turn, color)
-        geom.emission, geom.specular = GLOW, 0.0
-        self._geoms.ngeom += 1
+
+def _add_triangle(
+    geoms: mujoco.MjvScene, corner: _Array, along: _Array, left: _Array, reach: _Array, color: NDArray[np.float32]
+) -> None:
+    """Lay a right-angled triangle on the floor, if there is room for one more shape."""
+    if geoms.ngeom == geoms.maxgeom:
+        return
+    geom = geoms.geoms[geoms.ngeom]
+    turn = np.array([along[0], left[0], 0.0, along[1], left[1], 0.0, 0.0, 0.0, 1.0])
+    place = np.array([*corner, TRAIL_LAYER_M])
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_TRIANGLE, reach, place, turn, color)
+    geom.emission, geom.specular = GLOW, 0.0
+    geoms.ngeom += 1
 
 
 def _thinned(path: Sequence[tuple[float, float]], step: float) -> list[tuple[float, float]]:
