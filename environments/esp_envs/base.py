@@ -85,25 +85,16 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
     return (allowed.cumsum(-1) <= place.unsqueeze(-1)).sum(-1)
 
 
-def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
-    """Refuse a tensor of another shape.
+def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...], dtype: torch.dtype | None = None) -> None:
+    """Refuse a tensor of another shape, or of another type where one is given.
 
     Raises:
-        UserError: names both shapes.
+        UserError: names both.
     """
     if tuple(tensor.shape) != expected:
         raise UserError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
-
-
-def require_flags(what: str, tensor: Tensor, expected: tuple[int, ...]) -> None:
-    """Refuse a tensor of another shape, or of other numbers than flags.
-
-    Raises:
-        UserError: says which.
-    """
-    require_shape(what, tensor, expected)
-    if tensor.dtype != torch.bool:
-        raise UserError(f"the {what} is {tensor.dtype}, expected torch.bool")
+    if dtype is not None and tensor.dtype != dtype:
+        raise UserError(f"the {what} is {tensor.dtype}, expected {dtype}")
 
 
 OTHER_SIZE = "the saved environment has other seeds, worlds or bodies than this one; use its settings"

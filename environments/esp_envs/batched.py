@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import OTHER_SIZE, Environment, Observation, Step, require_flags, require_shape
+from esp_envs.base import OTHER_SIZE, Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import Discrete, TaskSpec
@@ -104,7 +104,7 @@ class BatchedTask(Environment):
 
     def reset(self) -> Observation:
         """Start a new episode in every world."""
-        self._restart_clock()
+        self._time, self._episode_time = 0, torch.zeros_like(self._episode_time)
         self._begin_with(self._episodes())
         return self._seen()
 
@@ -116,20 +116,18 @@ class BatchedTask(Environment):
         """
         require_shape("joint action", action, self.action_shape)
         reward, metrics = self._play(action)
-        following, final, horizon = self._seen(), None, self.spec.horizon
+        reached, horizon = self._seen(), self.spec.horizon
         terminated = self._switched("_ended", "terminates", self._worlds_shape)
         self._unproven = max(self._unproven - 1, 0)
         if terminated is not None:
             self._episode_time += 1
             truncated = (self._episode_time == horizon) & ~terminated
-            final = following
             self._renew(terminated | truncated)
             self._time = (self._time + 1) % horizon
-            return Step(self._seen(), reward, terminated, truncated, final, metrics)
+            return Step(self._seen(), reward, terminated, truncated, reached, metrics)
         self._time += 1
         ended = self._time == horizon
-        if ended:
-            final, following = following, self.reset()
+        following, final = (self.reset(), reached) if ended else (reached, None)
         terminated = torch.zeros(self._worlds_shape, dtype=torch.bool, device=self.device)
         truncated = torch.full(self._worlds_shape, ended, dtype=torch.bool, device=self.device)
         return Step(following, reward, terminated, truncated, final, metrics)
@@ -141,7 +139,7 @@ class BatchedTask(Environment):
             UserError: the state has another shape than [S, E, state width].
         """
         require_shape("state", state, self.state_shape)
-        self._restart_clock()
+        self._time, self._episode_time = 0, torch.zeros_like(self._episode_time)
         self._put(state)
         return self._seen()
 
@@ -202,11 +200,6 @@ class BatchedTask(Environment):
             self.world[name] = torch.where(over, value, self.world[name])
         self._episode_time = self._episode_time.masked_fill(ended, 0)
 
-    def _restart_clock(self) -> None:
-        self._time = 0
-        if self.spec.terminates:
-            self._episode_time = torch.zeros_like(self._episode_time)
-
     def _play(self, action: Tensor) -> Outcome:
         """Advance every world; return reward [S, E, N] and metrics, as float32 memory of their own."""
         outcome: object = self._advance(self.world, self.spec.action.admissible(action))
@@ -228,7 +221,7 @@ class BatchedTask(Environment):
                 "one reward [S, E], or set shared_reward=False in the spec"
             )
         for name, value in metrics.items():
-            if value.shape != self._worlds_shape:
+            if value.shape != self._worlds_shape:  # first, since the sentence takes time
                 require_shape(f"metric {name} that '_advance' of {self.spec.name} gives", value, self._worlds_shape)
         is_new = self.makes_new_tensors
         return _owned(reward, is_new), {name: _owned(value, is_new) for name, value in metrics.items()}
@@ -254,7 +247,7 @@ class BatchedTask(Environment):
             raise UserError(f"{self.spec.name}: implement '{method}' and set '{switch}' in the spec, or do neither")
         if flags is None:
             return None
-        require_flags(f"tensor of '{method}'", flags, shape)
+        require_shape(f"tensor of '{method}'", flags, shape, torch.bool)
         return flags.contiguous().clone()
 
     def _named(self, method: str, named: object) -> Mapping[str, Tensor]:

@@ -28,6 +28,8 @@ from esp_envs.errors import UserError
 _RESET, _STEP, _LEAVE = b"reset", b"step", b"leave"
 TERMINATED, TRUNCATED = 1, 2
 """What `Board.ended` says of a copy whose episode ended in this step."""
+NOW, FINAL = 0, 1
+"""Where a board holds what is seen now, and what was seen before an automatic reset."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,12 @@ class Board:
         seed: [C] int64, of the next start.
         action: [C, N] int64 or [C, N, width] float32.
         reward: [C, N] float32.
-        obs, final_obs: [C, N, D] float32, before and after the automatic reset the same unless the episode ended.
-        state, final_state: [C, state width] float32.
         metrics: [C, M] float32.
-        mask, final_mask: [C, N, A] uint8, the allowed actions; A = 0 without masks.
-        alive, final_alive: [C, N] uint8, the agents that have not ended.
+        obs: [2, C, N, D] float32; of these four arrays `NOW` is what is seen now, and `FINAL` what was seen before the
+            automatic reset; the two are the same unless the episode ended.
+        state: [2, C, state width] float32.
+        mask: [2, C, N, A] uint8, the allowed actions; A = 0 without masks.
+        alive: [2, C, N] uint8, the agents that have not ended.
     """
 
     cut: NDArray[np.uint8]
@@ -66,40 +69,31 @@ class Board:
     seed: NDArray[np.int64]
     action: NDArray[Any]
     reward: NDArray[np.float32]
-    obs: NDArray[np.float32]
-    final_obs: NDArray[np.float32]
-    state: NDArray[np.float32]
-    final_state: NDArray[np.float32]
     metrics: NDArray[np.float32]
+    obs: NDArray[np.float32]
+    state: NDArray[np.float32]
     mask: NDArray[np.uint8]
-    final_mask: NDArray[np.uint8]
     alive: NDArray[np.uint8]
-    final_alive: NDArray[np.uint8]
 
     def __init__(self, sizes: Sizes) -> None:
         copies, agents = sizes.copies, sizes.agents
         action = ((copies, agents), np.int64) if sizes.action is None else ((copies, agents, sizes.action), np.float32)
+        # the widest numbers first, so that each array begins at a multiple of its number's width
         parts: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
             "seed": ((copies,), np.int64),
             "action": action,
             "reward": ((copies, agents), np.float32),
-            "obs": ((copies, agents, sizes.obs), np.float32),
-            "final_obs": ((copies, agents, sizes.obs), np.float32),
-            "state": ((copies, sizes.state), np.float32),
-            "final_state": ((copies, sizes.state), np.float32),
             "metrics": ((copies, sizes.metrics), np.float32),
+            "obs": ((2, copies, agents, sizes.obs), np.float32),
+            "state": ((2, copies, sizes.state), np.float32),
+            "mask": ((2, copies, agents, sizes.choices), np.uint8),
+            "alive": ((2, copies, agents), np.uint8),
             "cut": ((copies,), np.uint8),
             "ended": ((copies,), np.uint8),
-            **dict.fromkeys(("mask", "final_mask"), ((copies, agents, sizes.choices), np.uint8)),
-            **dict.fromkeys(("alive", "final_alive"), ((copies, agents), np.uint8)),
         }
-        # the widest numbers first, so that each array begins at a multiple of its number's width
-        order = sorted(parts, key=lambda name: -np.dtype(parts[name][1]).itemsize)
-        total = sum(int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in parts.values())
-        memory = mmap.mmap(-1, total)
+        memory = mmap.mmap(-1, sum(int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in parts.values()))
         start = 0
-        for name in order:
-            shape, kind = parts[name]
+        for name, (shape, kind) in parts.items():
             array = np.frombuffer(memory, kind, int(np.prod(shape)), start).reshape(shape)
             setattr(self, name, array)
             start += array.nbytes

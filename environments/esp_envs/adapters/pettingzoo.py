@@ -14,7 +14,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of
-from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
+from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.installed import available_cores
@@ -116,7 +116,7 @@ class ParallelTask(CopyHooks, Environment):
             reward=self._per_world(board.reward),
             terminated=(ended == TERMINATED).to(self.device),
             truncated=(ended == TRUNCATED).to(self.device),
-            final=self._seen("final_") if self.terminates or which.any() else None,
+            final=self._seen(FINAL) if self.terminates or which.any() else None,
             metrics={name: self._per_world(board.metrics[:, m]) for m, name in enumerate(self.metrics)},
         )
 
@@ -153,14 +153,11 @@ class ParallelTask(CopyHooks, Environment):
 
     def action_mask(self) -> Tensor | None:
         """Return which actions each agent may take now; None without `masks`."""
-        return self._per_world(self._started().board.mask).bool() if self.masks else None
+        return self._per_world(self._started().board.mask[NOW]).bool() if self.masks else None
 
-    def _seen(self, which: str = "") -> Observation:
-        """Return what is seen now, or with "final_" what was seen before any reset."""
+    def _seen(self, when: int = NOW) -> Observation:
         board = self._started().board
-        obs, state, mask, alive = (
-            self._per_world(getattr(board, which + name)) for name in ("obs", "state", "mask", "alive")
-        )
+        obs, state, mask, alive = (self._per_world(x[when]) for x in (board.obs, board.state, board.mask, board.alive))
         return Observation(obs, state, mask.bool() if self.masks else None, alive.bool() if self.agents_end else None)
 
     def _per_world(self, values: Array) -> Tensor:

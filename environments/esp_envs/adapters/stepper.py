@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_envs.adapters.copies import TERMINATED, TRUNCATED, Board
+from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Layout
 
@@ -172,8 +172,7 @@ class CopyStepper:
         with self._naming(k, "reset"):
             self._seen[k], self._infos[k] = self._copies[k].env.reset(seed=seed)
         self._gone[k] = set()
-        board = self.board
-        self._write(k, board.obs, board.state, board.mask, board.alive)
+        self._write(k, NOW)
 
     def _step(self, k: int, copy: Copy) -> None:
         task, board, seen = self._task, self.board, self._seen[k]
@@ -200,12 +199,12 @@ class CopyStepper:
         board.ended[k] = self._how(k, len(over) == len(acting), terminates(ended.values()))
         gone.update(name for name in over if ended[name] or not board.cut[k])
         gone.update(name for name in others if terminated.get(name, False) or truncated.get(name, False))
-        self._write(k, board.final_obs, board.final_state, board.final_mask, board.final_alive)
+        self._write(k, FINAL)
         if board.ended[k]:
             self._start(k)
         else:
-            board.obs[k], board.state[k] = board.final_obs[k], board.final_state[k]
-            board.mask[k], board.alive[k] = board.final_mask[k], board.final_alive[k]
+            for seen_by in (board.obs, board.state, board.mask, board.alive):
+                seen_by[NOW, k] = seen_by[FINAL, k]
 
     def _how(self, k: int, over: bool, terminated: bool) -> int:
         """Return how the episode of a copy ended, 0 where it goes on; the horizon counts as a cut in any case."""
@@ -217,18 +216,20 @@ class CopyStepper:
             raise UserError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
         return TRUNCATED if self.board.cut[k] else 0
 
-    def _write(self, k: int, obs: Array, state: Array, mask: Array, alive: Array) -> None:
+    def _write(self, k: int, when: int) -> None:
         """Write what the agents of a copy see; zeros, and everything allowed, for one that is there no more."""
-        copy, seen, infos, gone = self._copies[k], self._seen[k], self._infos[k], self._gone[k]
-        alive[k] = [name not in gone for name in copy.learners]
+        copy, seen, infos, gone, board = self._copies[k], self._seen[k], self._infos[k], self._gone[k], self.board
+        alive = board.alive[when, k] = [name not in gone for name in copy.learners]
         with self._naming(k, "reading"):
             for i, name in enumerate(copy.learners):
-                obs[k, i] = self._task.reading(name, seen[name]).reshape(-1) if name in seen else 0
+                board.obs[when, k, i] = self._task.reading(name, seen[name]).reshape(-1) if name in seen else 0
         if self._task.masks:
             with self._naming(k, "allowed"):
                 for i, name in enumerate(copy.learners):
-                    mask[k, i] = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[k, i] else 1
-        state[k] = obs[k].reshape(-1) if self._task.state is None else np.asarray(copy.env.state()).reshape(-1)
+                    allowed = self._task.allowed(name, seen[name], infos.get(name, {})) if alive[i] else 1
+                    board.mask[when, k, i] = allowed
+        joint = self._task.state is None
+        board.state[when, k] = board.obs[when, k].reshape(-1) if joint else np.asarray(copy.env.state()).reshape(-1)
 
     @contextmanager
     def _naming(self, k: int, what: str) -> Iterator[None]:

@@ -24,6 +24,8 @@ mujoco.set_mju_user_warning(lambda _: None)  # by default warnings go to a file 
 class MujocoWorlds(Physics):
     """W worlds of a MuJoCo model in one `mujoco.batch.Batch`, stepped by its threads."""
 
+    remembered = ("qpos", "qvel", "pillars", "warmstart", "mass", "friction")
+
     def __init__(
         self, model: mujoco.MjModel, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int
     ) -> None:
@@ -69,14 +71,9 @@ class MujocoWorlds(Physics):
     def _adapt_wheels(self, mass: Array, friction: Array) -> None:
         """Fit the wheels to mass and friction [W, N], which are multiples of a robot's own."""
 
-    def state_dict(self) -> dict[str, Array]:
-        """Return everything a world's future depends on."""
-        names = ("qpos", "qvel", "pillars", "warmstart", "mass", "friction")
-        return {name: getattr(self, f"_{name}").copy() for name in names}
-
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
-        """Restore what `state_dict` returned."""
-        for name in ("qpos", "qvel", "pillars", "warmstart"):
+        """Write the arrays into the batch."""
+        for name in self.remembered[:4]:
             getattr(self, f"_{name}")[:] = arrays[name]
         self._make_of(arrays["mass"], arrays["friction"])
 

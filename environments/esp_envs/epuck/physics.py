@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -40,6 +41,9 @@ class Physics(ABC):
         num_threads: threads to step with, where the engine can.
     """
 
+    remembered: ClassVar[tuple[str, ...]]
+    """Names of the arrays that a world's future depends on; the attributes have an underscore before them."""
+
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
         self.arena, self.num_worlds, self.control_period_s = arena, num_worlds, control_period_s
 
@@ -65,9 +69,9 @@ class Physics(ABC):
     def velocity(self) -> Array:
         """[W, N, 3] of x, y and heading, as memory of its own."""
 
-    @abstractmethod
     def state_dict(self) -> dict[str, Array]:
         """Return copies of all that `load_state_dict` needs to go on bit for bit."""
+        return {name: getattr(self, f"_{name}").copy() for name in self.remembered}
 
     @abstractmethod
     def load_state_dict(self, arrays: dict[str, Array]) -> None:

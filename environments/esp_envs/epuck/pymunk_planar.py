@@ -41,6 +41,8 @@ _NUM_FIELDS = 9
 class PymunkPlanar(Physics):
     """Pymunk, one space a world, on one thread: Python's lock is taken and given back at every short step."""
 
+    remembered = ("pose", "velocity", "pillars", "mass", "friction")
+
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
         super().__init__(arena, num_worlds, control_period_s, num_threads)
         self._substeps = num_substeps(control_period_s, TIMESTEP_S)
@@ -126,13 +128,8 @@ class PymunkPlanar(Physics):
         """[W, N, 3] of x, y and heading."""
         return self._velocity.copy()
 
-    def state_dict(self) -> dict[str, Array]:
-        """Return everything a world's future depends on."""
-        names = ("pose", "velocity", "pillars", "mass", "friction")
-        return {name: getattr(self, f"_{name}").copy() for name in names}
-
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
-        """Restore what `state_dict` returned."""
+        """Place the bodies."""
         self.place(Bodies(**arrays))
 
 
