@@ -14,7 +14,6 @@ from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
 from esp_cli.training.build import build_environment
-from esp_cli.training.config import RunConfig
 from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
 from esp_cli.training.streams import generators
 from esp_envs.errors import UserError
@@ -96,7 +95,8 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     for played in (greedy, stochastic):
         for numbers in (played.returns, *played.metrics.values()):
             numbers[list(trained.stopped)] = float("nan")
-    names = build_environment(trained.config, 1, _STREAM, "shape").heuristics
+    one_world = build_environment(trained.config, 1, _STREAM, "shape")
+    names = one_world.heuristics
     anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
@@ -122,13 +122,13 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         metrics_per_seed={name: summarise_returns(value).per_seed for name, value in greedy.metrics.items()},
         anchor_metrics={name: _means(played) for name, played in anchors.items()},
         parameters={"policy": sum(p.numel() for p in trained.policy.parameters()) // len(seeds)},
-        flops_per_action=flops_per_action(trained.policy, trained.config),
+        flops_per_action=flops_per_action(trained.policy, one_world.reset().obs),
         over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
     )
 
 
 @torch.no_grad()
-def flops_per_action(policy: Policy, config: RunConfig) -> float:
+def flops_per_action(policy: Policy, obs: Tensor) -> float:
     """Count the floating-point operations of matrix products by which a policy chooses one agent's action.
 
     What is done once for any number of observations, such as putting constrained weights together, does not count; nor
@@ -136,18 +136,16 @@ def flops_per_action(policy: Policy, config: RunConfig) -> float:
 
     Args:
         policy: S policies.
-        config: of their run.
+        obs: of one world [S, 1, N, D].
     """
-    worlds = 16  # many pictures, so that no odd number is rounded up
-    counts = []
+    worlds, counts = 16, []  # many pictures, so that no odd number is rounded up
     for number in (worlds, 2 * worlds):
-        shown = build_environment(config, number, "shape").reset().obs
-        drawn = torch.randn(shown.shape, generator=torch.Generator().manual_seed(0))
-        obs = drawn.to(shown.device, shown.dtype)
+        noise = 1e-3 * torch.rand(len(obs), number, *obs.shape[2:], generator=torch.Generator().manual_seed(0))
+        shown = obs + noise.to(obs)  # unlike pictures, and entries that are whole numbers stay above them
         with FlopCounterMode(display=False) as counter:
-            policy.act(obs, policy.initial_memory(number, obs))
+            policy.act(shown, policy.initial_memory(number, shown))
         counts.append(counter.get_total_flops())
-    return (counts[1] - counts[0]) / (worlds * policy.num_agents * len(config.seeds))
+    return (counts[1] - counts[0]) / (worlds * policy.num_agents * len(obs))
 
 
 def summarise_returns(returns: Tensor) -> SeedSummary:

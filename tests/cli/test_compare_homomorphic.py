@@ -11,7 +11,7 @@ from esp_cli.policies.evaluation import flops_per_action
 from esp_cli.studies.catalogue import Request, plan
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import reported
-from esp_cli.training.build import build_learner
+from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import resolve_config
 from tests.cli.running import esp, refused
 
@@ -104,7 +104,8 @@ def test_methods_differ_in_network_and_prior_alone() -> None:
 def test_flops_by_hand(seeds: tuple[int, ...]) -> None:
     def flops(task: str, overrides: dict[str, object]) -> float:
         config = resolve_config(task, seeds=seeds, overrides=overrides)
-        return flops_per_action(build_learner(config).policy, config)
+        obs = build_environment(config, 1, "shape").reset().obs
+        return flops_per_action(build_learner(config).policy, obs)
 
     assert flops("navigation", {"network.hidden": [10]}) == 2 * (14 * 10 + 10 * 5)
     # each of four images is made by a product of 14 x 14 and brought home by one of 5 x 5
