@@ -10,7 +10,7 @@ from torch import Tensor
 from esp_cli.networks.contract import Network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.symmetry.maps import map_of
-from esp_cli.symmetry.representation import rows_operator
+from esp_cli.symmetry.operators import layout_operator
 
 
 class Symmetrised(Network):
@@ -33,7 +33,7 @@ class Symmetrised(Network):
         self.group = io.group(group)
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
-        self.image = map_of(rows_operator(io.layout, self.group.elements, io.spaces.num_agents))
+        self.image = map_of(layout_operator(io.layout, self.group.elements))
         back = [
             torch.block_diag(
                 *(

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from esp_cli.symmetry.elements import AGENTS, Element, item_places
+from esp_cli.symmetry.elements import AGENTS, Element
 from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
+from esp_cli.symmetry.operators import item_places, layout_operator
 from esp_cli.symmetry.parse import Factors, declared_factors, is_item_name, parse_elements
-from esp_cli.symmetry.representation import action_map, field_names, joint_sources, layout_operator, state_sources
+from esp_cli.symmetry.representation import action_map, field_names, joint_sources, state_sources
 from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Discrete, Items, Spaces
 
@@ -203,7 +204,7 @@ def _layout_reason(scenes: Sequence[Element], elements: Sequence[Element], space
     try:
         for layout in layouts:
             for field in layout.fields:
-                item_places(elements, field)
+                item_places(field, elements)
             layout_operator(layout, scenes)
     except UserError as error:
         return str(error)

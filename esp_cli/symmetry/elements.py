@@ -5,7 +5,6 @@ A new kind of geometry is one file beside this one: see `plane`. Orders of agent
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
-from esp_envs.spec import Field, Items
+from esp_envs.spec import Field
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -178,33 +177,6 @@ class Element:
 def aspects_of(elements: Iterable[Element]) -> frozenset[Any]:
     """Return all that some elements act on, see `Element.aspects`."""
     return frozenset[Any]().union(*(element.aspects for element in elements))
-
-
-def places_of(elements: Sequence[Element], num_agents: int) -> Indices | None:
-    """Return [G, N] the place that each agent moves to under each element, or None where all stay."""
-    if all(element.permutation is None for element in elements):
-        return None
-    stay = tuple(range(num_agents))
-    return np.array([element.permutation or stay for element in elements], dtype=np.int64)
-
-
-def item_places(elements: Sequence[Element], field: Field) -> Indices | None:
-    """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
-
-    Raises:
-        UserError: the field has another number of items, is a picture, or its items follow the agents.
-    """
-    name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
-    orders = [dict(element.items).get(name) for element in elements]
-    moved = [order for order in orders if order is not None]
-    if not moved:
-        return None
-    if field.items is not Items.FIXED or field.pixels is not None:
-        raise UserError(f"the items of field '{name}' cannot be exchanged: they are the agents', or pictures")
-    if any(len(order) != field.count for order in moved):
-        raise UserError(f"field '{name}' has {field.count} items, not {len(moved[0])}")
-    stay = tuple(range(field.count))
-    return np.array([order or stay for order in orders], dtype=np.int64)
 
 
 def order_name(name: str, order: Sequence[int]) -> str:

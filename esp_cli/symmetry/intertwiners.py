@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Floats, item_places
+from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.groups import FiniteGroup
-from esp_cli.symmetry.representation import action_map, field_operator, item_operator
+from esp_cli.symmetry.operators import field_operator, item_operator, item_places
+from esp_cli.symmetry.representation import action_map
 from esp_envs.spec import ActionSpace, Discrete, Field, Kind, Layout
 
 _INDEPENDENT = 1e-6
@@ -59,7 +60,7 @@ def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
 
 
 def _field_block(field: Field, group: FiniteGroup) -> Block:
-    if item_places(group.elements, field) is None:
+    if item_places(field, group.elements) is None:
         return Block(item_operator(field, group.elements).matrix, field.count)
     return Block(field_operator(field, group.elements).matrix, 1)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry.representation import Operator
+from esp_cli.symmetry.operators import Operator
 from esp_envs.errors import UserError
 
 _GATHERED_WIDTH = 128

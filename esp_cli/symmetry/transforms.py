@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry.elements import Element, places_of
+from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.maps import Gather, Map, gather_of, map_of
+from esp_cli.symmetry.operators import Operator
 from esp_cli.symmetry.representation import (
-    Operator,
     action_map,
+    agent_places,
     field_names,
     output_operator,
     rows_operator,
@@ -181,18 +182,18 @@ def build_transform(
     """
     if not elements:
         raise UserError("a transform needs one element per seed, got none")
-    chosen = tuple(elements)
-    if missing := [name for element in chosen for name, _ in element.items if name not in field_names(spaces)]:
+    if missing := [name for e in elements for name, _ in e.items if name not in field_names(spaces)]:
         names = ", ".join(field_names(spaces))
         raise UserError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {names}")
-    places, outputs, image = places_of(chosen, spaces.num_agents), output_operator(spaces, chosen), None
-    if isinstance(spaces.action, Discrete):
-        image = torch.as_tensor(action_map(spaces.action, chosen), device=device)
+    places = agent_places(elements, spaces.num_agents)
+    image = action_map(spaces.action, elements) if isinstance(spaces.action, Discrete) else None
+    state, outputs = state_operator(spaces, elements), output_operator(spaces, elements)
+    seen = rows_operator(spaces.observation, elements, spaces.num_agents)
     return Transform(
-        elements=chosen,
+        elements=tuple(elements),
         agents=None if places is None else gather_of(Operator.reordering(places.argsort(1)), device),
-        obs_map=map_of(rows_operator(spaces.observation, chosen, spaces.num_agents), device, dtype),
-        state_map=map_of(state_operator(spaces, chosen), device, dtype),
+        obs_map=map_of(seen, device, dtype),
+        state_map=map_of(state, device, dtype),
         output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
-        action_index=image,
+        action_index=None if image is None else torch.as_tensor(image, device=device),
     )
