@@ -139,10 +139,14 @@ def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> T
     It is sum((c + (m - K^-1 m')^2) / v - 1 + log v - log v') / 2 with c the diagonal of K^-1 diag(v') K, since the
     determinant of a turned covariance is that of diag(v').
     """
-    (mean, own), variance = _both(transform, there.loc, here.loc), transform.pull_back_variance(there.variance)
-    ratio = (variance + (own - mean).square()) / here.variance
-    volume = transform.values(there.variance.log().sum(-1))
-    return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
+    pulled = _both(transform, there.loc, here.loc)
+    variance, volume = transform.pull_back_variance(there.variance), transform.values(there.variance.log().sum(-1))
+
+    def divergence(mean: Tensor, own: Tensor) -> Tensor:
+        ratio = (variance + (own - mean).square()) / here.variance
+        return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
+
+    return policy_consistency_loss(divergence, *pulled)
 
 
 @torch.no_grad()

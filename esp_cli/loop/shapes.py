@@ -9,10 +9,43 @@ from torch import Tensor
 
 from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
-from esp_envs.spec import Discrete, Layout, Spaces
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces
 
 HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
 """What messages advise where numbers look like memory."""
+
+
+ANOTHER = "give another group, or fields that say what the numbers are"
+"""What messages advise where actions and layouts carry no group of the plane."""
+_ARGUMENTS = {
+    "observation": (Layout, "layout(Field(...), ...)"),
+    "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),
+    "group": (str, 'a text, as "d4"'),
+    "num_agents": (int, "a number of agents"),
+    "state": (Layout | None, "layout(Field(...), ...)"),
+    "seed": (int, "a number"),
+}
+"""What arguments of a symmetry are, and what a message says to give."""
+
+
+def check_arguments(
+    observation: Layout, action: ActionSpace, group: str, num_agents: int, state: Layout | None, copies: str, seed: int
+) -> None:
+    """Refuse arguments of a symmetry that are of another kind or out of range.
+
+    Raises:
+        UserError: one is.
+    """
+    given = (observation, action, group, num_agents, state, seed)
+    for value, (name, (kind, example)) in zip(given, _ARGUMENTS.items(), strict=True):
+        if not isinstance(value, kind):
+            raise UserError(f"{name} is {value!r}; give {example}")
+    if copies not in ("draw", "all"):
+        raise UserError(f"copies is {copies!r}; choose 'draw' or 'all'")
+    if num_agents < 1:
+        raise UserError(f"num_agents is {num_agents}; there is at least one agent")
+    if not -(2**63) <= seed < 2**64:
+        raise UserError(f"seed is {seed}; give a number from 0 to 2**64 - 1")
 
 
 def lead_of(spaces: Spaces, obs: Tensor) -> torch.Size:
@@ -89,12 +122,14 @@ def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Siz
     return carry(spaces, transform.per_agent, x, lead, name)
 
 
-def check_mask(spaces: Spaces, mask: Tensor, lead: torch.Size) -> None:
-    """Refuse what is no mask of discrete actions [..., N, A].
+def check_mask(spaces: Spaces, mask: Tensor | None, lead: torch.Size) -> None:
+    """Refuse what is no mask of discrete actions [..., N, A], if there is one.
 
     Raises:
         UserError: another shape or type, or continuous actions.
     """
+    if mask is None:
+        return
     if not isinstance(spaces.action, Discrete):
         raise UserError("an action mask is for discrete actions; leave it out")
     shape = [*lead, *_agents(spaces), spaces.action.count]
@@ -114,6 +149,23 @@ def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
                 f"{name} has shape {list(x.shape)} for the moved data, but {list(here.shape)} for the originals "
                 "(here); give both in one shape"
             )
+
+
+def mean_counted(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
+    """Return the mean over elements, rows and agents, of the rows that count; 0 where none does."""
+    gap = torch.stack(gaps)
+    counted = gap if mask is None else gap[:, _flags(mask, gap.shape[1:])]
+    return counted.mean() if counted.numel() else counted.sum()
+
+
+def _flags(mask: Tensor, shape: torch.Size) -> Tensor:
+    """Return which rows count, of a mask of flags, or of zeros and ones, that goes with the first axes of `shape`."""
+    if mask.shape != shape[: mask.dim()]:
+        raise UserError(f"mask has shape {list(mask.shape)}, but the rows have {list(shape)}; give a flag for each row")
+    flags = mask.bool()
+    if mask.dtype != torch.bool and not torch.equal(flags.to(mask.dtype), mask):
+        raise UserError("mask holds other numbers than 0 and 1; it says which rows count, and weighs none")
+    return flags
 
 
 def _check_rows(

@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from esp_cli.loop import shapes
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import act, carry, carry_along, check_alike, check_mask, check_state, lead_of
+from esp_cli.loop.shapes import act, carry, carry_along, check_alike, check_mask, check_state, lead_of, mean_counted
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
-from esp_cli.symmetry import Transform, TransformSet, transform_set
-from esp_cli.symmetry.admission import unrestricted
+from esp_cli.symmetry import Transform, TransformSet
+from esp_cli.symmetry.admission import admitted_elements, unrestricted
 from esp_envs.errors import UserError
-from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces, joint_layout
+from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
 
 if TYPE_CHECKING:
     from esp_cli.checking import ElementVerdict, Transitions
     from esp_envs.base import Environment
-
-
-_ARGUMENTS = {
-    "observation": (Layout, "layout(Field(...), ...)"),
-    "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),
-    "group": (str, 'a text, as "d4"'),
-    "num_agents": (int, "a number of agents"),
-    "state": (Layout | None, "layout(Field(...), ...)"),
-    "seed": (int, "a number"),
-}
-"""What arguments of a symmetry are, and what a message says to give."""
 
 
 class Symmetry:
@@ -52,7 +44,8 @@ class Symmetry:
         observation: layout of one agent's D numbers.
         action: of one agent.
         group: the transforms under which dynamics and reward stay the same, as `esp train --transforms` reads them:
-            "d4", "o2", "d4*agents", "rot90,flip-x". The caller vouches for it.
+            "d4", "o2", "d4*agents", "rot90,flip-x", "flip-x*hips-3-2-1-0", or elements of your own kind. The caller
+            vouches for it.
         num_agents: N; 1 also for rows of single agents.
         state: layout of the Ds numbers of the global state; by default all observations end to end.
         copies: "draw" draws one element for each call, "all" takes each element of a finite group.
@@ -79,20 +72,10 @@ class Symmetry:
         copies: Literal["draw", "all"] = "draw",
         seed: int = 0,
     ) -> None:
-        given = (observation, action, group, num_agents, state, seed)
-        for value, (name, (kind, example)) in zip(given, _ARGUMENTS.items(), strict=True):
-            if not isinstance(value, kind):
-                raise UserError(f"{name} is {value!r}; give {example}")
-        if copies not in ("draw", "all"):
-            raise UserError(f"copies is {copies!r}; choose 'draw' or 'all'")
-        if num_agents < 1:
-            raise UserError(f"num_agents is {num_agents}; there is at least one agent")
-        if not -(2**63) <= seed < 2**64:
-            raise UserError(f"seed is {seed}; give a number from 0 to 2**64 - 1")
-        joint = joint_layout(observation, num_agents)
-        self.spaces = unrestricted(
-            Spaces(num_agents=num_agents, observation=observation, state=state or joint, action=action, symmetry="c1")
-        )
+        shapes.check_arguments(observation, action, group, num_agents, state, copies, seed)
+        state = state or joint_layout(observation, num_agents)
+        spaces = Spaces(num_agents=num_agents, observation=observation, state=state, action=action, symmetry="c1")
+        self.spaces = unrestricted(spaces)
         self.group, self.copies = group, copies
         self.generator = torch.Generator().manual_seed(seed)
         self._sets: dict[tuple[torch.device, torch.dtype], TransformSet] = {}
@@ -164,13 +147,13 @@ class Symmetry:
         return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
 
     def augment_tensordict(self, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
-        """Return a TensorDict with its copies behind it, along the first axis of its batch.
+        """Return a TensorDict [B, ...] with its copies behind it, along the first axis.
 
         Keys are known by their last part: observation, state, action. Others hold numbers that go with their agents, or
         one for each row. What networks said (logits, loc, scale) and "info" are left out.
 
         Args:
-            data: TensorDict [B, ...], agents in nested groups or not, also below "next".
+            data: with agents in nested groups or not, also below "next".
             roles: of keys by their last part, where `esp_cli.loop.tensordicts.ROLES` says it otherwise.
 
         Raises:
@@ -188,6 +171,8 @@ class Symmetry:
     ) -> Tensor:
         """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), averaged over rows, agents and elements.
 
+        It is 0 if and only if the policy turns with the scene.
+
         Args:
             policy: obs [..., N, D] to a distribution of actions, or to a tensor, as `policy_divergence` knows them.
             obs: [..., N, D]; of a recurrent policy, whole histories.
@@ -196,25 +181,16 @@ class Symmetry:
             action_mask: flags [..., N, A], which discrete actions are allowed; then the policy is asked for
                 `policy(obs, action_mask)`, of moved data with the moved mask.
 
-        Returns:
-            A scalar, 0 if and only if the policy turns with the scene.
-
         Raises:
             UserError: a shape that does not fit, or a distribution that is not known.
         """
-        lead = lead_of(self.spaces, obs)
-        if action_mask is not None:
-            check_mask(self.spaces, action_mask, lead)
-
-        def asked(x: Tensor, allowed: Tensor | None) -> Policy:
-            return policy(x) if allowed is None else policy(x, allowed)
-
-        here = asked(obs, action_mask) if here is None else here
-        gaps = []
-        for g in self.transforms(obs):
-            allowed = None if action_mask is None else g.push_outputs(action_mask)
-            gaps.append(policy_divergence(g, asked(g.obs(obs), allowed), here))
-        return _mean(gaps, mask)
+        check_mask(self.spaces, action_mask, lead_of(self.spaces, obs))
+        masks = () if action_mask is None else (action_mask,)
+        here = policy(obs, *masks) if here is None else here
+        gaps = [
+            policy_divergence(g, policy(g.obs(obs), *map(g.push_outputs, masks)), here) for g in self.transforms(obs)
+        ]
+        return mean_counted(gaps, mask)
 
     def value_loss(
         self,
@@ -238,18 +214,16 @@ class Symmetry:
             UserError: a shape that does not fit.
         """
         if state is not None and obs is None:
-            lead = check_state(self.spaces, state)
-            here = value(state) if here is None else here
-            moved = [(g, value(g.state(state))) for g in self.transforms(state)]
+            data, lead = state, check_state(self.spaces, state)
         elif obs is not None and state is None:
-            lead = lead_of(self.spaces, obs)
-            here = value(obs) if here is None else here
-            moved = [(g, value(g.obs(obs))) for g in self.transforms(obs)]
+            data, lead = obs, lead_of(self.spaces, obs)
         else:
             raise UserError("value_loss takes either state or obs; give the one that the critic sees")
+        here = value(data) if here is None else here
+        moved = [(g, value(g.obs(data) if state is None else g.state(data))) for g in self.transforms(data)]
         carried = [carry(self.spaces, g.values, x, lead, "value") for g, x in moved]
         check_alike("value", carried, here)
-        return _mean([value_consistency_loss(x, here) for x in carried], mask)
+        return mean_counted([value_consistency_loss(x, here) for x in carried], mask)
 
     def action_value_loss(
         self, value: Callable[[Tensor], Tensor], obs: Tensor, here: Tensor | None = None, mask: Tensor | None = None
@@ -271,7 +245,7 @@ class Symmetry:
         here = value(obs) if here is None else here
         pulled = [g.pull_back(value(g.obs(obs))) for g in self.transforms(obs)]
         check_alike("value", pulled, here)
-        return _mean([value_consistency_loss(x, here) for x in pulled], mask)
+        return mean_counted([value_consistency_loss(x, here) for x in pulled], mask)
 
     def check(self, source: Environment | Transitions, transforms: str | None = None) -> list[ElementVerdict]:
         """Judge for each element and field whether a task is as symmetric as you say: holds, broken, or not covered.
@@ -291,31 +265,29 @@ class Symmetry:
 
         data = source if isinstance(source, Transitions) else collect(source)
         if self.spaces.num_agents == 1 and data.reward.dim() == 2:
-            held = {field.name: getattr(data, field.name) for field in fields(data)}
-            data = Transitions(**{name: value.unsqueeze(2) for name, value in held.items() if value is not None})
+            data = Transitions(**{name: value.unsqueeze(2) for name, value in vars(data).items() if value is not None})
         lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))
         spaces = replace(self.spaces, symmetry=self.group)
         return check_transitions(spaces, data, candidates(spaces, transforms or self.group))
 
+    def matrices(self) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+        """Return (name, L_g, K_g) of each element for other libraries: `obs.reshape(-1, N * D) @ L_g.T`.
+
+        L_g [N D, N D] and K_g [N A, N A] act on the rows of all agents end to end, K_g on one number per discrete
+        action or on continuous actions. An infinite or large group is refused.
+        """
+
+        def matrix(move: Callable[[Tensor], Tensor], width: int) -> NDArray[np.float64]:
+            count = self.spaces.num_agents
+            return move(torch.eye(count * width).double().view(-1, count, width)).flatten(1).T.numpy()
+
+        elements, width = self._set(torch.device("cpu"), torch.float64).each(), self.spaces.observation.width
+        return [(g.elements[0].name, matrix(g.obs, width), matrix(g.push_outputs, g.num_outputs)) for g in elements]
+
     def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
         key = (device, dtype)
         if key not in self._sets:
-            self._sets[key] = transform_set(self.group, self.spaces, device, dtype)
+            self._sets[key] = TransformSet(
+                admitted_elements(self.group, self.spaces, shapes.ANOTHER), self.spaces, *key
+            )
         return self._sets[key]
-
-
-def _mean(gaps: list[Tensor], mask: Tensor | None) -> Tensor:
-    """Return the mean over elements, rows and agents, of the rows that count; 0 where none does."""
-    gap = torch.stack(gaps)
-    counted = gap if mask is None else gap[:, _flags(mask, gap.shape[1:])]
-    return counted.mean() if counted.numel() else counted.sum()
-
-
-def _flags(mask: Tensor, shape: torch.Size) -> Tensor:
-    """Return which rows count, of a mask of flags, or of zeros and ones, that goes with the first axes of `shape`."""
-    if mask.shape != shape[: mask.dim()]:
-        raise UserError(f"mask has shape {list(mask.shape)}, but the rows have {list(shape)}; give a flag for each row")
-    flags = mask.bool()
-    if mask.dtype != torch.bool and not torch.equal(flags.to(mask.dtype), mask):
-        raise UserError("mask holds other numbers than 0 and 1; it says which rows count, and weighs none")
-    return flags

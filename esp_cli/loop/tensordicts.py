@@ -84,7 +84,7 @@ def _moved(spaces: Spaces, transform: Transform, x: Tensor, role: Role | None, l
             alone = spaces.num_agents == 1 and x.shape[len(lead) : -1] == (1,)
             return act(spaces, transform, x, torch.Size((*lead, 1)) if alone else lead)
         return x if role == "same" else carry(spaces, transform.per_agent, x, lead, "it")
-    except ValueError as error:
+    except UserError as error:
         advice = "" if role else "; name its role, 'same' or 'drop' for example"
         raise UserError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None
 

@@ -255,7 +255,7 @@ def _order_reason(undeclared: Sequence[Element], declared: Callable[[Element], b
     return None
 
 
-def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
+def admitted_elements(text: str, spaces: Spaces, instead: str = "") -> tuple[Element, ...] | Group:
     """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`).
 
     What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
@@ -264,5 +264,5 @@ def admitted_elements(text: str, spaces: Spaces) -> tuple[Element, ...] | Group:
     if not found and text:
         raise UserError("nothing was discovered that transforms could name; choose some, or no prior")
     elements = parse_elements(found, spaces.num_agents)
-    admit(found, elements, spaces if found == text else unrestricted(spaces))
+    admit(found, elements, spaces if found == text else unrestricted(spaces), instead)
     return elements

@@ -177,13 +177,13 @@ def test_agents_move_where_no_geometry_knows_a_field(legs) -> None:
 
 def test_what_does_not_commute_or_fit_is_refused(legs, monkeypatch) -> None:
     monkeypatch.setitem(plane.KIND_MATRICES, legs.LEGS, lambda planar: planar)
-    with pytest.raises(UserError, match=r"swap-legs and rot90 do not commute on field 'torque'"):
+    with pytest.raises(UserError, match=r"swap-legs and rot90 do not commute on field 'knees'"):
         build_transform(parse_elements("rot90*swap-legs", 3), spaces(legs.LEGS))
     monkeypatch.setitem(plane.KIND_MATRICES, legs.LEGS, lambda planar: np.eye(3))
-    with pytest.raises(UserError, match="rot90 transforms 3 numbers of field 'torque', but an item of it has 2"):
+    with pytest.raises(UserError, match="rot90 transforms 3 numbers of field 'knees', but an item of it has 2"):
         build_transform(parse_elements("rot90", 3), spaces(legs.LEGS))
     monkeypatch.delitem(plane.KIND_MATRICES, legs.LEGS)
-    with pytest.raises(UserError, match="does not say how field 'torque' of kind legs turns"):
+    with pytest.raises(UserError, match="does not say how field 'knees' of kind legs turns"):
         build_transform(parse_elements("rot90*swap-legs", 3), spaces(legs.LEGS))
 
 

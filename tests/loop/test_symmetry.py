@@ -456,3 +456,56 @@ def test_a_task_is_checked_with_the_layout_that_is_given() -> None:
     assert outcomes(right, env) == {"holds"}
     other = discrete_moves(["stay", "left", "down", "right", "up"])
     assert "broken" in outcomes(Symmetry(observation=spec.observation, action=other, num_agents=3), env)
+
+
+def test_matrices_do_what_the_copies_do() -> None:
+    def moved(symmetry: Symmetry, obs: Tensor, outputs: Tensor) -> list[tuple[str, Tensor, Tensor]]:
+        flat, done = obs.flatten(-2).double().numpy(), outputs.flatten(-2).double().numpy()
+        return [(name, flat @ seen.T, done @ acted.T) for name, seen, acted in symmetry.matrices()]
+
+    symmetry = Symmetry(observation=SEEN, action=MOVES, group="d4*agents", num_agents=2, copies="all")
+    obs, one_hot = random(5, 2, 3), torch.eye(4)[torch.randint(4, (5, 2))]
+    rows, actions, _ = symmetry.augment(obs, one_hot)
+    found = moved(symmetry, obs, one_hot)
+    assert [name for name, _, _ in found][:2] == ["rot90", "rot180"]
+    assert len(found) == 15
+    for k, (_, seen, acted) in enumerate(found, 1):
+        assert torch.equal(rows[5 * k : 5 * k + 5].flatten(1), torch.as_tensor(seen, dtype=torch.float32))
+        assert torch.equal(actions[5 * k : 5 * k + 5].flatten(1), torch.as_tensor(acted, dtype=torch.float32))
+    name, seen, done = Symmetry(observation=SEEN, action=FORCE, group="flip-x").matrices()[0]
+    assert (name, seen.tolist(), done.tolist()) == ("flip-x", [[1, 0, 0], [0, -1, 0], [0, 0, 1]], [[1, 0], [0, -1]])
+    with pytest.raises(ValueError, match="so2 cannot be listed"):
+        Symmetry(observation=SEEN, action=FORCE, group="so2").matrices()
+
+
+LIMBS = layout(Field("hips", Kind.PSEUDOSCALAR, 4), Field("knees", Kind.SCALAR, 4), Field("speed", Kind.VECTOR))
+
+
+def test_a_mirror_that_exchanges_limbs_is_one_element_by_hand() -> None:
+    symmetry = Symmetry(
+        observation=LIMBS,
+        action=Continuous(layout(Field("hips", Kind.PSEUDOSCALAR, 4), Field("knees", Kind.SCALAR, 4))),
+        group="flip-x*hips-1-0-3-2*knees-1-0-3-2",
+    )
+    obs, torque = torch.tensor([[1.0, 2, 3, 4, 5, 6, 7, 8, 9, 10]]), torch.tensor([[1.0, 2, 3, 4, 5, 6, 7, 8]])
+    rows, actions, _ = symmetry.augment(obs, torque)
+    assert rows[1].tolist() == [-2, -1, -4, -3, 6, 5, 8, 7, 9, -10]
+    assert actions[1].tolist() == [-2, -1, -4, -3, 6, 5, 8, 7]
+    generator = torch.Generator().manual_seed(0)
+    state = torch.randn(400, 1, 10, generator=generator)
+    torque = torch.rand(400, 1, 8, generator=generator) * 2 - 1
+    pull = torch.tensor([0.0, 0, 0, 0, 0.3, 0.3, 0, 0, 0.3, 0])
+    after = 0.8 * state + 0.3 * torch.cat([torque, torque.new_zeros(400, 1, 2)], -1) - pull
+    data = Transitions(state, torque, -after.square().sum(-1) - after[..., 0] * after[..., 1], after)
+    for group, outcome in (
+        ("flip-x*hips-1-0-3-2*knees-1-0-3-2", "holds"),
+        ("flip-x*hips-2-3-0-1*knees-2-3-0-1", "broken"),
+        ("flip-y*hips-1-0-3-2*knees-1-0-3-2", "broken"),
+    ):
+        told = Symmetry(observation=LIMBS, action=symmetry.spaces.action, group=group)
+        assert outcomes(told, data) == {outcome}, group
+    with pytest.raises(ValueError, match="field 'hips' has 4 items, not 3; use a group within o2"):
+        Symmetry(observation=LIMBS, action=symmetry.spaces.action, group="flip-x*hips-1-0-2")
+    strange = layout(Field("what", Kind("strange", 3)))
+    with pytest.raises(ValueError, match=r"of kind strange turns; give another group, or fields that say"):
+        Symmetry(observation=strange, action=FORCE)
