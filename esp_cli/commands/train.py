@@ -29,7 +29,6 @@ from esp_cli.commands.options import (
     was_given,
 )
 from esp_cli.commands.stopping import stop_requests
-from esp_cli.commands.train_choices import with_file
 from esp_cli.defaults import STEPS, PriorKind
 from esp_cli.networks.kernels.library import begin
 from esp_envs.errors import UserError
@@ -118,8 +117,7 @@ def train(
         begin("perceptron")  # while torch is imported
 
     from esp_cli import run as runs
-    from esp_cli.machine import resolve_device
-    from esp_cli.training.config import resolve_config
+    from esp_cli.commands.train_choices import plan_run
     from esp_cli.training.run_folder import RUN_FORMAT
     from esp_cli.training.trackers import require
 
@@ -138,7 +136,6 @@ def train(
         "network.name": network,
         "task.physics": physics,
     }
-    overrides = {name: value for name, value in short.items() if value is not None} | named
     choices: dict[str, Any] = {
         "task": task,
         "algorithm": algo,
@@ -148,13 +145,8 @@ def train(
         "device": device,
         "init_from": init_from,
     }
-    said = set(overrides)
-    if config is not None:
-        choices, overrides, said = with_file(context, config, choices, overrides)
-    start = choices.pop("init_from")
-    choices["device"] = resolve_device(choices["device"])
-    idle = said & resolve_config(**choices, overrides=overrides).without_effect()
-    resolved, weights = runs.plan(algo=choices.pop("algorithm"), settings=overrides, init_from=start, **choices)
+    overrides = {name: value for name, value in short.items() if value is not None} | named
+    resolved, weights, idle = plan_run(context, config, choices, overrides)
     note_without_effect(idle)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))

@@ -13,6 +13,8 @@ from esp_cli.commands.options import Device, was_given
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from esp_cli.policies.initial import Start
     from esp_cli.training.config import RunConfig
 
@@ -20,7 +22,38 @@ _PARAMETERS = {"algorithm": "algo"}
 """Names of parameters that differ from those in a file."""
 
 
-def with_file(
+def plan_run(
+    context: typer.Context, file: Path | None, choices: dict[str, Any], settings: dict[str, object]
+) -> tuple[RunConfig, Mapping[str, Tensor] | None, set[str]]:
+    """Resolve what was asked for into a configuration; nothing is written.
+
+    Args:
+        context: of the command, which knows what was given.
+        file: fills in what the command line leaves open.
+        choices: by their name in a file, defaults included.
+        settings: of the command line.
+
+    Returns:
+        The configuration, the weights that the run starts from, and the chosen settings that have no effect.
+
+    Raises:
+        UserError: what was asked for is unknown, out of range, or does not go together.
+    """
+    from esp_cli.machine import resolve_device
+    from esp_cli.run import plan
+    from esp_cli.training.config import resolve_config
+
+    said = set(settings)
+    if file is not None:
+        choices, settings, said = _with_file(context, file, choices, settings)
+    start = choices.pop("init_from")
+    choices["device"] = resolve_device(choices["device"])
+    idle = said & resolve_config(**choices, overrides=settings).without_effect()
+    config, weights = plan(algo=choices.pop("algorithm"), settings=settings, init_from=start, **choices)
+    return config, weights, idle
+
+
+def _with_file(
     context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
 ) -> tuple[dict[str, Any], dict[str, object], set[str]]:
     """Let a file fill in what the command line leaves open.

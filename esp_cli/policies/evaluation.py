@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import methodcaller
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
 from esp_cli.training.build import build_environment
-from esp_cli.training.play import Controller, Episodes, HeuristicController, PolicyController, RandomController, play
+from esp_cli.training.play import Controller, Episodes, PolicyController, ScriptedController, play
 from esp_cli.training.streams import generators
 from esp_envs.errors import UserError
 
@@ -97,10 +98,10 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
             numbers[list(trained.stopped)] = float("nan")
     one_world = build_environment(trained.config, 1, _STREAM, "shape")
     names = one_world.heuristics
-    anchors = {"random": play_batches(trained, RandomController(), "random", episodes)}
+    anchors = {"random": play_batches(trained, ScriptedController(methodcaller("random_action")), "random", episodes)}
     for index, name in enumerate(names):
         key = "heuristic" if index == 0 else name
-        anchors[key] = play_batches(trained, HeuristicController(name), "heuristic", episodes)
+        anchors[key] = play_batches(trained, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
     spread = dict(anchors)
     if len(seeds) == 1 and not trained.stopped:
         spread |= {"greedy": greedy, "stochastic": stochastic}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -48,29 +48,25 @@ class PolicyController:
         return action
 
 
-class RandomController:
-    """The random policy of `Environment.random_action`: the lower anchor."""
+class ScriptedController:
+    """A policy of the task itself, such as its random one or a heuristic.
+
+    Args:
+        choose: returns the action of an environment.
+
+    Example:
+        >>> play(env, ScriptedController(methodcaller("heuristic"))).returns
+    """
+
+    def __init__(self, choose: Callable[[Environment], Tensor]) -> None:
+        self._choose = choose
 
     def begin(self, env: Environment, observation: Observation) -> None:
-        """Nothing to prepare."""
+        """Prepare nothing."""
 
     def act(self, env: Environment, observation: Observation) -> Tensor:
-        """Return a random action from the environment's own generators."""
-        return env.random_action()
-
-
-class HeuristicController:
-    """A hand-written policy of the task: the upper anchor."""
-
-    def __init__(self, name: str | None = None) -> None:
-        self.name = name
-
-    def begin(self, env: Environment, observation: Observation) -> None:
-        """Nothing to prepare."""
-
-    def act(self, env: Environment, observation: Observation) -> Tensor:
-        """Return the heuristic's action."""
-        return env.heuristic(self.name)
+        """Return what the task's policy chooses."""
+        return self._choose(env)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
 """Playing episodes, against returns worked out by hand in a world where everything is written down before."""
 
+from operator import methodcaller
+
 import pytest
 import torch
 
 from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.training.play import HeuristicController, PolicyController, RandomController, play
+from esp_cli.training.play import PolicyController, ScriptedController, play
 from esp_cli.training.streams import generators
 from esp_envs.base import Environment, Observation, Step, generators_for
 from esp_envs.scene import Scene
@@ -78,7 +80,7 @@ class Scripted(Environment):
 
 def test_returns_lengths_and_metrics_by_hand():
     """Mean over agents of the sum over time: SCRIPT + 1 a step; with the action 0 nothing is added."""
-    episodes = play(Scripted(), HeuristicController("left"))
+    episodes = play(Scripted(), ScriptedController(methodcaller("heuristic", "left")))
     # world 0: 1 + 2 + 3 + 4 + 4 * 1; world 1: 5 + 7 + 2 * 1, and not the 100s; world 2: -1 + 4 * 1;
     # the second seed doubles SCRIPT
     assert episodes.returns.tolist() == [[14.0, 14.0, 3.0], [24.0, 26.0, 2.0]]
@@ -89,20 +91,23 @@ def test_returns_lengths_and_metrics_by_hand():
 
 def test_the_main_heuristic_is_the_anchor():
     """Its action is 1, which each agent gets on top in every step of the episode."""
-    episodes = play(Scripted(), HeuristicController())
+    episodes = play(Scripted(), ScriptedController(methodcaller("heuristic")))
     assert episodes.returns.tolist() == [[18.0, 16.0, 7.0], [28.0, 28.0, 6.0]]
+
+
+RANDOM = ScriptedController(methodcaller("random_action"))
 
 
 def test_the_random_anchor_draws_from_the_worlds_own_generators():
     env = Scripted()
-    returns = play(env, RandomController()).returns
+    returns = play(env, RANDOM).returns
     added = torch.stack(env.actions).float().mean(-1)
     added[2:, :, 1] = 0
     base = torch.tensor([[14.0, 14.0, 3.0], [24.0, 26.0, 2.0]])
     torch.testing.assert_close(returns, base + added.sum(0))
     assert 0 < torch.stack(env.actions).float().mean() < 1
-    assert torch.equal(play(Scripted(), RandomController()).returns, returns)
-    assert torch.equal(play(Scripted((6,)), RandomController()).lengths, torch.tensor([[4.0, 2.0, 4.0]]))
+    assert torch.equal(play(Scripted(), RANDOM).returns, returns)
+    assert torch.equal(play(Scripted((6,)), RANDOM).lengths, torch.tensor([[4.0, 2.0, 4.0]]))
 
 
 def policy_for(env, name="mlp"):
