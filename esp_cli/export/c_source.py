@@ -15,25 +15,24 @@ from esp_cli.export.templates import RUNTIME, filled
 from esp_envs.errors import UserError
 
 _LAYERS: dict[type[layers.Layer], str] = {
-    layers.Affine: "EACH affine(w{k}_0, w{k}_1, {0.inputs}, {0.outputs}, X, Y);",
+    layers.Affine: "EACH affine(w{k}_0, w{k}_1, {0.inputs}, {0.outputs}, X, Y);\nSWAP;",
     layers.Activation: "EACH apply_{0.kind}(X, {0.width});",
     layers.Norm: "EACH normalise(w{k}_0, w{k}_1, {0.outputs}, X);",
-    layers.Recurrent: (
-        "affine(w{k}_0, w{k}_1, {0.input.inputs}, 3 * {0.hidden}, X, into);\n"
-        "affine(w{k}_2, w{k}_3, {0.hidden}, 3 * {0.hidden}, memory, back);\n"
-        "recur({0.hidden}, into, back, memory);\n"
-        "memcpy(X, memory, sizeof(float) * {0.hidden});"
-    ),
+    layers.Recurrent: """
+        affine(w{k}_0, w{k}_1, {0.input.inputs}, 3 * {0.hidden}, x, into);
+        affine(w{k}_2, w{k}_3, {0.hidden}, 3 * {0.hidden}, memory, back);
+        recur({0.hidden}, into, back, memory);
+        memcpy(x, memory, sizeof(float) * {0.hidden});""",
     layers.Slice: "EACH memmove(X, X + {0.begin}, sizeof(float) * ({0.end} - {0.begin}));",
-    layers.Convolution: (
-        "EACH convolve(w{k}_0, w{k}_1, {0.channels}, {0.rows}, {0.columns}, {0.side}, {0.stride}, {0.outputs}, X, Y);"
-    ),
-    layers.GlobalMaxPool: "EACH global_max_pool({0.channels}, {0.places}, X, Y);",
-    layers.MessageAggregation: (
-        "aggregate(observation + {0.begin}, {0.width}, {reach_squared}, {reach}, all_X, all_Y);"
-    ),
+    layers.Convolution: """
+        EACH convolve(w{k}_0, w{k}_1, {0.channels}, {0.rows}, {0.columns}, {0.side}, {0.stride}, {0.outputs}, X, Y);
+        SWAP;""",
+    layers.GlobalMaxPool: "EACH global_max_pool({0.channels}, {0.places}, X, Y);\nSWAP;",
+    layers.MessageAggregation: """
+        aggregate(observation + {0.begin}, {0.width}, {reach_squared}, {reach}, x, y);
+        SWAP;""",
 }
-"""The lines of a layer: X is an agent's row of inputs, Y that of outputs; EACH repeats a line for every agent."""
+"""The statements of a layer, in the macros of `templates/policy.c.jinja`."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
             "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
         )
     body = _body(program)
-    variables = [name for name in ("i", "k", "best") if re.search(rf"\b{name} = ", body)]
+    variables = ["i", *(name for name in ("k", "best") if re.search(rf"\b{name} = ", body))]
     values = {
         **_shape(program),
         "comment": "\n".join(f" * {line}".rstrip() for line in _plain(comment).splitlines()),
@@ -171,50 +170,30 @@ def _body(program: Program) -> str:
     lines = ["EACH memcpy(X, observation + i * ESP_POLICY_OBSERVATION, sizeof(float) * ESP_POLICY_OBSERVATION);"]
     if program.previous:
         copied = f"memory + {program.hidden}, sizeof(float) * {program.previous}"
-        lines.append(f"memcpy(X + ESP_POLICY_OBSERVATION, {copied});")
-    x, y = "row_a", "row_b"
-    lines = [_placed(line, x, y, program.team) for line in lines]
+        lines.append(f"memcpy(x + ESP_POLICY_OBSERVATION, {copied});")
     for k, layer in enumerate(program.layers):
-        ranges = isinstance(layer, layers.MessageAggregation)
-        reach = {name: literal(getattr(layer, name)) for name in ("reach", "reach_squared")} if ranges else {}
-        text = _LAYERS[type(layer)].format(layer, k=k, **reach)
-        lines += [_placed(line, x, y, program.team) for line in text.splitlines()]
-        if "Y" in text:
-            x, y = y, x
-    lines.append(f"last = {x};")
-    head = _choose(program) if program.head == "choose" else _squash(program)
-    return "\n".join(f"    {line}" for line in [*lines, *(_placed(line, x, y, program.team) for line in head)])
-
-
-def _placed(line: str, x: str, y: str, team: int) -> str:
-    """Put the rows that hold inputs and outputs into a line, and repeat it for every agent of a team."""
-    repeated = line.startswith("EACH ") and team > 1
-    line = line.removeprefix("EACH ")
-    for name, row in {"X": x, "Y": y}.items():
-        line = re.sub(rf"\ball_{name}\b", row, line)
-        line = re.sub(rf"\b{name}\b", f"{row} + i * ROW" if repeated else row, line)
-    if repeated:
-        return f"for (i = 0; i < AGENTS; i++) {line}"
-    return re.sub(r" \+ i \* \w+", "", line)
-
-
-def _choose(program: Program) -> list[str]:
-    call = "choose_allowed(X, allowed + i * ESP_POLICY_ACTION)" if program.masked else "choose(X)"
+        reach = {name: literal(getattr(layer, name, 0.0)) for name in ("reach", "reach_squared")}
+        lines += _LAYERS[type(layer)].format(layer, k=k, **reach).splitlines()
+    lines.append("last = x;")
     if program.team > 1:
-        return [f"EACH action[i] = {call};"]
-    lines = [f"best = {call};"]
+        call = "choose_allowed(X, allowed + i * ESP_POLICY_ACTION)" if program.masked else "choose(X)"
+        lines.append(f"EACH action[i] = {call};")
+    elif program.head == "choose":
+        lines.append(f"best = {'choose_allowed(x, allowed)' if program.masked else 'choose(x)'};")
+    else:
+        lines += _squash(program.groups)
     if program.previous:
-        lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = k == best ? 1.0f : 0.0f;")
-    return [*lines, "return best;"]
+        value = "action[k]" if program.head == "squash" else "k == best ? 1.0f : 0.0f"
+        lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = {value};")
+    lines += ["return best;"] if program.head == "choose" and program.team == 1 else []
+    return "\n".join(f"    {line.strip()}" for line in lines if line.strip())
 
 
-def _squash(program: Program) -> list[str]:
+def _squash(groups: Iterable[int]) -> list[str]:
     lines, start = [], 0
-    for width in program.groups:
-        squares = " + ".join(f"X[{i}] * X[{i}]" for i in range(start, start + width))
+    for width in groups:
+        squares = " + ".join(f"x[{i}] * x[{i}]" for i in range(start, start + width))
         lines.append(f"length = sqrtf({squares} + {literal(layers.SQUASH_EPSILON)});")
-        lines.append(f"for (k = {start}; k < {start + width}; k++) action[k] = X[k] * (tanhf(length) / length);")
+        lines.append(f"for (k = {start}; k < {start + width}; k++) action[k] = x[k] * (tanhf(length) / length);")
         start += width
-    if program.previous:
-        lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = action[k];")
     return lines
