@@ -119,7 +119,7 @@ def draw(
         request: what is drawn, and into which file.
         policies: one run, or two of the same task that play the same episodes.
         names: of the policies, where there are two.
-        watch: told how many frames of how many are drawn.
+        watch: called with the numbers of drawn and of all frames.
 
     Raises:
         UserError: no such seed, a view that cannot be drawn, or policies that cannot be compared.
@@ -258,7 +258,7 @@ def write_film(
         painter: draws the shots.
         taken: the shots, in their order.
         step_s: how long one step is in view, s; the last of an episode is in view for longer.
-        watch: told how many frames are drawn, after each.
+        watch: called with the number of drawn frames, after each.
     """
     ends = [*(after.time_s == 0 for after in taken[1:]), True]
     seconds = [shot.steps * step_s + HOLD_SECONDS * end for shot, end in zip(taken, ends, strict=True)]

@@ -13,7 +13,7 @@ from PIL import Image
 
 from esp_cli.drawing.draw import open_painter, shots, stride, write_film
 from esp_cli.drawing.films import write_gif, write_mp4
-from esp_cli.drawing.recording import HOLD_SECONDS, Episode, framed, record
+from esp_cli.drawing.recording import HOLD_SECONDS, framed, record
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
@@ -24,10 +24,10 @@ from esp_envs.base import Environment
 from esp_envs.compass import Compass
 from esp_envs.drawing import TopPainter, draw
 from esp_envs.errors import UserError
+from tests.drawing.scenes import RED, episode, line
 from tests.training.runs import tiny_config
 
 SEEDS = (3, 7)
-RED, BLUE = "#ff0000", "#0000ff"
 
 
 @pytest.fixture
@@ -47,18 +47,6 @@ def filmed(trained, seed, *choice):
     """Record the episodes of one seed."""
     (own,) = record([trained.single_seed(seed)], *choice)
     return own
-
-
-def line(count=9, trail=True):
-    """A red body on its way from the lower left to the right, and a blue one that stands."""
-    places = np.linspace([-0.8, -0.6], [0.8, -0.6], count)  # beside the lines of the grid
-    still = Body((0.0, 0.5), 0.1, BLUE)
-    return [Scene((still, Body(tuple(place), 0.1, RED, trail=trail)), (-1.0, 1.0, -1.0, 1.0)) for place in places]
-
-
-def episode(scenes):
-    """Return an episode that earns 1 a step."""
-    return Episode(scenes, [float(k) for k in range(len(scenes))])
 
 
 def test_the_start_and_every_step_of_every_episode_are_recorded(trained):
