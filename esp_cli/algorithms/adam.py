@@ -8,6 +8,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from esp_cli.prior.loss import Loss
+
 _ALIGNED = 16
 """Numbers per seed are filled up to a multiple of this, so that no seed begins within a vector of the processor."""
 BETAS = (0.9, 0.999)
@@ -28,6 +30,7 @@ class SeedParameters:
         self.parameters = list(parameters)
         ends = torch.tensor([p[0].numel() for p in self.parameters]).cumsum(0).tolist()
         self._parts = list(pairwise([0, *ends]))
+        self._places = {id(p): k for k, p in enumerate(self.parameters)}
         first = self.parameters[0]
         self._rest = first.new_zeros(first.shape[0], -ends[-1] % _ALIGNED)
         self.buffer = self.flat([p.detach() for p in self.parameters])
@@ -37,6 +40,25 @@ class SeedParameters:
     def flat(self, tensors: Sequence[Tensor]) -> Tensor:
         """Return a new buffer [S, P] of tensors [S, ...] in the order of the parameters."""
         return torch.cat([*(tensor.flatten(1) for tensor in tensors), self._rest], 1)
+
+    @torch.no_grad()
+    def sum(self, gradients: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]]) -> Tensor:
+        """Return a new buffer [S, P] of the sum of gradients by some of the parameters.
+
+        Args:
+            gradients: parameters that follow each other here, and the gradients by them, or one by all side by side.
+        """
+        parts, rest = [], []
+        at = 0
+        for parameters, by_parameters in sorted(gradients, key=lambda pair: self._places[id(pair[0][0])]):
+            first = self._places[id(parameters[0])]
+            if first < at:
+                rest.append((parameters, by_parameters))
+                continue
+            parts += [torch.zeros_like(p) for p in self.parameters[at:first]] + [*by_parameters]
+            at = first + len(parameters)
+        total = self.flat([*parts, *(torch.zeros_like(p) for p in self.parameters[at:])])
+        return total.add_(self.sum(rest)) if rest else total
 
     def views(self, buffer: Tensor) -> list[Tensor]:
         """Return the part of a buffer [S, P] that belongs to each parameter, in its shape."""
@@ -78,15 +100,17 @@ class SeedAdam:
         """Set the learning rate to this share of what it was made with."""
         self.learning_rate = self.initial_learning_rate * remaining
 
-    def gradient(self, loss: Tensor) -> Tensor:
+    def gradient(self, loss: Loss | Tensor) -> Tensor:
         """Return the gradients [S, P] of the losses [S] of all seeds."""
-        parameters = self.parameters.parameters
-        # of a scalar: with gradients given for a vector, torch imports sympy, which takes a second
-        found = torch.autograd.grad(loss.sum(), parameters, allow_unused=True, materialize_grads=True)
-        return self.parameters.flat(found)
+        loss = loss if isinstance(loss, Loss) else Loss.of(loss)
+        return self.parameters.sum(loss.gradients(self.parameters.parameters))
+
+    def step(self, loss: Loss | Tensor) -> list[Tensor]:
+        """Take one step down the losses [S] of all seeds; return each group's gradient norms [S] before clipping."""
+        return self.apply(self.gradient(loss))
 
     @torch.no_grad()
-    def step(self, gradient: Tensor) -> list[Tensor]:
+    def apply(self, gradient: Tensor) -> list[Tensor]:
         """Clip the gradients [S, P] in place and take one step; return each group's norms [S] before clipping."""
         norms = clip_per_seed([gradient[:, begin:end] for begin, end in self._groups], self.max_grad_norm)
         self.count += 1

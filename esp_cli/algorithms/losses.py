@@ -95,33 +95,6 @@ def _beside(per_seed: Tensor, x: Tensor) -> Tensor:
     return per_seed.view(-1, *[1] * (x.dim() - 1))
 
 
-def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
-    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A), element by element (to be maximised)."""
-    ratio = log_ratio.exp()
-    return torch.minimum(ratio * advantage, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage)
-
-
-def huber(error: Tensor, delta: float) -> Tensor:
-    """Return e^2 / 2 within delta, delta (|e| - delta / 2) beyond, element by element."""
-    size = error.abs()
-    inner = size.clamp(max=delta)
-    return inner * (size - 0.5 * inner)
-
-
-def value_loss(
-    value: Tensor, target: Tensor, huber_delta: float, old_value: Tensor | None = None, clip_epsilon: float = 0.0
-) -> Tensor:
-    """Return the value loss element by element; with `old_value`, the larger of the clipped and the plain one.
-
-    The clipped prediction is V_old + clip(V - V_old, -eps, eps), as in the MAPPO paper.
-    """
-    loss = huber(value - target, huber_delta)
-    if old_value is None:
-        return loss
-    clipped = old_value + (value - old_value).clamp(-clip_epsilon, clip_epsilon)
-    return torch.maximum(loss, huber(clipped - target, huber_delta))
-
-
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S].
 

@@ -15,15 +15,13 @@ from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedParameters
-from esp_cli.algorithms.closed_actor import ActorWeights, actor_gradient, draw
-from esp_cli.algorithms.closed_form import carries
+from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.joint_q import OneValueEach
-from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
@@ -72,7 +70,6 @@ class Maddpg(OffPolicyLearner):
         if not spec.shared_reward:
             self.joint = OneValueEach(spec, config.critic_input)
         shape = perceptron(network, config.critic_activation)
-        _, self._compiled = shape.products
         width = self.critic_width + spec.num_agents * self.head.action_width
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
@@ -95,11 +92,6 @@ class Maddpg(OffPolicyLearner):
         # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
         # that Adam's epsilon slows the actor down.
         self._value_scale = spec.horizon**0.5
-        discrete = isinstance(self.head, ExploringCategorical) and isinstance(self.policy.actor, MLP)
-        sampled = config.actor_gradient == "sampled" and config.actor_actions == "all"
-        self._closed_form = discrete and sampled and not spec.masks and not spec.agents_end
-        if self._compiled and self._closed_form:
-            begin("actor")
 
     @classmethod
     def build_policy(
@@ -128,7 +120,7 @@ class Maddpg(OffPolicyLearner):
         return self.policy.unroll(rows.obs[:, :, :-1], rows.action, rows.action_mask)
 
     def _learn_critic(self, copies: Copies[EpisodeBatch], seen: Tensor, here: Tensor) -> dict[str, Tensor]:
-        """Take one gradient step down L_TD + c S_Q.
+        """Take one gradient step down L_TD + c S_Q (supplement eq. 19).
 
         Args:
             copies: the batch.
@@ -137,71 +129,26 @@ class Maddpg(OffPolicyLearner):
         """
         values = self.joint.value(self.critic, here, self._encoded(copies.rows))
         target = self._targets(copies.originals, copies.original(seen))
-        loss, metrics = self._td_loss(values, target, copies)
-        (norm,) = self.critic_optimiser.step(self.critic_optimiser.gradient(loss))
-        return metrics | {"critic_grad_norm": norm}
+        loss = value_loss(values, target, copies, self.config.huber_delta) + copies.penalty(value=values)
+        (norm,) = self.critic_optimiser.step(loss)
+        return self._td_metrics(copies.original(values), target, copies.originals) | {"critic_grad_norm": norm}
 
     def _learn_actor(self, copies: Copies[EpisodeBatch], here: Tensor) -> dict[str, Tensor]:
-        """Take one gradient step down the actor's loss; `here` is what the critic sees of every row."""
-        rows = copies.originals
+        """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `here` is what the critic sees of every row."""
+        rows, batch = copies.originals, copies.loss_rows
         lead = (rows.count, self.spec.horizon, self.spec.num_agents, self.head.num_outputs)
         noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]])
-        noise = noise.to(self.device, non_blocking=True)
+        noise = copies.tiled(noise.to(self.device, non_blocking=True))
+        outputs = self._outputs(copies.rows)
+        chosen = copies.for_loss(outputs)
         self.critic.requires_grad_(False)
-        closed = self._closed_form and carries(copies.transforms)
-        gradient, metrics = (self.closed_gradient if closed else self.reference_gradient)(copies, here, noise)
-        self.critic.requires_grad_(True)
-        (norm,) = self.actor_optimiser.step(gradient)
-        return metrics | {"actor_grad_norm": norm}
-
-    def reference_gradient(
-        self, copies: Copies[EpisodeBatch], here: Tensor, noise: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the gradient [S, P] of -Q(s, pi(o)) + penalty + c S_pi by the actor, and what is logged of it.
-
-        Args:
-            copies: the batch.
-            here: what the critic sees of every row, [S, B (1 + copies), T(, N), critic width].
-            noise: [S, B, T, N, outputs] uniform in [0, 1), of the originals.
-        """
-        outputs, batch = self._outputs(copies.rows), copies.batch
-        learned = copies.learned(outputs)
-        value = self._value_of_policy(copies.learned(here), learned, copies.repeated(noise), batch)
+        value = self._value_of_policy(copies.for_loss(here), chosen, noise, batch)
         policy_loss = -self._value_scale * mean_per_seed(value, batch.mask)
-        loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(learned), batch.mask)
-        loss = loss + copies.penalty(policy=(self.head, outputs))
-        metrics = {name: mean_per_seed(x, batch.mask) for name, x in self.head.statistics(learned).items()}
-        return self.actor_optimiser.gradient(loss), {"policy_loss": policy_loss} | metrics
-
-    def closed_gradient(
-        self, copies: Copies[EpisodeBatch], here: Tensor, noise: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return what `reference_gradient` returns, by fewer operations; rows lie agent by agent, then part by part."""
-        config, prior = self.config, self.prior.config
-        obs = copies.rows.obs[:, :, :-1].permute(0, 3, 1, 2, 4)  # [S, N, B (1 + copies), T, D]
-        outputs, pull = self.policy.actor.traced(obs)  # [S, N, B (1 + copies), T, A]
-        parts = outputs.flatten(1, 3).transpose(1, 2).unflatten(2, (obs.shape[1], 1 + len(copies.transforms), -1))
-        num_learned = parts.shape[3] if copies.augments else 1
-        drawn = draw(parts, num_learned, noise, self._compiled)
-
-        action = drawn.hard.unflatten(1, (-1, obs.shape[3])).requires_grad_()
-        value = self.joint.value(self.critic, copies.learned(here), action)
-        mask = copies.originals.mask
-        share = mask / mask.flatten(1).sum(1).clamp_min(1).view(-1, 1, 1)
-        by_value = copies.repeated(share).unsqueeze(-1).mul(-self._value_scale / (num_learned * value.shape[3]))
-        (by_action,) = torch.autograd.grad((value * by_value).sum(), action)
-
-        weights = ActorWeights(
-            config.output_penalty, prior.coefficient if prior.terms != "value" else 0.0, prior.stop_gradient
-        )
-        by_action, share = by_action.flatten(1, 2), share.flatten(1)
-        made = (by_action, share, copies.transforms, weights, self._compiled)
-        by_outputs, entropy = actor_gradient(parts, drawn, *made)
-        by_outputs = by_outputs.flatten(2).transpose(1, 2).view(outputs.shape)
-        return self.actor_optimiser.parameters.flat(pull(by_outputs)), {
-            "policy_loss": -self._value_scale * mean_per_seed(value.detach(), copies.batch.mask),
-            "entropy": (entropy * share).sum(1),
-        }
+        loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(chosen), batch.mask)
+        (norm,) = self.actor_optimiser.step(loss + copies.penalty(policy=(self.head, outputs)))
+        self.critic.requires_grad_(True)
+        metrics = {name: mean_per_seed(x, batch.mask) for name, x in self.head.statistics(chosen.detach()).items()}
+        return metrics | {"policy_loss": policy_loss, "actor_grad_norm": norm}
 
     def _encoded(self, rows: EpisodeBatch) -> Tensor:
         """Return what was done as the critic reads it [S, B, T, N, A]; zeros for an agent that has ended."""

@@ -14,20 +14,16 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
-from esp_cli.algorithms.closed_form import carries, critic_gradient, policy_gradient, weights_of
-from esp_cli.algorithms.closed_gaussian import gaussian_gradient
 from esp_cli.algorithms.learner import Iteration, Learner
-from esp_cli.algorithms.losses import clipped_surrogate, explained_variance, gae, normalise_per_seed, value_loss
+from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
+from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_loss
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
-from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import NetworkConfig, WithVJP
 from esp_cli.networks.critic import Critic
-from esp_cli.networks.heads import Categorical
-from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import Answers, Copies, mean_per_seed
+from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
@@ -91,10 +87,6 @@ class Mappo(Learner):
         self.optimisers = {"adam": self.optimiser}
         self.collector = Collector(env, self.policy, self.generators["learner"])
         self._old: tuple[StochasticPolicy, Critic] | None = None
-        _, self._compiled = perceptron(network, "relu").products
-        self._closed_form = not (config.clip_value or self.prior.recomputes or spec.masks or spec.agents_end)
-        if self._compiled and self._closed_form and isinstance(self.policy.head, Categorical):
-            begin("policy_gradient")
 
     @classmethod
     def build_policy(
@@ -208,7 +200,8 @@ class Mappo(Learner):
 
     def _gradient_step(self, minibatch: Batch, entropy_coef: float, sums: dict[str, Tensor] | None) -> None:
         """Take one gradient step, accumulated over chunks small enough for the processor's cache."""
-        copies = self.prior.copies(minibatch, self.generators["prior"], self.reevaluated)
+        adapt = None if self._old is None else self.reevaluated
+        copies = self.prior.copies(minibatch, self.generators["prior"], adapt)
         num_seeds, total, length = minibatch.obs.shape[:3]
         size = max(1, self.config.chunk_steps // (num_seeds * length))
         if minibatch.alive is not None:
@@ -216,77 +209,52 @@ class Mappo(Learner):
         gradients = []
         for chunk in copies.chunks(size):
             weight = chunk.originals.count / total
-            if self._closed_form and carries(chunk.transforms):
-                gradient = self._closed_form_gradient(chunk, entropy_coef, weight, sums)
-            else:
-                gradient = self.optimiser.gradient(self.reference_loss(chunk, entropy_coef, weight, sums))
+            gradient = self.optimiser.gradient(self.loss(chunk, entropy_coef, weight, sums))
             gradients.append(gradient if weight == 1 else gradient.mul_(weight))
-        actor_norm, critic_norm = self.optimiser.step(sum(gradients[1:], start=gradients[0]))
+        actor_norm, critic_norm = self.optimiser.apply(sum(gradients[1:], start=gradients[0]))
         if sums is not None:
             _add(sums, 1.0, actor_grad_norm=actor_norm, critic_grad_norm=critic_norm)
 
-    def _closed_form_gradient(
-        self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
-    ) -> Tensor:
-        """Return the gradient [S, P] of `reference_loss`, by fewer operations."""
-        config, batch, head = self.config, copies.originals, self.policy.head
-        outputs, pull_outputs = self.policy.traced(copies.obs, config.truncation)
-        state = copies.state if self.critic.reads == "state" else batch.state
-        values, pull_values = self.critic.traced(copies.obs, state, config.truncation)
-        if sums is not None:
-            said = head.normalise(copies.original(outputs).transpose(2, 3))
-            self._watch(batch, said, copies.original(values), weight, sums)
-        weights = weights_of(config, entropy_coef, self.prior.config, copies.augments)
-        pulled = pull_values(critic_gradient(values, batch.target, weights))
-        if isinstance(head, Categorical):
-            made = (batch.action, batch.log_prob, batch.advantage)
-            pulled = pull_outputs(policy_gradient(outputs, copies.transforms, *made, weights, self._compiled)) + pulled
-        else:
-            mean, log_std = outputs.transpose(2, 3), head.log_deviation(outputs).detach()
-            old, advantage = copies.repeated(batch.log_prob), copies.repeated(batch.advantage)
-            action = copies.learned(copies.action)
-            by_mean, by_log_std = gaussian_gradient(mean, log_std, copies.transforms, action, old, advantage, weights)
-            pulled = [head.by_item(by_log_std), *pull_outputs(by_mean.transpose(2, 3)), *pulled]
-        return self.optimiser.parameters.flat(pulled)
+    def loss(self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None) -> Loss:
+        """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S].
 
-    def reference_loss(
-        self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None
-    ) -> Tensor:
-        """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S]."""
-        config, head, rows, batch = self.config, self.policy.head, copies.rows, copies.batch
-        outputs = self.policy.unroll(rows.obs, config.truncation, rows.action_mask)
-        values = self.critic.unroll(rows.obs, rows.state, config.truncation)
-
-        learned = copies.learned(outputs)
-        log_prob, entropy = head.log_prob(learned, batch.action), head.entropy(learned)
-        objective = clipped_surrogate(log_prob - batch.log_prob, batch.advantage, config.clip_epsilon)
-        old_value = batch.value if config.clip_value else None
-        value_error = value_loss(
-            copies.learned(values), batch.target, config.huber_delta, old_value, config.clip_epsilon
-        )
-        loss = config.value_coef * mean_per_seed(value_error, batch.valued(self.num_values))
-        loss = loss - mean_per_seed(objective, batch.mask) - entropy_coef * mean_per_seed(entropy, batch.mask)
+        Args:
+            copies: a chunk of a minibatch.
+            entropy_coef: weight of the entropy.
+            weight: share of the chunk in its minibatch.
+            sums: to which the numbers that are logged are added; None adds none.
+        """
+        config, head, state = self.config, self.policy.head, copies.originals.state
+        outputs = self.policy.unroll_with_vjp(copies.obs, config.truncation, copies.action_mask)
+        state = copies.state if self.critic.reads == "state" else state
+        values = self.critic.unroll_with_vjp(copies.obs, state, config.truncation)
         if sums is not None:
-            originals = (copies.original(outputs.detach()), copies.original(values.detach()))
-            self._watch(copies.originals, *originals, weight, sums)
+            self._watch(copies.originals, copies.original(outputs.tensor), copies.original(values.tensor), weight, sums)
+        loss = ppo_loss(head, outputs, copies, config.clip_epsilon, entropy_coef)
+        loss = loss + config.value_coef * self._value_loss(values, copies)
         return loss + copies.penalty(policy=(head, outputs), value=values)
+
+    def _value_loss(self, values: WithVJP | Tensor, copies: Copies[Batch]) -> Loss:
+        """Return the critic's loss (Eq. 4)."""
+        config = self.config
+        clip = config.clip_epsilon if config.clip_value else None
+        return value_loss(values, copies.originals.target, copies, config.huber_delta, clip)
 
     @torch.no_grad()
     def _watch(self, batch: Batch, outputs: Tensor, values: Tensor, weight: float, sums: dict[str, Tensor]) -> None:
         """Add what is logged of a chunk of originals to the sums, from what policy and critic say of it."""
         config, head = self.config, self.policy.head
+        outputs = head.normalise(outputs)
         log_ratio = head.log_prob(outputs, batch.action) - batch.log_prob
         ratio = log_ratio.exp()
-        old_value = batch.value if config.clip_value else None
         parts = {
             "clip_fraction": ((ratio - 1).abs() > config.clip_epsilon).float(),
             "kl": ratio - 1 - log_ratio,
             "entropy": head.entropy(outputs),
-            "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon),
+            "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon)[0],
         }
-        error = value_loss(values, batch.target, config.huber_delta, old_value, config.clip_epsilon)
         means = {name: mean_per_seed(part, batch.mask) for name, part in parts.items()}
-        _add(sums, weight, **means, value_loss=mean_per_seed(error, batch.valued(self.num_values)))
+        _add(sums, weight, **means, value_loss=self._value_loss(values, self.prior.alone(batch)).value)
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""

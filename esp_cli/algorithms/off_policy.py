@@ -12,13 +12,14 @@ from torch import Tensor, nn
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.episodes import EpisodeCollector
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
-from esp_cli.algorithms.losses import huber, td_targets
+from esp_cli.algorithms.losses import td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
+from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.joint_q import OneValue
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.prior import Answers, Copies, mean_per_seed
+from esp_cli.prior import Answers, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
 
@@ -181,23 +182,11 @@ class OffPolicyLearner(Learner):
             over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own
         return td_targets(reward, next_value, over, config.gamma, config.td_lambda)
 
-    def _td_loss(
-        self, values: Tensor, target: Tensor, copies: Copies[EpisodeBatch]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return L_TD + c S_Q (supplement eq. 19) per seed, and what is logged of it.
-
-        Args:
-            values: [S, B (1 + copies), T, C] of what was done.
-            target: [S, B, T, C] of the originals.
-            copies: the batch.
-        """
-        error = huber(copies.learned(values) - copies.inherited(target), self.config.huber_delta)
-        loss = mean_per_seed(error, copies.batch.valued(values.shape[-1])) + copies.penalty(value=values)
-        valid = copies.originals.valued(values.shape[-1])
-        return loss, {
-            "td_loss": mean_per_seed(copies.original(error), valid),
-            "value": mean_per_seed(copies.original(values), valid),
-        }
+    @torch.no_grad()
+    def _td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:
+        """Return what is logged of a step: L_TD and the mean value, over the originals; [S, B, T, C] each."""
+        loss = value_loss(values, target, self.prior.alone(batch), self.config.huber_delta)
+        return {"td_loss": loss.value, "value": mean_per_seed(values, batch.valued(values.shape[-1]))}
 
     def adam(self, module: nn.Module, *others: nn.Module, learning_rate: float) -> SeedAdam:
         """Return an optimiser of the parameters of some networks, whose gradients are clipped together."""

@@ -17,6 +17,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
@@ -96,12 +97,12 @@ class Qmix(OffPolicyLearner):
         seen = self._critic_rows(copies.rows)
         values = self._total(utilities, copies.rows, seen)
         target = self._targets(batch, copies.original(utilities).detach(), copies.original(seen))
-        loss, metrics = self._td_loss(values, target, copies)
-        (norm,) = self.optimiser.step(self.optimiser.gradient(loss))
+        loss = value_loss(values, target, copies, self.config.huber_delta) + copies.penalty(value=values)
+        (norm,) = self.optimiser.step(loss)
         if (self.updates + 1) % self.config.target_every == 0:
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_mixer.load_state_dict(self.mixer.state_dict())
-        return metrics | {"grad_norm": norm}
+        return self._td_metrics(copies.original(values), target, batch) | {"grad_norm": norm}
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return Q_tot of rows, for `SymmetryPrior.errors`."""

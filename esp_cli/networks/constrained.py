@@ -11,10 +11,10 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig, Pull
+from esp_cli.networks.contract import VJP, ActivationName, Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, orthogonal
-from esp_cli.networks.perceptron import Pass, Shape, affine, perceptron
+from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
 from esp_envs.errors import UserError
@@ -193,17 +193,17 @@ class Equivariant(Memoryless):
         """Map [S, B, in] to [S, B, out]."""
         return perceptron(self._shape, [x], self._plain())
 
-    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return outputs and the way back; see `Network.traced`."""
+    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
+        """Return outputs and VJP; see `Network.unroll_with_vjp`."""
         plain = self._plain()
-        run = Pass(self._shape, [x], plain)
+        outputs, vjp = perceptron_with_vjp(self._shape, [x], plain)
 
-        def pull(gradient: Tensor) -> list[Tensor]:
-            made = zip(plain, run.backward(gradient.flatten(1, -2)), strict=True)
+        def vjp_of_free(slope: Tensor) -> list[Tensor]:
+            made = zip(plain, vjp(slope), strict=True)
             learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
             return [*torch.autograd.grad(learned, [*self.parameters()], by_learned)]
 
-        return run.outputs.unflatten(1, x.shape[1:-1]), pull
+        return outputs, vjp_of_free
 
     def _plain(self) -> list[Tensor]:
         """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""

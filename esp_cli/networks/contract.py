@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import torch
 from pydantic import Field
@@ -17,8 +17,10 @@ from esp_envs.errors import UserError
 
 ActivationName = Literal["relu", "tanh"]
 
-Pull = Callable[[Tensor], list[Tensor]]
-"""From the gradient by a network's outputs to those by its parameters, each as it is or side by side [S, P]."""
+
+VJP = Callable[[Tensor], list[Tensor]]
+"""The vector-Jacobian product of a network: from the slope of a loss by its outputs to those by its parameters in
+order, as they are, or all together side by side [S, P]."""
 
 
 class NetworkConfig(Strict, ABC):
@@ -107,22 +109,34 @@ class Network(nn.Module, ABC):
             y: [S, B, T, out].
         """
 
-    def unroll_all(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes along any axes, those of a world's agents along the last one: [S, ..., T, in]."""
-        return self.unroll(x.flatten(1, -3), truncation).unflatten(1, x.shape[1:-2])
+    def unroll_agents(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Run over whole episodes of all agents of a world: [S, B, T, N, in] -> [S, B, T, N, out]."""
+        rows = x.transpose(2, 3)
+        return self.unroll(rows.flatten(1, 2), truncation).unflatten(1, rows.shape[1:3]).transpose(2, 3)
 
-    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return what `unroll_all` does, and a function from the gradient by it to those by the parameters in order.
+    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
+        """Return what `unroll_agents` does, without a graph, and its VJP, which autograd computes by default."""
+        outputs = self.unroll_agents(x, truncation)
 
-        By autograd, unless a network knows better.
-        """
-        outputs = self.unroll_all(x, truncation)
-
-        def pull(gradient: Tensor) -> list[Tensor]:
+        def vjp(slope: Tensor) -> list[Tensor]:
             parameters = list(self.parameters())
-            return [*torch.autograd.grad(outputs, parameters, gradient, allow_unused=True, materialize_grads=True)]
+            return [*torch.autograd.grad(outputs, parameters, slope, allow_unused=True, materialize_grads=True)]
 
-        return outputs.detach(), pull
+        return outputs.detach(), vjp
+
+
+class WithVJP(NamedTuple):
+    """What a network returned, and the way back from slopes by it.
+
+    Attributes:
+        tensor: without a graph.
+        vjp: see `VJP`.
+        parameters: that the VJP gives the slopes by.
+    """
+
+    tensor: Tensor
+    vjp: VJP
+    parameters: Sequence[Tensor]
 
 
 class Memoryless(Network):
@@ -133,5 +147,9 @@ class Memoryless(Network):
         return self(x), memory
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once."""
-        return self(x.flatten(1, 2)).unflatten(1, x.shape[1:3])
+        """Apply the network to all steps at once: [S, ..., in] -> [S, ..., out]."""
+        return self(x.flatten(1, -2)).unflatten(1, x.shape[1:-1])
+
+    def unroll_agents(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps of all agents; see `Network.unroll_agents`."""
+        return self.unroll(x, truncation) if self.team == 1 else super().unroll_agents(x, truncation)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import build_network
-from esp_cli.networks.contract import NetworkConfig, Pull
+from esp_cli.networks.contract import NetworkConfig, WithVJP
 from esp_cli.networks.io_spec import IoSpec, Reads
 from esp_envs.spec import TaskSpec
 
@@ -41,23 +41,21 @@ class Critic(nn.Module):
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
-        return self._values(self.network.unroll_all(self._rows(obs, state), truncation))
+        return self._values(self.network.unroll_agents(self._rows(obs, state), truncation))
 
-    def traced(self, obs: Tensor, state: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return what `unroll` does, and a function from the gradient by it to those by the parameters."""
-        values, pull = self.network.traced(self._rows(obs, state), truncation)
-
-        def pull_values(gradient: Tensor) -> list[Tensor]:
-            return pull(gradient.transpose(2, 3).unsqueeze(-1) if self.reads == "own" else gradient)
-
-        return self._values(values), pull_values
+    def unroll_with_vjp(self, obs: Tensor, state: Tensor, truncation: int = 0) -> WithVJP:
+        """Return what `unroll` does, for losses."""
+        outputs, vjp = self.network.unroll_with_vjp(self._rows(obs, state), truncation)
+        return WithVJP(
+            self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), [*self.network.parameters()]
+        )
 
     def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
-        """Return what the network reads, [S, B, T, width] or agent by agent [S, B, N, T, width]."""
-        if self.reads == "state":
-            return state
-        return obs.flatten(-2) if self.reads == "observations" else obs.transpose(2, 3)
+        """Return what the network reads, [S, B, T, 1 or N, width]."""
+        if self.reads == "own":
+            return obs
+        return (state if self.reads == "state" else obs.flatten(-2)).unsqueeze(3)
 
     def _values(self, outputs: Tensor) -> Tensor:
         """Return the values [S, B, T, C] that are in the network's outputs."""
-        return outputs.squeeze(-1).transpose(2, 3) if self.reads == "own" else outputs
+        return outputs.squeeze(4 if self.reads == "own" else 3)

@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from esp_cli.networks.contract import WithVJP
+from esp_cli.networks.policies import CategoricalPolicies, Frame, GaussianPolicies, divergence_by_choice
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 _INITIAL_STD = 0.6
@@ -115,7 +117,11 @@ class Categorical(Head):
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return KL[p || q] of two sets of log-probabilities: [S, B, N]."""
-        return (p.exp() * (p - q)).sum(-1)
+        return divergence_by_choice(p, q, p.exp()).sum(-1)
+
+    def policies(self, outputs: WithVJP, frame: Frame) -> CategoricalPolicies:
+        """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
+        return CategoricalPolicies(outputs, frame)
 
 
 class BoundedGaussian(Head):
@@ -143,9 +149,9 @@ class BoundedGaussian(Head):
         """Return the log deviation of each number, shaped to stand beside `like`: [S, ..., width]."""
         return self.log_std[:, self.item].view(-1, *[1] * (like.dim() - 2), self.num_outputs)
 
-    def by_item(self, by_numbers: Tensor) -> Tensor:
-        """Return the gradient by the parameter, from that by the log deviation of each number [S, width]."""
-        return torch.zeros_like(self.log_std).index_add_(1, self.item, by_numbers)
+    def policies(self, outputs: WithVJP, frame: Frame) -> GaussianPolicies:
+        """Return the policies that outputs [S, P B, T, N, width] are, for losses with slopes."""
+        return GaussianPolicies(outputs, frame, self.log_std, self.item)
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw standard normal noise [S, *shape, width], per seed from its own generator."""

@@ -46,7 +46,7 @@ class OneValue:
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
-        return critic.of_parts(seen, self.joint_action(action)).unflatten(1, seen.shape[1:-1])
+        return critic(seen, self.joint_action(action))
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q for its other actions, with the actions of all others fixed.

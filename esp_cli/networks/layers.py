@@ -7,14 +7,13 @@ learns the same alone and among ten.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.kernels.library import library
-from esp_cli.networks.kernels.perceptron import CompiledPass
-from esp_cli.networks.perceptron import Pass, Shape, activate_, affine, passed, perceptron
+from esp_cli.networks.perceptron import Shape, activate_, affine, perceptron, perceptron_with_vjp
 
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
 """Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
@@ -106,19 +105,11 @@ class SeedMLP(nn.Module):
         normed = sizes if activate_output else sizes[:-1]
         self.norms = nn.ModuleList(SeedLayerNorm(len(generators), w) for w in normed) if layer_norm else None
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map [S, B, in] to [S, B, out]."""
-        return self.of_parts(x)
-
-    def of_parts(self, *parts: Tensor, rows_innermost: bool = False) -> Tensor:
-        """Map rows whose numbers, side by side, are parts [S, ..., d], to [S, B, out]; see `Shape`."""
+    def forward(self, *parts: Tensor, rows_innermost: bool = False) -> Tensor:
+        """Map rows whose numbers, side by side, are parts [S, ..., d], to [S, ..., out]; see `Shape`."""
         if self.norms is not None:
-            return self._forward_normed((parts[0] if len(parts) == 1 else torch.cat(parts, -1)).flatten(1, -2))
+            return self._forward_normed(parts[0] if len(parts) == 1 else torch.cat(parts, -1))
         return self._from_layer(0, parts, rows_innermost)
-
-    def passed(self, x: Tensor) -> Pass | CompiledPass:
-        """Map [S, ..., in] as `of_parts` does, with a backward to call by hand; not with layer normalisation."""
-        return passed(self._shape(), [x], self._from(0))
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
         """Map what the first layer gives, x W_1 + b_1 before its activation, [S, B, H], to [S, B, out].
@@ -145,6 +136,10 @@ class SeedMLP(nn.Module):
                 x = self.norms[k + 1](x)
         return torch.cat(idle, 1).float().mean(1)
 
+    def forward_with_vjp(self, x: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
+        """Map [S, ..., in] as `forward` does, without a graph, and return the VJP; not with layer normalisation."""
+        return perceptron_with_vjp(self._shape(), [x], self._from(0))
+
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:
         return perceptron(self._shape(rows_innermost), parts, self._from(first))
 
@@ -157,10 +152,10 @@ class SeedMLP(nn.Module):
 
     def _forward_normed(self, x: Tensor) -> Tensor:
         assert self.norms is not None
-        x = self.norms[0](x)
+        lead, x = x.shape[1:-1], self.norms[0](x.flatten(1, -2))
         last = len(self.layers) - 1
         for k, layer in enumerate(self.layers):
             x = layer(x)
             if k < last or self.activate_output:
                 x = self.norms[k + 1](torch.relu(x) if self.activation == "relu" else torch.tanh(x))
-        return x
+        return x.unflatten(1, lead)

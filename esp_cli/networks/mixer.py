@@ -61,7 +61,7 @@ class MonotonicMixer(nn.Module):
 
     def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
         """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
-        rows = self.hypernetwork.of_parts(seen, rows_innermost=True)
+        rows = self.hypernetwork(seen, rows_innermost=True)
         return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
 
 

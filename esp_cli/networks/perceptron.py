@@ -7,7 +7,7 @@ the same and is the reference in the tests.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -52,24 +52,27 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
         parameters: W_1, b_1, ..., W_n, b_n.
 
     Returns:
-        [S, B, out], the rows in the order of the inputs' axes.
+        [S, ..., out], with the axes of the inputs.
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
+    return _pass(shape, inputs, parameters, keep=False).outputs.unflatten(1, inputs[0].shape[1:-1])
+
+
+def perceptron_with_vjp(
+    shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]
+) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
+    """Return what `perceptron` does, without a graph, and its VJP; nothing may change in place before that is used."""
+    with torch.no_grad():
+        run = _pass(shape, inputs, parameters, keep=True)
+    return run.outputs.unflatten(1, inputs[0].shape[1:-1]), lambda slope: run.backward(slope.flatten(1, -2))
+
+
+def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> _Pass | CompiledPass:
+    """Return a pass by the kernel where it is chosen, else by torch's operations; its outputs are [S, B, out]."""
     if computes(shape.compiled, inputs[0]):
-        return _compiled(shape, inputs, parameters, keep=False).outputs
-    if shape.precision != torch.float32:
-        parameters = [p.to(shape.precision) for p in parameters]
-    return _joined([_run(shape, x, parameters)[-1] for x in _pieces(shape, _flat(inputs))])
-
-
-def passed(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Pass | CompiledPass:
-    """Return a pass with a backward to call by hand, before which the inputs must not change; arguments as above."""
-    return (_compiled if computes(shape.compiled, inputs[0]) else Pass)(shape, inputs, parameters)
-
-
-def _compiled(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool = True) -> CompiledPass:
-    return CompiledPass(inputs, parameters, shape.activation, shape.activate_output, shape.rows_innermost, keep)
+        return CompiledPass(inputs, parameters, shape.activation, shape.activate_output, shape.rows_innermost, keep)
+    return _Pass(shape, inputs, parameters, keep)
 
 
 def _flat(inputs: Sequence[Tensor]) -> list[Tensor]:
@@ -113,24 +116,23 @@ def _run(shape: Shape, x: Tensor, parameters: Sequence[Tensor]) -> list[Tensor]:
     return run
 
 
-class Pass:
-    """A pass through a perceptron that keeps its activations until its `backward`; arguments as of `perceptron`.
+class _Pass:
+    """A pass through a perceptron that keeps its activations where there will be a backward; see `perceptron`."""
 
-    Attributes:
-        outputs: y.
-    """
-
-    @torch.no_grad()
-    def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> None:
-        parameters, inputs = [p.detach().to(shape.precision) for p in parameters], _flat(inputs)
+    def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> None:
+        if shape.precision != torch.float32:
+            parameters = [p.to(shape.precision) for p in parameters]
+        inputs = _flat(inputs)
         self._shape, self._size, self._weights = shape, _size(inputs[0]), parameters[::2]
-        self._runs = [_run(shape, piece, parameters) for piece in _pieces(shape, inputs)]
+        runs = (_run(shape, piece, parameters) for piece in _pieces(shape, inputs))
+        self._runs = list(runs) if keep else [run[-1:] for run in runs]
         self._widths = [x.shape[-1] for x in inputs]
         self.outputs = _joined([run[-1] for run in self._runs])
 
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by the parameters, of what has the gradient `grad` by the outputs."""
-        grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
+        with torch.no_grad():
+            grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
         return [g for g in grads if g is not None]
 
     def backward_to(
@@ -157,16 +159,16 @@ class _Perceptron(Function):
     @staticmethod
     def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
         inputs = tensors[:num_inputs]
-        ctx.sizes, ctx.run = [x.shape[1:-1] for x in inputs], passed(shape, inputs, tensors[num_inputs:])
+        ctx.num_inputs, ctx.run = num_inputs, _pass(shape, inputs, tensors[num_inputs:], keep=True)
         ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
+        return ctx.run.outputs.detach().unflatten(1, inputs[0].shape[1:-1])
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _ = ctx.saved_tensors
-        first = 2 + len(ctx.sizes)
-        grads, below = ctx.run.backward_to(grad, ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first])
-        below = [None if x is None else x.unflatten(1, size) for x, size in zip(below, ctx.sizes, strict=True)]
+        inputs, first = ctx.saved_tensors[: ctx.num_inputs], 2 + ctx.num_inputs
+        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first]
+        grads, below = ctx.run.backward_to(grad.flatten(1, -2), learns, asked)
+        below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, inputs, strict=True)]
         return None, None, *below, *grads
 
 

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Memoryless, Network, NetworkConfig, Pull
+from esp_cli.networks.contract import VJP, ActivationName, Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.perceptron import Shape, perceptron
@@ -88,20 +88,13 @@ class MLP(SeedMLP, Memoryless):
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
 
-    def unroll_all(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once, wherever they lie in memory."""
-        return self.of_parts(x).unflatten(1, x.shape[1:-1])
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        """Apply the network to all steps at once, wherever they lie in memory; see `Memoryless.unroll`."""
+        return self(x)
 
-    def traced(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return outputs and the way back; see `Network.traced`."""
-        if self.norms is not None:
-            return super().traced(x, truncation)
-        run = self.passed(x)
-
-        def pull(gradient: Tensor) -> list[Tensor]:
-            return run.backward(gradient.flatten(1, -2))
-
-        return run.outputs.unflatten(1, x.shape[1:-1]), pull
+    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
+        """Return outputs and VJP; see `Network.unroll_with_vjp`."""
+        return super().unroll_with_vjp(x, truncation) if self.norms is not None else self.forward_with_vjp(x)
 
 
 class GRU(Network):
@@ -127,9 +120,8 @@ class GRU(Network):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
-        size = (x.shape[2], x.shape[1])
-        memories = self.gru.unroll(self.body.of_parts(x.transpose(1, 2)).unflatten(1, size), truncation).flatten(1, 2)
-        return self._said(self.norm(memories)).unflatten(1, size).transpose(1, 2)
+        memories = self.gru.unroll(self.body(x.transpose(1, 2)), truncation)
+        return self._said(self.norm(memories.flatten(1, 2))).unflatten(1, memories.shape[1:3]).transpose(1, 2)
 
     def _said(self, rows: Tensor) -> Tensor:
         """Return the outputs for memories [S, B, H]."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import Network, NetworkConfig, build_network
-from esp_cli.networks.contract import Pull
+from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.io_spec import IoSpec
@@ -93,15 +93,12 @@ class StochasticPolicy(Policy):
 
     def unroll(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""
-        return self._normalised(self.rows(obs, truncation).transpose(2, 3), action_mask)
+        return self._normalised(self.actor.unroll_agents(obs, truncation), action_mask)
 
-    def rows(self, obs: Tensor, truncation: int = 0) -> Tensor:
-        """Return the actor's outputs as they are, agent by agent: [S, B, N, T, outputs]; see `unroll`."""
-        return self.actor.unroll_all(obs.transpose(2, 3), truncation)
-
-    def traced(self, obs: Tensor, truncation: int = 0) -> tuple[Tensor, Pull]:
-        """Return what `rows` does, and a function from the gradient by it to those by the actor's parameters."""
-        return self.actor.traced(obs.transpose(2, 3), truncation)
+    def unroll_with_vjp(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> WithVJP:
+        """Return the outputs as they are but for the mask, for losses; see `unroll`."""
+        outputs, vjp = self.actor.unroll_with_vjp(obs, truncation)
+        return WithVJP(masked(outputs, action_mask), vjp, [*self.actor.parameters()])
 
 
 class HistoryPolicy(Policy):
@@ -163,10 +160,10 @@ class HistoryPolicy(Policy):
         Returns:
             [S, B, T + 1, N, outputs], one row for each row of `obs`.
         """
-        rows = obs.transpose(2, 3)
+        rows = obs
         if self.recurrent:
             done = self.head.encode(action)
             previous = torch.cat([torch.zeros_like(done[:, :, :1]), done], 2)[:, :, : obs.shape[2]]
-            rows = torch.cat([rows, previous.transpose(2, 3)], -1)
+            rows = torch.cat([rows, previous], -1)
         allowed = None if action_mask is None else action_mask[:, :, : obs.shape[2]]
-        return self._normalised(self.actor.unroll_all(rows).transpose(2, 3), allowed)
+        return self._normalised(self.actor.unroll_agents(rows), allowed)

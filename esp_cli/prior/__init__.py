@@ -3,8 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 from esp_cli.prior.copies import Copies
+from esp_cli.prior.loss import Loss, Term
 from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
-from esp_cli.prior.seed_batch import SeedBatch, mean_per_seed
+from esp_cli.prior.seed_batch import SeedBatch, average, mean_per_seed, shares
 from esp_cli.prior.symmetry_prior import Answers, SymmetryPrior
 
 if TYPE_CHECKING:
@@ -13,11 +14,15 @@ if TYPE_CHECKING:
 __all__ = [
     "Answers",
     "Copies",
+    "Loss",
     "PriorConfig",
     "SeedBatch",
     "SymmetryPrior",
+    "Term",
+    "average",
     "mean_per_seed",
     "policy_consistency_loss",
+    "shares",
     "value_consistency_loss",
 ]
 

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Generic, Protocol
+from typing import TYPE_CHECKING, Any, Generic
 
 import torch
 from torch import Tensor
 
-from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
-from esp_cli.prior.seed_batch import Rows, mean_per_seed
+from esp_cli.prior.frame import Frame, Values
+from esp_cli.prior.loss import Loss, OfGraph, Term
+from esp_cli.prior.losses import policy_consistency_loss, policy_gap, value_gap
+from esp_cli.prior.seed_batch import Rows, average, shares
 from esp_cli.symmetry import Transform
 
 if TYPE_CHECKING:
     from esp_cli.prior.config import PriorConfig
-
-
-class Divergent(Protocol):
-    """A policy's head: it says how far two policies, given by their outputs, are apart."""
-
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return how far the policy with outputs p is from that with outputs q: [S, B, ..., N]."""
 
 
 class Copies(Generic[Rows]):
@@ -45,6 +40,7 @@ class Copies(Generic[Rows]):
     ) -> None:
         self.config, self.originals, self.transforms = config, originals, list(transforms)
         self.augments, self.adapt = augments and bool(self.transforms), adapt
+        self._made: dict[int, Any] = {}
 
     @cached_property
     def rows(self) -> Rows:
@@ -64,9 +60,13 @@ class Copies(Generic[Rows]):
         return self._pushed(self.originals.state, lambda g: g.state)
 
     @cached_property
-    def action(self) -> Tensor:
-        """The actions of `rows` alone."""
-        return self._pushed(self.originals.action, lambda g: g.action)
+    def action_mask(self) -> Tensor | None:
+        """The allowed actions of `rows`."""
+        mask = self.originals.action_mask
+        return None if mask is None else self._pushed(mask, lambda g: g.push_outputs)
+
+    def _pushed(self, x: Tensor, push: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
+        return torch.cat([x, *(push(g)(x) for g in self.transforms)], 1) if self.transforms else x
 
     def chunks(self, size: int) -> list[Copies[Rows]]:
         """Cut the originals into pieces of at most `size`, each with its own copies."""
@@ -79,30 +79,56 @@ class Copies(Generic[Rows]):
         ]
 
     @property
-    def batch(self) -> Rows:
+    def loss_rows(self) -> Rows:
         """The rows that the learner's own loss takes: with the copies, or the originals alone."""
         return self.rows if self.augments else self.originals
 
-    def learned(self, x: Tensor) -> Tensor:
-        """Return the part of x [S, B (1 + copies), ...] that the learner's own loss takes."""
+    def for_loss(self, x: Tensor) -> Tensor:
+        """Return the part of x [S, B (1 + copies), ...] that belongs to `loss_rows`."""
         return x if self.augments else self.original(x)
 
     def original(self, x: Tensor) -> Tensor:
         """Return the part of x [S, B (1 + copies), ...] that belongs to the originals."""
         return x[:, : self.originals.count] if self.transforms else x
 
-    def inherited(self, target: Tensor) -> Tensor:
-        """Return targets [S, B, ..., C] for all that is learned: a copy keeps that of its original (Prop. 1)."""
-        if not self.augments:
-            return target
-        return torch.cat([target, *(g.per_agent(target) for g in self.transforms)], 1)
-
-    def repeated(self, x: Tensor) -> Tensor:
-        """Return x [S, B, ...] once for each part of what is learned."""
+    def tiled(self, x: Tensor) -> Tensor:
+        """Return x [S, B, ...] of the originals for all `loss_rows`, the same for each copy."""
         return torch.cat([x] * (1 + len(self.transforms)), 1) if self.augments else x
 
-    def penalty(self, policy: tuple[Divergent, Tensor] | None = None, value: Tensor | None = None) -> Tensor:
-        """Return c times the sum of the consistency terms that are on (Eq. 10): [S], or 0 where the loss is off.
+    @cached_property
+    def frame(self) -> Frame:
+        """The originals' frame."""
+        return Frame(self.transforms)
+
+    @property
+    def learned(self) -> int:
+        """How many parts of the rows, originals and copies, the learner's own loss takes."""
+        return 1 + len(self.transforms) if self.augments else 1
+
+    def in_frame(self, name: str) -> Tensor:
+        """Return a field of numbers per agent or per world of what is learned from: [S, 1 or 1 + copies, R].
+
+        Copies share that of their original unless the learner adapts them.
+        """
+        if self.adapt is None or not self.augments:
+            return getattr(self.originals, name).flatten(1).unsqueeze(1)
+        return self.frame.pull_values(getattr(self.rows, name)).flatten(2)
+
+    def policies(self, head: Any, outputs: Any) -> Any:
+        """Return outputs for all rows [S, B (1 + copies), ...] as policies, made once; see `networks.policies`."""
+        return self._once(outputs, lambda: head.policies(_returned(outputs), self.frame))
+
+    def values(self, values: Any) -> Values:
+        """Return values for all rows [S, B (1 + copies), ..., C] in the frame, made once."""
+        return self._once(values, lambda: Values(_returned(values), self.frame))
+
+    def _once(self, tensor: Any, make: Callable[[], Any]) -> Any:
+        if id(tensor) not in self._made:
+            self._made[id(tensor)] = make()
+        return self._made[id(tensor)]
+
+    def penalty(self, policy: tuple[Any, Any] | None = None, value: Any = None) -> Loss:
+        """Return c times the sum of the consistency terms that are on (Eq. 10), or nothing where the loss is off.
 
         Args:
             policy: a head and its outputs for all rows [S, B (1 + copies), ..., N, A]; None leaves S_pi out.
@@ -110,36 +136,32 @@ class Copies(Generic[Rows]):
         """
         coefficient, terms = self.config.coefficient, self.config.terms
         if not self.transforms or coefficient == 0:
-            return torch.zeros(())
-        gaps = self.gaps(policy if terms != "value" else None, value if terms != "policy" else None)
-        return coefficient * sum(gaps.values(), start=torch.zeros(()))
+            return Loss()
+        gaps = self._gaps(policy if terms != "value" else None, value if terms != "policy" else None)
+        return coefficient * Loss(*(term for gap in gaps.values() for term in gap.terms))
 
-    def gaps(self, policy: tuple[Divergent, Tensor] | None = None, value: Tensor | None = None) -> dict[str, Tensor]:
+    def gaps(self, policy: tuple[Any, Any] | None = None, value: Any = None) -> dict[str, Tensor]:
         """Return S_pi (Eq. 8) under "policy" and S_V (Eq. 9) or S_Q (supplement eq. 19) under "value".
 
         Each is averaged over the copies and the rows that count, [S]; arguments as of `penalty`.
         """
-        stop, gaps = self.config.stop_gradient, dict[str, Tensor]()
-        if policy is not None:
-            head, outputs = policy
-            gaps["policy"] = self._mean(
-                outputs,
-                lambda g, moved, here: policy_consistency_loss(head.divergence, g.pull_back(moved), here, stop),
-                self.originals.mask,
-            )
+        return {name: gap.value for name, gap in self._gaps(policy, value).items()}
+
+    def _gaps(self, policy: tuple[Any, Any] | None, value: Any) -> dict[str, Loss]:
+        stop, gaps, rows = self.config.stop_gradient, dict[str, Loss](), self.originals
+        if policy is not None and hasattr(policy[0], "policies"):
+            gaps["policy"] = Loss(Term(self.policies(*policy), 1.0, policy_gap(rows.mask, stop)))
+        elif policy is not None:
+            head, outputs = policy[0], self.frame.pull_outputs(policy[1])
+            gap = policy_consistency_loss(head.divergence, outputs[:, 1:], outputs[:, :1], stop).flatten(2)
+            gaps["policy"] = Loss.of(average(gap, shares(rows.mask, gap.shape)))
         if value is not None:
-            gaps["value"] = self._mean(
-                value,
-                lambda g, moved, here: value_consistency_loss(g.values(moved), here, stop),
-                self.originals.valued(value.shape[-1]),
+            gaps["value"] = Loss(
+                Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).tensor.shape[-1]), stop))
             )
         return gaps
 
-    def _pushed(self, x: Tensor, push: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
-        return torch.cat([x, *(push(g)(x) for g in self.transforms)], 1) if self.transforms else x
 
-    def _mean(self, x: Tensor, gap: Callable[[Transform, Tensor, Tensor], Tensor], mask: Tensor | None) -> Tensor:
-        """Return the mean [S], over the copies and what a mask counts, of the gap between each and the originals."""
-        here, *moved = x.split(self.originals.count, 1)
-        parts = zip(self.transforms, moved, strict=True)
-        return torch.stack([mean_per_seed(gap(g, copy, here), mask) for g, copy in parts]).mean(0)
+def _returned(x: Any) -> Any:
+    """Return what a network returned, a tensor among it as one that autograd knows."""
+    return OfGraph(x) if isinstance(x, Tensor) else x

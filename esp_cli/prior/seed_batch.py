@@ -116,3 +116,32 @@ def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
     elif x.dim() > mask.dim():
         x = x.flatten(mask.dim()).mean(-1)
     return torch.where(mask, x, 0.0).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+
+
+def shares(mask: Tensor | None, shape: Sequence[int]) -> Tensor | float:
+    """Return the share of each number of x [S, P, R] in the mean of each seed over parts and over what counts.
+
+    Args:
+        mask: [S, B, T] which rows count, or [S, B, T, N] of which agents; all where it is None.
+        shape: of x; R counts B, T and one number per world or N of the agents.
+
+    Returns:
+        A number, or [S, 1, R].
+    """
+    if mask is None:
+        return 1.0 / (shape[1] * shape[2])
+    numbers = shape[2] // mask[0, ..., 0].numel() if mask.dim() > 3 else shape[2] // mask[0].numel()
+    if mask.dim() == 3:
+        mask = mask.unsqueeze(-1).expand(-1, -1, -1, numbers)
+    elif numbers != mask.shape[-1]:
+        mask = mask.any(-1, keepdim=True)
+    mask = mask.flatten(1).unsqueeze(1)
+    return mask / (mask.sum(2, keepdim=True).clamp_min(1) * shape[1])
+
+
+def average(x: Tensor, share: Tensor | float) -> Tensor:
+    """Return the mean [S] of x [S, P, R] with these shares; 0 where nothing counts."""
+    if isinstance(share, float):
+        return x.flatten(1).mean(1)
+    counts = (share > 0).expand_as(x)
+    return torch.where(counts, x, 0.0).flatten(1).sum(1) / counts.flatten(1).sum(1).clamp_min(1)

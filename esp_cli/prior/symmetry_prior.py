@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import torch
 from torch import Tensor
 
-from esp_cli.prior.copies import Copies, Divergent
+from esp_cli.prior.copies import Copies
 from esp_cli.prior.gate import Gate, gated, moved_share
 from esp_cli.prior.seed_batch import Rows, SeedBatch
 from esp_cli.symmetry import Transform, carried_groups, transform_set
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Answers(TypedDict, total=False):
     """What networks say of rows: see `Copies.gaps`."""
 
-    policy: tuple[Divergent, Tensor]
+    policy: tuple[Any, Tensor]
     value: Tensor
 
 
@@ -129,6 +129,10 @@ class SymmetryPrior:
         """
         used = self.augments or self.config.coefficient > 0
         return Copies(self.config, batch, self._chosen(batch, generators) if used else [], self.augments, adapt)
+
+    def alone(self, batch: Rows) -> Copies[Rows]:
+        """Return a batch without copies, as a learner's losses take it."""
+        return Copies(self.config, batch, [], augments=False)
 
     def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
         """Return the copies of new experience that a replay stores with it."""

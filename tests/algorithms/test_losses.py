@@ -1,19 +1,9 @@
 """The learners' equations against numbers worked out by hand."""
 
-import math
-
 import pytest
 import torch
 
-from esp_cli.algorithms.losses import (
-    clipped_surrogate,
-    explained_variance,
-    gae,
-    huber,
-    normalise_per_seed,
-    td_targets,
-    value_loss,
-)
+from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed, td_targets
 from esp_cli.prior import mean_per_seed
 
 
@@ -56,34 +46,6 @@ def test_gae_with_lambda_one_is_the_discounted_return_minus_the_value():
     discounts = 0.9 ** torch.arange(6, dtype=torch.float64)
     expected = (reward[:, :, :, 0] * discounts).sum(-1) + 0.9**6 * value[:, :, 6, 0] - value[:, :, 0, 0]
     torch.testing.assert_close(advantage[:, :, 0, 0], expected)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "advantage", "expected"),
-    [
-        (1.1, 2.0, 2.2),  # inside the clip range
-        (1.5, 2.0, 2.4),  # gain is capped at 1.2 A
-        (0.5, 2.0, 1.0),  # a loss of probability is not capped for a good action
-        (0.5, -2.0, -1.6),  # gain is capped at 0.8 A
-        (1.5, -2.0, -3.0),  # a bad action made likelier counts in full
-    ],
-)
-def test_clipped_surrogate_by_hand(ratio, advantage, expected):
-    value = clipped_surrogate(torch.tensor(math.log(ratio)), torch.tensor(advantage), 0.2)
-    assert value.item() == pytest.approx(expected, rel=1e-6)
-
-
-def test_huber_is_quadratic_inside_and_linear_outside():
-    # delta = 10: 3^2 / 2 = 4.5; at 12: 10 * (12 - 5) = 70; both meet at 10: 50
-    assert huber(torch.tensor([3.0, -3.0, 10.0, 12.0, -12.0]), 10.0).tolist() == [4.5, 4.5, 50.0, 70.0, 70.0]
-
-
-def test_clipped_value_loss_takes_the_larger_error():
-    value, target, old = torch.tensor([2.0, 0.1]), torch.tensor([3.0, 3.0]), torch.tensor([0.0, 0.0])
-    # clipped predictions are 0.2 and 0.1; errors 1 against 2.8, and 2.9 against 2.9
-    expected = torch.tensor([0.5 * 2.8**2, 0.5 * 2.9**2])
-    torch.testing.assert_close(value_loss(value, target, 10.0, old, 0.2), expected)
-    torch.testing.assert_close(value_loss(value, target, 10.0), torch.tensor([0.5, 0.5 * 2.9**2]))
 
 
 def test_explained_variance_of_perfect_constant_and_opposite_predictions():

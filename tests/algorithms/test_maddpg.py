@@ -165,11 +165,9 @@ def test_actor_and_critic_have_rates_of_their_own():
     assert moved == [pytest.approx(1e-4, rel=0.05), pytest.approx(4e-3, rel=0.05)]
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_the_actors_loss_is_in_units_of_one_steps_reward(closed):
+def test_the_actors_loss_is_in_units_of_one_steps_reward():
     """A critic that says 2 of everything: values are over the root of 25 steps, so the loss is -5 x 2."""
     trained, episodes = prepared(prior__kind="none")
-    trained._closed_form = closed
     linear_critic(trained, torch.zeros(5))
     trained.critic.layers[0].bias.data.fill_(2.0)
     metrics = trained._learn_actor(trained.prior.copies(episodes, []), trained._critic_rows(episodes)[:, :, :-1])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from esp_cli.algorithms.rollout import Batch, values_along
+from esp_cli.networks.contract import WithVJP
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
@@ -231,14 +232,14 @@ def test_the_final_states_of_cut_episodes_alone_are_valued_and_ends_have_no_valu
 @pytest.mark.parametrize("group", ["actor", "critic"])
 def test_a_gradient_that_is_not_finite_stops_its_seed(group):
     trained = learner()
-    step = trained.optimiser.step
+    step = trained.optimiser.apply
 
     def broken(gradient):
         norms = dict(zip(("actor", "critic"), step(gradient), strict=True))
         norms[group][1] = torch.nan
         return [*norms.values()]
 
-    trained.optimiser.step = broken
+    trained.optimiser.apply = broken
     result = trained.iterate(0.0)
     assert result.finite.tolist() == [True, False]
     assert all(result.metrics[f"train/{name}"].isfinite().all() for name in ("policy_loss", "value_loss"))
@@ -376,10 +377,10 @@ def test_value_clipping_by_hand(clip, expected):
     batch, _ = trained.prepare(trained.collector.collect(25))
     value = torch.full_like(batch.value, 2.0)
     batch = replace(batch, value=value * 0, target=value + 1, advantage=torch.zeros_like(batch.advantage))
-    trained.critic.unroll = lambda *args: value
+    trained.critic.unroll_with_vjp = lambda *args: WithVJP(value, lambda slope: [slope], [])
     sums = {}
-    loss = trained.reference_loss(trained.prior.copies(batch, []), 0.0, 1.0, sums)
-    torch.testing.assert_close(loss.detach(), torch.full((2,), expected))
+    loss = trained.loss(trained.prior.copies(batch, []), 0.0, 1.0, sums)
+    torch.testing.assert_close(loss.value, torch.full((2,), expected))
     torch.testing.assert_close(sums["value_loss"], torch.full((2,), expected))
 
 

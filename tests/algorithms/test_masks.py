@@ -119,7 +119,7 @@ def test_a_masked_action_never_enters_a_targets_maximum(algorithm):
     def constant(rows, *rest):
         return values.expand(*rows.shape[:-1], 5)
 
-    trained.policy.actor.unroll_all = trained.target_policy.actor.unroll_all = constant
+    trained.policy.actor.unroll_agents = trained.target_policy.actor.unroll_agents = constant
     if algorithm == "qmix":
         seen = []
         trained.target_mixer.forward = lambda chosen, state: seen.append(chosen) or chosen.sum(-1)

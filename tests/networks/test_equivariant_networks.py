@@ -355,7 +355,7 @@ def test_a_relaxed_network_begins_equivariant_and_can_give_it_up(relaxation: str
 @pytest.mark.parametrize(("relax", "relaxation"), [(0.0, "weights"), (0.5, "residual"), (0.5, "weights")])
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("settings", [{}, {"actions": "continuous"}], ids=["directions", "forces"])
-def test_the_way_back_by_hand_is_that_of_autograd_through_the_layers(relax, relaxation, activation, settings) -> None:
+def test_the_vjp_is_that_of_autograd_through_the_layers(relax, relaxation, activation, settings) -> None:
     """Also where outputs are forces: vectors, whose bias is 0 and no parameter."""
     spec, obs, _ = scene("navigation", **settings)
     config = NETWORKS["equivariant"](
@@ -365,14 +365,14 @@ def test_the_way_back_by_hand_is_that_of_autograd_through_the_layers(relax, rela
     network = build_network(generators(0, 1), spec.observation.width, width, config, 1.0, IoSpec(spec, "own"))
     stir(network)
     x = torch.randn_like(obs).flatten(1, 2).unsqueeze(2)
-    outputs, pull = network.traced(x)
+    outputs, vjp = network.unroll_with_vjp(x)
     first, second, last = network.layers
     act = getattr(torch, activation)
     expected = last(act(second(act(first(x.flatten(1, 2)))))).unsqueeze(2)
     torch.testing.assert_close(outputs, expected.detach())
     torch.testing.assert_close(network.unroll(x), expected)
     gradient, parameters = torch.randn_like(outputs), [*network.parameters()]
-    found = pull(gradient)
+    found = vjp(gradient)
     for ours, theirs in zip(found, torch.autograd.grad(expected, parameters, gradient), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
     assert all(ours.abs().max() > 0 for ours in found), "negative control: no gradient is empty"

@@ -59,7 +59,7 @@ def test_parts_side_by_side_equal_whole_rows_and_get_gradients_where_they_ask(ro
     mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0)
     fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
     ours, theirs = (
-        mlp.of_parts(fixed, moving, rows_innermost=rows_innermost),
+        mlp(fixed, moving, rows_innermost=rows_innermost),
         reference(mlp, torch.cat([fixed, moving], -1)),
     )
     torch.testing.assert_close(ours, theirs)
@@ -156,14 +156,14 @@ def test_unrolling_an_episode_equals_stepping_through_it(name):
 
 
 @pytest.mark.parametrize(("name", "norm"), [("mlp", False), ("mlp", True), ("gru", False)])
-def test_the_way_back_by_hand_is_that_of_autograd(name, norm):
+def test_the_vjp_is_that_of_autograd(name, norm):
     network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8, 8), layer_norm=norm), 1.0)
-    x, gradient = torch.randn(2, 2, 3, 5, 6), torch.randn(2, 2, 3, 5, 3)  # episodes along two axes
-    outputs, pull = network.traced(x)
-    expected = network.unroll(x.flatten(1, 2)).unflatten(1, (2, 3))
+    x, gradient = torch.randn(2, 2, 3, 5, 6), torch.randn(2, 2, 3, 5, 3)  # episodes of five agents
+    outputs, vjp = network.unroll_with_vjp(x)
+    expected = network.unroll_agents(x)
     torch.testing.assert_close(outputs, expected.detach())
     assert not outputs.requires_grad
-    found, parameters = pull(gradient), list(network.parameters())
+    found, parameters = vjp(gradient), list(network.parameters())
     for ours, theirs in zip(found, torch.autograd.grad(expected, parameters, gradient), strict=True):
         torch.testing.assert_close(ours, theirs)
     assert all(ours.abs().max() > 0 for ours in found), "negative control: no gradient is empty"

@@ -70,12 +70,12 @@ def test_originals_come_first_and_copies_follow_transformed():
 def test_what_is_learned_from_depends_on_the_kind():
     batch, values = rows(), torch.arange(12.0).view(2, 6, 1, 1)
     learned = {kind: prior(kind=kind).copies(batch, []) for kind in ("esp", "augment", "consistency")}
-    assert [learned[kind].batch.count for kind in learned] == [6, 6, 3]
-    assert [learned[kind].learned(values).shape[1] for kind in learned] == [6, 6, 3]
+    assert [learned[kind].loss_rows.count for kind in learned] == [6, 6, 3]
+    assert [learned[kind].for_loss(values).shape[1] for kind in learned] == [6, 6, 3]
     assert learned["esp"].original(values).flatten().tolist() == [0, 1, 2, 6, 7, 8]
     none = prior(kind="none").copies(batch, [])
     assert none.rows is batch
-    assert none.penalty(value=values[:, :3]).item() == 0
+    assert none.penalty(value=values[:, :3]).value.item() == 0
 
 
 @pytest.mark.parametrize(
@@ -89,11 +89,11 @@ def test_copies_are_made_of_batches_or_stored_in_a_replay(replays, replay, in_ba
     assert [made.num_stored, len(made.stored(batch, []))] == [beside, beside]
 
 
-def test_a_copy_inherits_the_target_of_its_original_and_agents_take_theirs_along():
+def test_values_of_copies_come_back_to_the_originals_agents():
     made = prior(transforms="agents-1-0").copies(rows(1, 1), [])
-    assert made.inherited(torch.tensor([[[[1.0, 2.0]]]])).flatten().tolist() == [1, 2, 2, 1]
-    assert made.inherited(torch.tensor([[[[3.0]]]])).flatten().tolist() == [3, 3]
-    assert made.repeated(torch.tensor([[[[1.0, 2.0]]]])).flatten().tolist() == [1, 2, 1, 2]
+    assert made.frame.pull_values(torch.tensor([1.0, 2, 2, 1]).view(1, 2, 1, 2)).flatten().tolist() == [1, 2, 1, 2]
+    assert made.frame.pull_values(torch.tensor([3.0, 4]).view(1, 2, 1, 1)).flatten().tolist() == [3, 4]
+    assert made.tiled(torch.tensor([[[[1.0, 2.0]]]])).flatten().tolist() == [1, 2, 1, 2]
 
 
 def test_a_learner_adapts_copies_and_no_original():
@@ -110,7 +110,7 @@ def test_the_penalty_by_hand():
     values = torch.tensor([3.0, 3, 3, 1, 1, 1]).view(1, 6, 1, 1).expand(2, 6, 1, 1)
 
     def penalty(**choice):
-        return prior(**choice).copies(rows(), []).penalty(policy=(Squared(), logits), value=values).tolist()
+        return prior(**choice).copies(rows(), []).penalty(policy=(Squared(), logits), value=values).value.tolist()
 
     assert penalty() == [0.5 * (2 + 4)] * 2
     assert penalty(terms="policy") == [0.5 * 2] * 2

@@ -152,8 +152,8 @@ def test_a_prior_of_no_strength_makes_no_copies_and_draws_nothing() -> None:
     own = generators()
     made = faded(0.5).copies(rows(), own)
     assert made.transforms == []
-    assert made.batch is made.originals
-    assert made.penalty(value=torch.randn(2, 3, 1, 1)) == 0
+    assert made.loss_rows is made.originals
+    assert made.penalty(value=torch.randn(2, 3, 1, 1)).value == 0
     assert all(torch.equal(g.get_state(), new.get_state()) for g, new in zip(own, generators(), strict=True))
 
 
@@ -171,7 +171,7 @@ def test_a_copy_by_the_identity_equals_its_original_and_costs_no_penalty() -> No
     assert torch.equal(here[1], there[1])
     logits = torch.tensor([1.0, 0, 0, 0]).expand(2, 6, 1, 2, 4)
     values = torch.tensor([3.0, 3, 3, 3, 3, 3]).view(1, 6, 1, 1).expand(2, 6, 1, 1)
-    assert made.penalty(policy=(Squared(), logits), value=values).tolist() == [0.5 * 2, 0.0]
+    assert made.penalty(policy=(Squared(), logits), value=values).value.tolist() == [0.5 * 2, 0.0]
 
 
 @pytest.mark.parametrize("algorithm", SMALL)

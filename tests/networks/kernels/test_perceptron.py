@@ -75,7 +75,7 @@ def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits(rows):
 def test_parts_side_by_side_and_frozen_parameters():
     mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0, compiled=True).requires_grad_(False)
     fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
-    ours = mlp.of_parts(fixed, moving, rows_innermost=True)
+    ours = mlp(fixed, moving, rows_innermost=True)
     theirs = reference(mlp, torch.cat([fixed, moving], -1))
     assert ours.transpose(1, 2).is_contiguous()
     torch.testing.assert_close(ours, theirs)
@@ -93,7 +93,7 @@ def test_parts_may_lie_anyhow_in_memory(axes):
     cut = torch.randn(2, 6, 5, 9, 4)[:, :, :, 1:8]
     assert moved.shape == size
     parts = [cut, moved.requires_grad_(), shared]
-    ours, theirs = mlp.of_parts(*parts), reference(mlp, torch.cat(parts, -1).flatten(1, 3))
+    ours, theirs = mlp(*parts).flatten(1, -2), reference(mlp, torch.cat(parts, -1).flatten(1, 3))
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-5)
     wanted = [moved, *mlp.parameters()]
     assert_same_gradients(ours, theirs, torch.randn(2, 210, 3), wanted, rtol=1e-4, atol=1e-4)
@@ -103,7 +103,7 @@ def test_parts_may_lie_anyhow_in_memory(axes):
 def test_a_change_of_inputs_before_the_backward_is_noticed(compiled):
     mlp = SeedMLP(generators(0), (5, 16, 3), "tanh", 1.0, compiled=compiled)
     x, more = torch.randn(1, 7, 4), torch.randn(1, 7, 1)
-    y = mlp.of_parts(x, more)
+    y = mlp(x, more)
     x.zero_()
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         y.sum().backward()
@@ -123,7 +123,7 @@ def test_inputs_of_other_shapes_or_numbers_are_refused(parts):
     """The kernel would read foreign memory."""
     mlp = SeedMLP(generators(0), (5, 16, 3), "tanh", 1.0, compiled=True)
     with pytest.raises(ValueError, match=r"a perceptron for float32 rows \[1, ..., 5\] got"):
-        mlp.of_parts(*parts)
+        mlp(*parts)
 
 
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
@@ -140,8 +140,8 @@ def test_a_frozen_parameter_leaves_the_others_their_gradients(frozen, compiled):
 def test_rows_along_more_axes_than_the_kernel_counts_are_copied():
     mlp = SeedMLP(generators(0), (2, 16, 3), "relu", 1.0, compiled=True)
     x = torch.randn(2, 3, 4, 5, 2, 1).permute(5, 3, 0, 2, 1, 4)
-    torch.testing.assert_close(mlp.of_parts(x), reference(mlp, x.flatten(1, -2)), rtol=1e-5, atol=1e-5)
-    assert mlp.of_parts(x[:, :, :0]).shape == (1, 0, 3)
+    torch.testing.assert_close(mlp(x).flatten(1, -2), reference(mlp, x.flatten(1, -2)), rtol=1e-5, atol=1e-5)
+    assert mlp(x[:, :, :0]).shape == (1, *x[:, :, :0].shape[1:-1], 3)
 
 
 @needs_compiler

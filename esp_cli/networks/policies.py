@@ -1,0 +1,203 @@
+"""Policies at originals and at copies of them, in one frame, with the slopes of what losses are made of.
+
+Shape letters: S seeds, P parts (the originals and K copies of them), R rows of a part (B scenes, T steps, N agents), A
+actions, W numbers of a continuous action. The first L parts are those that a learner's own loss takes: all, or the
+originals.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from esp_cli.networks.contract import WithVJP
+
+_HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
+
+Weights = Tensor | float
+"""A number, or [S, 1, R]."""
+
+
+class Frame(Protocol):
+    """Brings outputs for copies back to the originals, and slopes to the copies; see `prior.frame.Frame`."""
+
+    def pull_outputs(self, outputs: Tensor) -> Tensor:
+        """Return outputs [S, P B, T, N, ...] in the frame: [S, P, B, T, N, ...]."""
+
+    def push_outputs(self, outputs: Tensor) -> Tensor:
+        """Undo `pull_outputs`."""
+
+
+class Policies(Protocol):
+    """What a network outputs for originals and copies, as policies.
+
+    A slope is None at first; `add_...` return it with more added.
+    """
+
+    def log_prob(self, action: Tensor, learned: int) -> Tensor:
+        """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
+
+    def entropy(self, learned: int) -> Tensor:
+        """Return the entropies [S, L, R]."""
+
+    def divergence(self, copies: slice, originals: slice) -> Tensor:
+        """Return KL[copy || original] [S, K, R] of some parts."""
+
+    def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
+        """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
+
+    def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
+        """Add the slope of the sum of divergences times weights; see `PriorConfig` for `stop_gradient`."""
+
+    def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
+        """Return what networks returned, and the slopes by it."""
+
+
+class CategoricalPolicies:
+    """Choices among A actions with probabilities softmax(outputs).
+
+    A slope is by the log-probabilities [S, A, P, R], up to a multiple of the probabilities, which the softmax takes
+    away. The action axis comes first; see `Categorical.normalise`.
+
+    Args:
+        outputs: [S, P B, T, N, A] logits, under autograd.
+        frame: of the originals.
+    """
+
+    def __init__(self, outputs: WithVJP, frame: Frame) -> None:
+        self._outputs, self._frame = outputs, frame
+        logits = frame.pull_outputs(outputs.tensor)
+        self._shape = logits.shape
+        self.log_probs = torch.log_softmax(logits.movedim(-1, 1).flatten(3), 1)
+        self.probs = self.log_probs.exp()
+        self._inner = self.probs * self.log_probs
+
+    def log_prob(self, action: Tensor, learned: int) -> Tensor:
+        """Return log pi(action) [S, L, R]."""
+        return self.log_probs.gather(1, _index(action, learned)).squeeze(1)
+
+    def entropy(self, learned: int) -> Tensor:
+        """Return - sum_a pi(a) log pi(a): [S, L, R]."""
+        return self._inner[:, :, :learned].sum(1).neg_()
+
+    def divergence(self, copies: slice, originals: slice) -> Tensor:
+        """Return KL[copy || original] [S, K, R] of some parts."""
+        p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
+        self._gap = divergence_by_choice(log_p, log_q, p)
+        return self._gap.sum(1)
+
+    def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
+        """Add the slope by the log-probabilities; see `Policies.add_slope`."""
+        learned = by_log_prob.shape[1]
+        if slope is None and learned == self._shape[1]:
+            slope = self._inner * -_beside(by_entropy)
+        else:
+            slope = torch.zeros_like(self.probs) if slope is None else slope
+            slope[:, :, :learned].sub_(self._inner[:, :, :learned] * _beside(by_entropy))
+        return slope.scatter_add_(1, _index(action, learned), by_log_prob.unsqueeze(1))
+
+    def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
+        """Add p (log p - log q) by log p, and -p by log q; see `Policies.add_divergence_slope`."""
+        slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
+        if stop_gradient != "transformed":
+            slope[:, :, 1:].add_(self._gap * weights)
+        if stop_gradient != "original":
+            slope[:, :, :1].sub_((self.probs[:, :, 1:] * weights).sum(2, keepdim=True))
+        return slope
+
+    def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
+        """Return the outputs and the slope by them."""
+        by_logits = torch.addcmul(slope, self.probs, slope.sum(1, keepdim=True), value=-1)
+        return [(self._outputs, self._frame.push_outputs(by_logits.unflatten(3, self._shape[2:5]).movedim(1, -1)))]
+
+
+def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:
+    """Return p (log p - log q) for each choice, whose sum over the choices is KL[p || q]."""
+    return p * (log_p - log_q)
+
+
+def _index(action: Tensor, learned: int) -> Tensor:
+    """Return actions [S, B, T, N] as the index [S, 1, L, R]."""
+    return action.reshape(len(action), 1, 1, -1).expand(-1, -1, learned, -1)
+
+
+def _beside(weights: Weights) -> Weights:
+    """Return weights shaped to stand beside numbers of actions."""
+    return weights.unsqueeze(1) if isinstance(weights, Tensor) else weights
+
+
+class GaussianPolicies:
+    """Gaussians whose means are the outputs, with one log deviation for all rows.
+
+    A slope is that by the means [S, P, R, W] and that by the log deviation [S, W].
+
+    Args:
+        outputs: [S, P B, T, N, W] means, under autograd.
+        frame: of the originals.
+        log_std: the parameter [S, items].
+        item: [W], the item of each number.
+    """
+
+    def __init__(self, outputs: WithVJP, frame: Frame, log_std: Tensor, item: Tensor) -> None:
+        self._outputs, self._frame, self._parameter, self._item = outputs, frame, log_std, item
+        self._deviation = WithVJP(log_std, lambda slope: [slope], [log_std])
+        means = frame.pull_outputs(outputs.tensor)
+        self._shape, self._means = means.shape, means.flatten(2, -2)
+        self._log_std = log_std.detach()[:, item].view(-1, 1, 1, len(item))
+        self._precision = (-self._log_std).exp()
+
+    def log_prob(self, action: Tensor, learned: int) -> Tensor:
+        """Return the log density [S, L, R] of latent actions [S, B, T, N, W]."""
+        square = self._standardised(action, learned).square()
+        return -(0.5 * square + self._log_std + _HALF_LOG_TAU).sum(-1)
+
+    def entropy(self, learned: int) -> Tensor:
+        """Return the entropies [S, L, R], equal for all rows."""
+        return (self._log_std + (0.5 + _HALF_LOG_TAU)).sum(-1).expand(self._means[:, :learned].shape[:-1])
+
+    def divergence(self, copies: slice, originals: slice) -> Tensor:
+        """Return |m - m'|^2 / (2 std^2) [S, K, R] of some parts."""
+        self._gap = (self._means[:, copies] - self._means[:, originals]) * self._precision
+        return 0.5 * self._gap.square().sum(-1)
+
+    def add_slope(
+        self, slope: tuple[Tensor, Tensor] | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights
+    ) -> tuple[Tensor, Tensor]:
+        """Add the slopes by the means and by the log deviation; see `Policies.add_slope`."""
+        by_means, by_log_std = slope or self._no_slope()
+        learned, above = by_log_prob.shape[1], by_log_prob.unsqueeze(-1)
+        z = self._standardised(action, learned)
+        entropies = (torch.zeros_like(by_log_prob) + by_entropy).flatten(1).sum(1, keepdim=True)
+        by_log_std += (z.square() - 1).mul_(above).flatten(1, -2).sum(1) + entropies
+        by_means[:, :learned].add_(z.mul_(self._precision).mul_(above))
+        return by_means, by_log_std
+
+    def add_divergence_slope(
+        self, slope: tuple[Tensor, Tensor] | None, weights: Weights, stop_gradient: str
+    ) -> tuple[Tensor, Tensor]:
+        """Add the slopes by the means and by the log deviation; see `Policies.add_divergence_slope`."""
+        by_means, by_log_std = slope or self._no_slope()
+        weighted = self._gap * (weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights)
+        by_log_std -= (weighted * self._gap).flatten(1, -2).sum(1)
+        weighted.mul_(self._precision)
+        if stop_gradient != "transformed":
+            by_means[:, 1:].add_(weighted)
+        if stop_gradient != "original":
+            by_means[:, :1].sub_(weighted.sum(1, keepdim=True))
+        return by_means, by_log_std
+
+    def back(self, slope: tuple[Tensor, Tensor]) -> list[tuple[WithVJP, Tensor]]:
+        """Return the outputs and the parameter, and the slope by each."""
+        by_means, by_log_std = slope
+        by_parameter = torch.zeros_like(self._parameter).index_add_(1, self._item, by_log_std)
+        by_outputs = self._frame.push_outputs(by_means.unflatten(2, self._shape[2:-1]))
+        return [(self._outputs, by_outputs), (self._deviation, by_parameter)]
+
+    def _standardised(self, action: Tensor, learned: int) -> Tensor:
+        return (action.flatten(1, -2).unsqueeze(1) - self._means[:, :learned]) * self._precision
+
+    def _no_slope(self) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(self._means), torch.zeros_like(self._precision[:, 0, 0])
