@@ -138,7 +138,7 @@ def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, in
 
 @dataclass(frozen=True)
 class StudyChoices:
-    """What a study command was called with, and by its annotations what can be said to it: an option for each field."""
+    """The options that all study commands share: annotations hold flags and help, values what was given."""
 
     tasks: TasksOption = None
     algos: AlgosOption = None

@@ -30,7 +30,7 @@ EPILOG = """Examples:\n
     esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
 
 FIRST_TRIAL_SEED = 1000
-"""Trials have seeds from here on; what they choose is judged on others."""
+"""Seed of the first trial; the best settings are evaluated on other seeds."""
 
 
 @study_command(
@@ -107,7 +107,7 @@ def _tuning(
     meant, steps = (request.steps or ((None, 500_000),))[0]
     if meant not in (None, task):
         raise UserError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
-    ALGORITHMS[algorithm]  # a name that nobody has is refused as such, and not for the space that it lacks
+    ALGORITHMS[algorithm]  # refuses an unknown algorithm before the space that it lacks
     tried_settings = read_space(space) if space else default_space(algorithm)
     tuning = Tuning(
         task=task,
