@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -128,6 +129,8 @@ def map_of(operator: Operator, device: torch.device | str = "cpu", dtype: torch.
 
 def gather_of(operator: Operator, device: torch.device | str = "cpu") -> Gather:
     """Return the gather of an operator that is a signed permutation."""
-    source = torch.as_tensor(operator.source[:, :, 0], device=device)
-    sign = torch.as_tensor(operator.weight[:, :, 0], dtype=torch.float32, device=device)
-    return Gather(source, source.argsort(1), None if bool((sign == 1).all()) else sign)
+    source, sign = operator.source[:, :, 0], operator.weight[:, :, 0]
+    signs = None if (sign == 1).all() else torch.as_tensor(sign, dtype=torch.float32, device=device)
+    return Gather(
+        torch.as_tensor(source, device=device), torch.as_tensor(np.argsort(source, 1), device=device), signs
+    )
