@@ -131,6 +131,4 @@ def gather_of(operator: Operator, device: torch.device | str = "cpu") -> Gather:
     """Return the gather of an operator that is a signed permutation."""
     source, sign = operator.source[:, :, 0], operator.weight[:, :, 0]
     signs = None if (sign == 1).all() else torch.as_tensor(sign, dtype=torch.float32, device=device)
-    return Gather(
-        torch.as_tensor(source, device=device), torch.as_tensor(np.argsort(source, 1), device=device), signs
-    )
+    return Gather(torch.as_tensor(source, device=device), torch.as_tensor(np.argsort(source, 1), device=device), signs)

@@ -332,9 +332,10 @@ def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
     (row,) = (line for line in told.stdout.splitlines() if " greedy " in line)
     assert [cell.strip() for cell in row.strip("│").split("│")] == ["greedy", f"{value[1]:.2f}", "1"]
     monkeypatch.undo()
-    report = json.loads(esp("report", tmp_path / "run", "--json", "-").stdout)["runs"][0]["returns"]["150"]
-    assert report["per_seed"] == [None, pytest.approx(value[1], abs=1e-4)]
-    assert report["sem"] is None
+    (cell,) = json.loads(esp("report", tmp_path / "run", "--json", "-").stdout)["cells"]
+    returns = cell["summary"]["returns"]
+    assert returns["per_seed"] == [None, pytest.approx(value[1], abs=1e-4)]
+    assert returns["sem"] is None
 
 
 def test_a_run_whose_every_seed_stopped_ends_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -345,8 +345,8 @@ def test_a_full_wind_carries_every_moving_poacher_to_the_right() -> None:
 @pytest.mark.parametrize("task", ["navigation", "predator-prey", "formation", "wildlife"])
 def test_breakings_are_off_by_default_and_named_in_the_convention_when_on(task: str) -> None:
     env = make(task, 1, [0])
-    assert all(breaking.size == 0 for breaking in env.settings.breakings)
-    name = env.settings.breakings[0].name
+    assert env.settings.broken() == {}
+    name = next(iter(env.settings.breakable()))
     assert make(task, 1, [0], {name: 0.25}).spec.convention == f"{env.spec.convention}, {name} 0.25"
     with pytest.raises(ValueError, match=name):
         make(task, 1, [0], {name: -0.1})
