@@ -56,7 +56,10 @@ def _stored(data: object) -> object:
         return data
     cls = network_class(data.get("name", "mlp"))
     excess = _FLAT_FIELDS - set(cls.model_fields)
-    return validate(cls, {name: value for name, value in data.items() if name not in excess})
+    kept = {name: value for name, value in data.items() if name not in excess}
+    if "compiled" in cls.model_fields:  # a run of before there was a choice computed without kernels
+        kept.setdefault("compiled", False)
+    return validate(cls, kept)
 
 
 AnyNetworkConfig = Annotated[SerializeAsAny[NetworkConfig], BeforeValidator(_stored)]

@@ -72,6 +72,15 @@ class NetworkConfig(Strict, ABC):
         """Return the names of settings that change nothing beside the others."""
         return frozenset()
 
+    def decided(self, steps: int, device: str) -> NetworkConfig:
+        """Return these settings with what depends on the run decided, as it is stored with the run.
+
+        Args:
+            steps: environment steps per seed.
+            device: "cpu" or "cuda".
+        """
+        return self
+
     def least_parameters(self, inputs: int) -> int:
         """Return a lower bound of the number of weights; a file with fewer is damaged.
 

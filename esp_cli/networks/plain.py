@@ -12,10 +12,14 @@ from torch import Tensor, nn
 
 from esp_cli.networks.contract import VJP, ActivationName, Memoryless, Network, NetworkConfig
 from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.kernels.library import has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
+
+WORTH_COMPILING = 100_000
+"""Steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed."""
 
 
 class PlainConfig(NetworkConfig):
@@ -23,8 +27,10 @@ class PlainConfig(NetworkConfig):
 
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
     precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
-    compiled: bool = Field(
-        False, description="kernels compiled for this processor: faster, other rounding; needs a C++ compiler"
+    compiled: Literal["auto"] | bool = Field(
+        "auto",
+        description="kernels compiled for this processor: faster, other rounding; auto: on for 100k steps and more on "
+        "the CPU where there is a C++ compiler",
     )
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
     separate_parts: bool = Field(
@@ -34,15 +40,22 @@ class PlainConfig(NetworkConfig):
     @property
     def products(self) -> tuple[torch.dtype, bool]:
         """How networks compute: the precision as torch names it, and whether by kernels."""
-        return getattr(torch, self.precision), self.compiled and not self.layer_norm
+        return getattr(torch, self.precision), self.compiled is True and not self.layer_norm
 
     @model_validator(mode="after")
     def _fits(self) -> PlainConfig:
         if self.separate_parts and self.symmetrise:
             raise UserError("separate_parts and symmetrise exclude each other; leave one of them off")
-        if self.compiled and self.precision != "float32":
+        if self.compiled is True and self.precision != "float32":
             raise UserError("compiled perceptrons compute in float32; leave compiled off, or precision as it is")
         return self
+
+    def decided(self, steps: int, device: str) -> PlainConfig:
+        """Return these settings with `compiled` decided: on where the run gains more than compiling takes."""
+        if self.compiled != "auto":
+            return self
+        fits = device == "cpu" and self.precision == "float32" and not self.layer_norm
+        return self.model_copy(update={"compiled": fits and steps >= WORTH_COMPILING and has_compiler()})
 
     def without_effect(self) -> frozenset[str]:
         """Return what concerns networks without layer normalisation where there is one."""

@@ -197,9 +197,10 @@ def _untrained(config: RunConfig, spec: TaskSpec, network: NetworkConfig) -> Pol
 
 
 def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
-    """Return a network's settings with some of them, where it has them, as they are by default."""
+    """Return a network's settings with some of them, where it has them, as they are by default; `compiled` is off."""
     fields = type(network).model_fields
-    return network.model_copy(update={name: fields[name].default for name in names if name in fields})
+    chosen = {name: fields[name].default for name in names if name in fields}
+    return network.model_copy(update=chosen | {name: False for name in chosen if name == "compiled"})
 
 
 def _build(

@@ -177,7 +177,7 @@ def resolve_config(
         "algorithm_settings": validated(
             ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm
         ).model_dump(),
-        "network": validated(network, sections["network"], "network", owner),
+        "network": validated(network, sections["network"], "network", owner).decided(steps, device),
         "prior": prior,
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,

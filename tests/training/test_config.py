@@ -133,8 +133,8 @@ FLAT = {
 @pytest.mark.parametrize(
     ("name", "network"),
     [
-        ("mlp", MlpConfig(hidden=(32,), activation="relu")),
-        ("gru", GruConfig(hidden=(32,), activation="relu")),
+        ("mlp", MlpConfig(hidden=(32,), activation="relu", compiled=False)),
+        ("gru", GruConfig(hidden=(32,), activation="relu", compiled=False)),
         ("mpn", MpnConfig(hidden=(32,))),
         ("empn", EmpnConfig(hidden=(32,), group="d4")),
         ("equivariant", EquivariantConfig(hidden=(32,), activation="relu", group="d4")),

@@ -68,12 +68,29 @@ def begin(name: str) -> Future[tempfile.TemporaryDirectory[str]]:
     return compiling
 
 
-def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
+def has_compiler() -> bool:
+    """Return whether there is a C++ compiler: that of the environment variable CXX, or one on the path."""
+    try:
+        return shutil.which(_compiler()[0]) is not None
+    except UserError:
+        return False
+
+
+def _compiler() -> list[str]:
+    """Return the command of the compiler; its program may not exist.
+
+    Raises:
+        UserError: CXX is no command.
+    """
     try:
         named = shlex.split(os.environ.get("CXX", ""))
     except ValueError as error:
         raise UserError(f"the environment variable CXX is no command ({error}); name a C++ compiler in it") from None
-    compiler = named or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
+    return named or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
+
+
+def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
+    compiler = _compiler()
     if shutil.which(compiler[0]) is None:
         raise UserError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
     folder = tempfile.TemporaryDirectory()

@@ -3,6 +3,7 @@
 import gc
 import os
 import weakref
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch.autograd.function import BackwardCFunction
 from typer.testing import CliRunner
 
 from esp_cli.app import app
+from esp_cli.networks import plain
 from esp_cli.networks.kernels import library
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.mixer import MonotonicMixer
@@ -18,6 +20,7 @@ from esp_cli.networks.recurrent import SeedGRU
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
+from esp_cli.training.config_file import parse_config
 from tests.networks.kernels.compiler import needs_compiler
 from tests.networks.test_layers import generators
 
@@ -137,3 +140,32 @@ def test_what_a_pass_keeps_goes_with_its_outputs(kind, compiled):
         assert kept() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize(
+    ("steps", "device", "choice", "decided"),
+    [
+        (100_000, "cpu", {}, True),
+        (99_999, "cpu", {}, False),
+        (100_000, "cuda", {}, False),
+        (100_000, "cpu", {"network.precision": "bfloat16"}, False),
+        (100_000, "cpu", {"network.layer_norm": True}, False),
+        (100_000, "cpu", {"network.compiled": False}, False),
+        (100, "cpu", {"network.compiled": True}, True),
+    ],
+)
+def test_long_runs_compute_by_kernels_and_say_so(steps, device, choice, decided, monkeypatch):
+    monkeypatch.setattr(plain, "has_compiler", lambda: True)
+    config = resolve_config("navigation", steps=steps, device=device, overrides=choice)
+    assert config.network.compiled is decided
+    stored = config.model_dump(mode="json")
+    assert parse_config(stored, Path("run")).network.compiled is decided
+    del stored["network"]["compiled"]
+    assert parse_config(stored, Path("run")).network.compiled is False, "stored before there was a choice"
+
+
+def test_without_a_compiler_nothing_is_compiled(monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert not library.has_compiler()
+    monkeypatch.setattr(plain, "has_compiler", library.has_compiler)
+    assert resolve_config("navigation").network.compiled is False
