@@ -61,7 +61,7 @@ class Discovery:
 
     Attributes:
         source: the task, run or file.
-        method: "paired states", "transitions", or that of `blind`.
+        method: "paired states" or "transitions".
         group: the name of what was found: "d4*agents", "flip-x", "c1" for nothing.
         transforms: what `--transforms` takes to use it; empty where nothing was found.
         tried: one entry for each element.

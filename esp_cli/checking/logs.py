@@ -18,13 +18,13 @@ _MOST_BYTES = 2**31
 _NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask",)
 
 
-def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
+def read_transitions(path: Path, spaces: Spaces) -> Transitions:
     """Read the transitions of a file; reading never runs code.
 
     Args:
         path: of an .npz file with obs and next_obs [M, T, N, D], action [M, T, N] of integers or [M, T, N, width],
             reward [M, T, N], and action_mask [M, T, N, A] where the task has masks; the axis T may be left out.
-        spaces: what the numbers are; None where nobody knows, so that the arrays alone say how many there are.
+        spaces: what the numbers are.
 
     Raises:
         UserError: it is missing, damaged or too large, or does not fit the spaces.
@@ -33,23 +33,16 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
     missing = [name for name in _NEEDED if name not in arrays]
     if missing:
         raise UserError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
-    if spaces is None:
-        flat = [name for name in ("obs", "action", "action_mask") if name in arrays and arrays[name].ndim < 2]
-        if flat:
-            raise UserError(f"'{flat[0]}' of {path} has no axis of agents; save [episodes, steps, agents, width]")
-        agents, width = arrays["obs"].shape[-2:]
-        count, acts = None, arrays["action"].shape[-1]
-        discrete = arrays["action"].dtype.kind in "iu"
-    else:
-        agents, width, discrete = spaces.num_agents, spaces.observation.width, isinstance(spaces.action, Discrete)
-        count, acts = (spaces.action.count, 0) if isinstance(spaces.action, Discrete) else (None, spaces.action.width)
-    shapes = {"obs": (agents, width), "next_obs": (agents, width), "reward": (agents,)}
-    shapes["action"] = (agents,) if discrete else (agents, acts)
-    if discrete and "action_mask" in arrays:
-        shapes["action_mask"] = (agents, arrays["action_mask"].shape[-1] if count is None else count)
-    tensors: dict[str, Tensor] = {}
-    for name, shape in shapes.items():
-        tensors[name] = _tensor(path, name, arrays[name], shape, integer=discrete and name == "action")
+    action, agents, seen = spaces.action, spaces.num_agents, (spaces.num_agents, spaces.observation.width)
+    shapes: dict[str, tuple[int, ...]] = {"obs": seen, "next_obs": seen, "reward": (agents,), "action": (agents,)}
+    if not isinstance(action, Discrete):
+        shapes["action"] = (agents, action.width)
+    elif "action_mask" in arrays:
+        shapes["action_mask"] = (agents, action.count)
+    tensors = {
+        name: _tensor(path, name, arrays[name], shape, integer=name == "action" and isinstance(action, Discrete))
+        for name, shape in shapes.items()
+    }
     lengths = {tuple(tensor.shape[:2]) for tensor in tensors.values()}
     if len(lengths) != 1:
         raise UserError(f"the arrays of {path} hold different numbers of transitions; give each the same")
@@ -58,11 +51,9 @@ def read_transitions(path: Path, spaces: Spaces | None) -> Transitions:
     empty = [name for name, tensor in tensors.items() if not tensor.numel()]
     if empty:
         raise UserError(f"'{empty[0]}' of {path} holds no number; record at least one step of one agent")
-    if discrete:
-        chosen = tensors["action"]
-        if int(chosen.min()) < 0 or (count is not None and int(chosen.max()) >= count):
-            known = "on" if count is None else f"to {count - 1}"
-            raise UserError(f"the actions of {path} are not all from 0 {known}; save indices")
+    chosen = tensors["action"]
+    if isinstance(action, Discrete) and not 0 <= int(chosen.min()) <= int(chosen.max()) < action.count:
+        raise UserError(f"the actions of {path} are not all from 0 to {action.count - 1}; save indices")
     mask = tensors.get("action_mask")
     return Transitions(
         tensors["obs"], tensors["action"], tensors["reward"], tensors["next_obs"], None if mask is None else mask > 0

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp discover navigation --set task.wind=0.3\n
     esp discover runs/navigation --json found.json\n
-    esp discover transitions.npz --task rendezvous:Rendezvous --blind\n
+    esp discover transitions.npz --task rendezvous:Rendezvous\n
     esp train --task navigation --transforms discovered"""
 
 
@@ -32,7 +32,7 @@ def discover(
         typer.Option(
             "--task",
             "-t",
-            help="Task whose layout the transitions of a file have (without it --blind), or a run's own module:Class.",
+            help="Task whose layout the transitions of a file have, or a run's own module:Class.",
             metavar="TASK",
         ),
     ] = None,
@@ -44,9 +44,6 @@ def discover(
     logs: Annotated[
         bool, typer.Option("--logs", help="Judge from transitions alone, also where states can be set.")
     ] = False,
-    blind: Annotated[
-        bool, typer.Option("--blind", help="Judge from transitions alone, and without knowing what any number means.")
-    ] = False,
     json: JsonOption = None,
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
@@ -54,14 +51,12 @@ def discover(
     What the task declares is not looked at. An element is accepted where it is shown to hold; of all accepted elements
     at most 5 % are false, in expectation.
     """
-    if blind and transforms is not None:
-        raise UserError("--blind searches for maps by itself; leave --transforms out")
-    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, blind)
+    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs)
     console.result(json, found, lambda: _print(found))
 
 
 def _discovery(
-    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, blind: bool
+    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool
 ) -> Discovery:
     from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
     from esp_cli.checking.logs import read_transitions
@@ -71,19 +66,12 @@ def _discovery(
     path = Path(what)
     register_named([task, None if path.exists() else what])
     if path.suffix == ".npz" or path.is_file():
-        if settings and task is None:
-            raise UserError(f"--set is for a task, and {what} is a file; add --task, or leave --set out")
+        if task is None:
+            raise UserError(f"{what} does not say what its numbers are; add --task")
         if logs:
             raise UserError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
-        spec = None if task is None else make(task, 1, [0], resolve_task_settings(task, settings)).spec
-        data = read_transitions(path, spec)
-        if spec is None or blind:
-            from esp_cli.checking.blind import discover_blindly
-
-            if transforms is not None:
-                raise UserError(f"{what} does not say what its numbers are, as --transforms needs; add --task")
-            return discover_blindly(what, spec, data)
-        return discover_in_transitions(what, spec, data, transforms)
+        spec = make(task, 1, [0], resolve_task_settings(task, settings)).spec
+        return discover_in_transitions(what, spec, read_transitions(path, spec), transforms)
     name = what
     if task is not None and not path.is_dir():
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
@@ -100,10 +88,6 @@ def _discovery(
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
 
-    if blind:
-        from esp_cli.checking.blind import discover_blindly_in_task
-
-        return discover_blindly_in_task(worlds)
     return discover_in_task(worlds, transforms, logs)
 
 

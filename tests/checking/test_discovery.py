@@ -227,21 +227,19 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     junk = tmp_path / "junk.npz"
     junk.write_bytes(b"PK\x03\x04 no archive")
     assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
-    assert "is not an intact .npz file" in refused("discover", junk)
-    for words in ([], ["--task", "navigation"]):
-        assert "there is no file" in refused("discover", tmp_path / "none.npz", *words)
-    assert "does not say what its numbers are" in refused("discover", recorded(tmp_path), "--transforms", "d4")
-    assert "has no axis of agents" in refused("discover", recorded(tmp_path, obs=np.zeros(64)))
+    assert "does not say what its numbers are; add --task" in refused("discover", recorded(tmp_path))
+    navigation = ("--task", "navigation")
+    assert "there is no file" in refused("discover", tmp_path / "none.npz", *navigation)
+    assert "'obs' of" in refused("discover", recorded(tmp_path, obs=np.zeros(64)), *navigation)
     scalar = recorded(tmp_path, action=np.zeros((1536, 8, 3), int), action_mask=np.array(True))
-    assert "'action_mask' of" in refused("discover", scalar)
-    nothing = {"obs": (1536, 0, 3, 4), "next_obs": (1536, 0, 3, 4), "action": (1536, 0, 3), "reward": (1536, 0, 3)}
+    assert "'action_mask' of" in refused("discover", scalar, *navigation)
+    nothing = {"obs": (1536, 0, 3, 14), "next_obs": (1536, 0, 3, 14), "action": (1536, 0, 3), "reward": (1536, 0, 3)}
     empty = {name: np.zeros(shape, int if name == "action" else float) for name, shape in nothing.items()}
-    assert "holds no number; record at least one step" in refused("discover", recorded(tmp_path, **empty))
+    assert "holds no number; record at least one step" in refused("discover", recorded(tmp_path, **empty), *navigation)
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
     assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")
-    assert "add --task, or leave --set out" in refused("discover", recorded(tmp_path), "--set", "task.wind=0.3")
-    assert "leave --logs out" in refused("discover", recorded(tmp_path), "--logs")
+    assert "leave --logs out" in refused("discover", recorded(tmp_path), "--logs", *navigation)
 
 
 def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:
