@@ -6,10 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 
-from esp_cli.checking.discovery import discover_in_task
-from esp_cli.checking.paired import check_paired
-from esp_cli.checking.recorded import collect
-from esp_cli.checking.regression import check_by_regression
+from esp_cli.checking.task import check_symmetry, judged
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Group, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestricted
@@ -18,8 +15,6 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.registry import make, task_class
 
-_EPISODES = 1024
-_WORLDS = 256
 _HORIZON = 50
 """Steps of an episode, at most, where a task has such a setting: of a longer one only the beginning is looked at."""
 
@@ -92,33 +87,29 @@ class _Maker:
 
 @lru_cache(maxsize=64)
 def _discovered(make_worlds: _Maker) -> str:
-    return discover_in_task(make_worlds).transforms.removeprefix(DISCOVERED)
+    return check_symmetry(make_worlds).transforms.removeprefix(DISCOVERED)
 
 
 @lru_cache(maxsize=64)
 def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], ...]:
-    """Return by how many standard deviations of its worst field each element is off; 0 where it holds.
+    """Return by how many standard deviations each element's worst field is off; infinite where it is not covered.
 
     Raises:
         UserError: the task cannot carry the elements, or they cannot be listed.
     """
-    env = make_worlds(_WORLDS, [0])
-    spec = env.spec
-    elements = admitted_elements(transforms, unrestricted(spec))  # what is weighed need not be declared
+    elements = admitted_elements(
+        transforms, unrestricted(make_worlds(1, [0]).spec)
+    )  # what is weighed need not be declared
     if isinstance(elements, Group):
         raise UserError(
             f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "
             "finite group, such as d4"
         )
-    if env.has("set_state"):
-        return tuple((verdict.element, _worst(verdict)) for verdict in check_paired(make_worlds, elements))
-    verdicts = check_by_regression(spec, collect(env, _EPISODES), elements)
-    # Half of the data are copies, so that a shift of d standard deviations costs (d / 2)^2 of the variance.
-    return tuple((verdict.element, 2 * _worst(verdict) ** 0.5) for verdict in verdicts)
+    _, verdicts = judged(make_worlds, elements)
+    return tuple((verdict.element, _gap(verdict)) for verdict in verdicts)
 
 
-def _worst(verdict: ElementVerdict) -> float:
-    """Return how far the worst field is off; without end where nothing could be said, as of a task that raises."""
+def _gap(verdict: ElementVerdict) -> float:
     if verdict.outcome == "not covered":
         return math.inf
     return max((field.gap for field in verdict.fields if field.outcome == "broken"), default=0.0)

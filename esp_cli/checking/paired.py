@@ -5,8 +5,9 @@ runs from L_g s with K_g a give Y and Y'. The energy distance
 
     E |X - Y| - (E |X - X'| + E |Y - Y'|) / 2
 
-is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. Without chance it is |X - Y|.
-A random prey or a noisy sensor is thus no false alarm, and no task has to turn its own noise along.
+is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. A random prey or a noisy sensor is
+thus no false alarm, and no task has to turn its own noise along. A field without chance is judged state by state: one
+that differs by more than rounding is a proof.
 """
 
 from __future__ import annotations
@@ -18,7 +19,15 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
-from esp_cli.checking.verdicts import RANK, ElementVerdict, FieldVerdict, judged
+from esp_cli.checking.verdicts import (
+    NEGLIGIBLE,
+    RANK,
+    SIGNIFICANT,
+    ElementVerdict,
+    FieldVerdict,
+    chance,
+    concluded,
+)
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
 from esp_envs.conformance.subject import MakeWorlds
@@ -29,7 +38,8 @@ _NUMBERS = 1 << 18
 """Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
 MOMENTS = 8
 """Points of an episode at which states are taken."""
-
+TOLERATED = 0.15
+"""Standard deviations that a field with chance may be off, where it is not found broken."""
 _BOUND = 0.05
 """Where the bounded distance levels off, in standard deviations of the field."""
 Outcomes = dict[str, Tensor]
@@ -90,30 +100,42 @@ def _judge(
     except Exception as error:
         reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
         return ElementVerdict(element.name, declared, (), reason)
-    same = _fields(here[0], spec, None)
     first, second = (_fields(steps, spec, transform) for steps in here)
     third, fourth = (_fields(steps, spec, None) for steps in there)
-    verdicts = [_verdict(name, first[name], second[name], third[name], fourth[name], same[name]) for name in first]
+    verdicts = [_verdict(name, first[name], second[name], third[name], fourth[name]) for name in first]
     return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
 
 
-def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, plain: Tensor) -> FieldVerdict:
-    """Judge one field from its outcomes [M, numbers]; `plain` is x before it was transformed."""
+def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:
+    """Judge one field from its outcomes [M, numbers]: x and x2 transformed, y and y2 from the transformed state."""
     known = torch.isfinite(torch.stack([x, x2, y, y2])).all(-1).all(0)
     x, x2, y, y2 = (part[known] for part in (x, x2, y, y2))
     if not bool(known.any()):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    spread = torch.cat([x, y]).std(0)
-    scale = max(float(spread.max()), 1e-6)
+    scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+    if name == "reward" and scale <= 1e-6:  # it never came
+        return FieldVerdict(name, "not covered", 0.0, 0.0)
+    if max(float((x - x2).abs().max()), float((y - y2).abs().max())) <= NEGLIGIBLE * scale:
+        return _state_by_state(name, (x - y).abs().amax(1), scale)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
     # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
     bound = _BOUND * scale
     distances = (Tensor.abs, lambda gap: bound * -torch.expm1(-gap.abs() / bound))
     tests = [_excess(distance, within, across) for distance in distances]
     tests.append((x + x2 - y - y2) / 2)
-    # An invariant number is covered by any state; one that turns, only where it is not zero throughout.
-    moved = float(plain.abs().max()) > 1e-6 or torch.equal(plain, x)
-    return judged(name, torch.cat(tests, 1), scale, moved)
+    samples = torch.cat(tests, 1).double() / scale
+    gaps, errors = samples.mean(0).abs(), samples.std(0) / len(samples) ** 0.5
+    broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
+    worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
+    gap, error = float(gaps[worst]), float(errors[worst])
+    return concluded(name, gap, error, bool(broken.any()), chance(gap, TOLERATED, error))
+
+
+def _state_by_state(name: str, apart: Tensor, scale: float) -> FieldVerdict:
+    """Judge a field without chance by how far apart the two sides are in each state, [M]."""
+    differ = apart > NEGLIGIBLE * scale
+    share = float(differ.float().mean())
+    return concluded(name, float(apart.mean()) / scale, 0.0, bool(differ.any()), 0.0, share)
 
 
 def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], across: Sequence[Tensor]) -> Tensor:
@@ -128,7 +150,7 @@ def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
     best: dict[str, FieldVerdict] = {}
     for verdict in verdicts:
         name = verdict.field.removeprefix("start ")
-        renamed = FieldVerdict(name, verdict.outcome, verdict.gap, verdict.error)
+        renamed = replace(verdict, field=name)
         known = best.get(name)
         if known is None or (RANK[renamed.outcome], renamed.gap) > (RANK[known.outcome], known.gap):
             best[name] = renamed

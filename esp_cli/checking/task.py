@@ -1,19 +1,25 @@
-"""Check the symmetry of a task, in the way that it allows."""
+"""Check the symmetry of a task, or find what nobody declared, in the way that the task allows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from esp_cli.checking.candidates import candidates, found_group, refused
-from esp_cli.checking.paired import check_paired
-from esp_cli.checking.recorded import collect
-from esp_cli.checking.transitions import check_transitions
+from esp_cli.checking import paired, transitions
+from esp_cli.checking.candidates import candidates, refused
+from esp_cli.checking.naming import named
+from esp_cli.checking.recorded import EPISODES, Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
+from esp_cli.symmetry import Element
+from esp_cli.symmetry.parse import Factors
 from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.spec import Spaces
 
+PAIRED, TRANSITIONS = "paired states", "transitions"
+TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
+"""Standard deviations that a field may be off and yet hold, by method."""
 _COPIES = 256
-"""Worlds of a task that cannot be set to a state."""
+"""Worlds of a task that cannot be set to a state, at most."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +27,11 @@ class SymmetryReport:
     """What a check found.
 
     Attributes:
-        task: its name.
+        task: its name, or the file of transitions.
         method: "paired states" or "transitions".
         declared: the symmetry that the task declares.
-        found: the largest group whose tried elements all hold.
+        found: the largest group whose tried elements all hold: "d4*agents", "flip-x", "c1" for nothing.
+        transforms: what `--transforms` takes to use it; empty where nothing was found.
         elements: one verdict for each element that was tried.
         refused: why elements that were asked for could not be tried, by their names.
     """
@@ -33,32 +40,73 @@ class SymmetryReport:
     method: str
     declared: str
     found: str
+    transforms: str
     elements: tuple[ElementVerdict, ...]
     refused: Mapping[str, str]
 
     @property
+    def broken(self) -> tuple[str, ...]:
+        """Declared elements that are broken."""
+        return self._declared("broken")
+
+    @property
+    def uncovered(self) -> tuple[str, ...]:
+        """Declared elements of which the data cannot tell."""
+        return self._declared("not covered")
+
+    @property
     def holds(self) -> bool:
-        """Whether no declared element is broken."""
-        return not any(element.declared and element.outcome == "broken" for element in self.elements)
+        """Whether every declared element that was tried holds."""
+        return not self.broken and not self.uncovered
+
+    def _declared(self, outcome: str) -> tuple[str, ...]:
+        return tuple(e.element for e in self.elements if e.declared and e.outcome == outcome)
 
 
-def check_symmetry(make: MakeWorlds, transforms: str | None = None) -> SymmetryReport:
+def check_symmetry(make: MakeWorlds, transforms: str | None = None, from_transitions: bool = False) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
     Args:
         make: makes E worlds for some seeds.
         transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
+        from_transitions: use transitions of the random policy even where the task can be set to states.
 
     Raises:
         UserError: the transforms mean nothing, or the task can carry none of them.
     """
-    probe = make(1, [0])
-    spec = probe.spec
+    spec = make(1, [0]).spec
     elements = candidates(spec, transforms)
-    if probe.has("set_state"):
-        method, verdicts = "paired states", check_paired(make, elements)
-    else:
-        worlds = min(_COPIES, max(32, 8192 // spec.horizon))
-        method, verdicts = "transitions", check_transitions(spec, collect(make(worlds, [0])), elements)
-    found, left_out = found_group(verdicts, spec), {} if transforms is None else refused(spec, transforms)
-    return SymmetryReport(spec.name, method, spec.symmetry, found, tuple(verdicts), left_out)
+    method, verdicts = judged(make, elements, from_transitions)
+    return _reported(spec.name, method, spec, elements, verdicts, transforms)
+
+
+def check_recorded(source: str, spaces: Spaces, data: Transitions, transforms: str | None = None) -> SymmetryReport:
+    """Judge transitions of a policy that prefers no direction, from whatever source; see `check_symmetry`."""
+    elements = candidates(spaces, transforms)
+    verdicts = transitions.check_transitions(spaces, data, elements)
+    return _reported(source, TRANSITIONS, spaces, elements, verdicts, transforms)
+
+
+def judged(
+    make: MakeWorlds, elements: Sequence[Element], from_transitions: bool = False
+) -> tuple[str, list[ElementVerdict]]:
+    """Return the method that a task allows, and what it says of some elements."""
+    probe = make(1, [0])
+    if probe.has("set_state") and not from_transitions:
+        return PAIRED, paired.check_paired(make, elements)
+    worlds = make(min(_COPIES, max(32, 8192 // probe.spec.horizon)), [0])
+    return TRANSITIONS, transitions.check_transitions(probe.spec, collect(worlds, EPISODES), elements)
+
+
+def _reported(
+    source: str,
+    method: str,
+    spaces: Spaces,
+    elements: Sequence[Element],
+    verdicts: Sequence[ElementVerdict],
+    transforms: str | None,
+) -> SymmetryReport:
+    holding = [e for e, verdict in zip(elements, verdicts, strict=True) if verdict.outcome == "holds"]
+    found, usable = named(holding, elements, Factors.of(spaces.symmetry).scene)
+    left_out = {} if transforms is None else refused(spaces, transforms)
+    return SymmetryReport(source, method, spaces.symmetry, found, usable, tuple(verdicts), left_out)

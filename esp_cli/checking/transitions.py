@@ -1,33 +1,48 @@
 """Measure symmetry from transitions alone: no state can be set, and the noise is unknown.
 
-If the starts, the policy, the dynamics and the reward are symmetric, a transition and its transformed copy have one
-distribution. So every expectation of (input, residual) agrees, where the residual is what a regression of change and
-reward on the input leaves. The regression only takes the large common part away; the test holds without it.
+A predictor of change and reward is fitted to each half of the episodes. On the other half it errs by e(x, y), and on
+the images of these under an element by e(gx, gy). If starts, policy, dynamics and reward are symmetric, a transition
+and its image have one distribution, so any predictor errs on both alike. The gap squared is the difference
+(e(gx, gy) - e(x, y)) / variance; of an exact predictor it is the mean squared difference of a step from the image and
+the step's image. Squares of what changes are predicted too, which shows where noise is not symmetric; of the reward
+only the mean matters.
 
-Starts that are not symmetric themselves say nothing about the dynamics: there the element is "not covered".
+A predictor that knows nothing errs alike everywhere. So breakings of the tolerance's size are planted in the same data
+(see `controls`): d h(x) is added to a field, for functions h that the element changes. An element holds where each of
+them would have raised the gap so far that one as small as what is found has a probability of 5 %, at most.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
+from esp_cli.checking.controls import STILL, Controls, strength
+from esp_cli.checking.predictor import Predictor
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.regression import MATERIAL, check_by_regression
-from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, judged
-from esp_cli.prior.regression import moments, orders_of_others, own_inputs, ridge
-from esp_cli.symmetry import Element, build_transform
+from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, concluded
+from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 FEWEST = 64
 """Episodes (or single transitions) below which nothing can be told."""
-_ASYMMETRIC = 0.05
-"""Shift of the starts, in standard deviations, from which an element is not covered."""
+TOLERATED = 0.2
+"""Standard deviations of a field that a step from the image may differ from the step's image."""
+_SEEN = 0.1
+"""Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
+_MOST_ROWS = 1 << 15
+"""Steps of agents that are looked at, at most; of more episodes every k-th step."""
+_FEWEST_INSIDE = 0.05
+"""Share of the images that lie where transitions do, below which they show nothing; these alone are judged."""
+_PREFERS, _ELSEWHERE = 0.05, 0.5
+"""Shifts of the starts, in standard deviations: from the first on, what looks broken may be a preference of the starts;
+from the second on, images lie where no transition does."""
 
 
 def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
@@ -35,7 +50,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
 
     Args:
         spaces: what the numbers are, and the declared symmetry.
-        data: anybody's transitions, of a policy that prefers no direction.
+        data: anybody's transitions, of a policy that prefers no direction; each episode counts once.
         elements: to try.
 
     Raises:
@@ -43,27 +58,170 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     """
     data = _in_float32(data)
     _refuse_what_says_nothing(spaces, data)
+    data = replace(data, reward=_without_tails(data.reward))
+    stride = -(-len(data.obs) * data.obs.shape[1] * spaces.num_agents // _MOST_ROWS)
+    thinned = Transitions(*(part[:, ::stride] for part in vars(data).values() if part is not None))
     half = len(data.obs) // 2
-    inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
-    gram, cross = moments(inputs[:half].double(), outputs[:half].double())
-    rows = half * data.obs.shape[1]
-    model = ridge(gram / rows, cross / rows, strength=1e-3, floor=1e-6)
-    held = data.episodes(slice(half, None))
-    verdicts = [_judge(element, spaces, held, model) for element in elements]
-    exchanging = [element for element in elements if element.permutation is not None]
-    sharper = {verdict.element: verdict for verdict in check_by_regression(spaces, data, exchanging)}
-    return [_sharpened(verdict, sharper.get(verdict.element)) for verdict in verdicts]
+    parts = thinned.episodes(slice(half)), thinned.episodes(slice(half, None))
+    controls = Controls(spaces.observation, thinned)
+    halves = [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
+    return [_judge(element, spaces, halves, data.obs[:, 0]) for element in elements]
 
 
-def _sharpened(verdict: ElementVerdict, by_regression: ElementVerdict | None) -> ElementVerdict:
-    """Return a verdict with the fields that a regression on what all agents see and do shows to be broken.
+def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], start: Tensor) -> ElementVerdict:
+    declared, transform = is_declared(element, spaces), build_transform([element], spaces)
+    compared = [half.compared(transform) for half in halves]
+    if (share := min(one.inside for one in compared)) < _FEWEST_INSIDE:
+        reason = f"{1 - share:.0%} of the images lie outside what was seen"
+        return ElementVerdict(element.name, declared, (), reason)
+    counts = compared[0].counts & compared[1].counts
+    verdicts = []
+    for name in halves[0].fields:
+        alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
+        still = halves[0].is_still(name)
+        verdicts.append(_of_nothing(name) if still else _judged(name, alone, squares, planted[:, counts]))
+    found = ElementVerdict(element.name, declared, tuple(verdicts))
+    shift = _shift(start, transform.obs(start.unsqueeze(0))[0])
+    if shift > (_PREFERS if found.outcome == "broken" else _ELSEWHERE):
+        return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
+    return found
 
-    It sees a wrong order of agents in what an agent sees, of which the products of its own numbers show little.
+
+def _of_nothing(name: str) -> FieldVerdict:
+    """Judge what never changes: that is its law where it is seen, and a reward that never came has none."""
+    return concluded(name, 0.0, 0.0, broken=False, p_value=float(name == "reward"))
+
+
+def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
+    """Judge one field by how much larger errors are on images, as shares of the variance.
+
+    Args:
+        name: the field's.
+        alone: [M] squared errors of what follows.
+        squares: [M] those of its square.
+        planted: [M, functions] those of what follows with a breaking of the tolerance's size.
     """
-    if by_regression is None or not verdict.fields:
-        return verdict
-    broken = {f.field: f for f in by_regression.fields if f.gap > max(MATERIAL, SIGNIFICANT * f.error)}
-    return replace(verdict, fields=tuple(broken.get(f.field, f) for f in verdict.fields))
+    gap, error = _mean(alone)
+    p_value = 1.0
+    if planted.shape[1]:
+        expected, errors = _mean(planted - alone.unsqueeze(1))[0], _mean(planted)[1]
+        p_value = float(torch.special.ndtr((gap - expected) / errors).max())
+    if name.startswith("obs."):
+        other, its_error = _mean(squares)
+        if other / its_error > gap / error and _is_broken(other, its_error):
+            gap, error = other, its_error
+    size = float(gap.clamp_min(0).sqrt())
+    error_of_size = min(float(error) / max(2 * size, 1e-12), float(error) ** 0.5)
+    return concluded(name, size, error_of_size, _is_broken(gap, error), p_value)
+
+
+class _Half:
+    """A predictor of one half of the episodes, and what it errs by on the other.
+
+    Attributes:
+        fields: which outputs are of which field.
+    """
+
+    def __init__(self, spaces: Spaces, controls: Controls, fitted: Transitions, held: Transitions) -> None:
+        outputs, width = outputs_of(fitted), spaces.observation.width
+        self._width, self._controls, self._held = outputs.shape[-1], controls, held
+        self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
+        self._predict = Predictor(spaces, fitted, self._targets(fitted), controls(fitted))
+        self._planted = controls(held)
+        self._here = self._sides(held, self._planted)
+        self._trust = _trust(self._here.said, self._here.true)
+        self._errors = (self._trust * self._here.said - self._here.true).square()
+        self._spread = self._here.true.flatten(0, 2).var(0)
+        self.fields = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
+        self.fields |= {"reward": slice(width, width + 1)}
+        self.fields |= {"action mask": slice(width + 1, None)} if self._width > width + 1 else {}
+
+    def is_still(self, name: str) -> bool:
+        """Return whether a field never changes."""
+        return float(self._spread[self.fields[name]].sum()) < STILL**2
+
+    @torch.no_grad()
+    def compared(self, transform: Transform) -> _Compared:
+        """Compare errors on images with those on originals."""
+        image = turned(self._held, transform)
+        inside = self._predict.covers(image).float().unsqueeze(-1)
+        weight = inside / inside.mean().clamp_min(STILL)
+        carried = transform.per_agent(self._planted.movedim(-1, 0)).movedim(0, -1)
+        there, (size, counts) = self._sides(image, carried), strength(carried, self._controls(image), weight)
+        worse = weight * ((self._trust * there.said - there.true).square() - self._errors)
+        fields = {}
+        for name, where in self.fields.items():
+            main = where.start + int(self._deviation[where].argmax())
+            variance = self._spread[where].sum().clamp_min(STILL**2)
+            planted = weight * _excess(self._here, there, main, TOLERATED * (variance / size).sqrt())
+            others = (worse[..., where].sum(-1) - worse[..., main]).unsqueeze(-1)
+            squares = worse[..., self._width :][..., where].sum(-1)
+            of_squares = self._spread[self._width :][where].sum().clamp_min(STILL**2)
+            parts = worse[..., where].sum(-1) / variance, squares / of_squares, (planted + others) / variance
+            fields[name] = tuple(part.mean((1, 2)).double() for part in parts)
+        return _Compared(float(inside.mean()), counts, fields)
+
+    def _sides(self, data: Transitions, functions: Tensor) -> _Sides:
+        said, planted = self._predict(data)
+        mean = torch.cat([self._mean, torch.ones_like(self._mean)])
+        return _Sides(said - mean, self._targets(data) - mean, planted, functions)
+
+    def _targets(self, data: Transitions) -> Tensor:
+        """Return what is predicted of each agent, and its square in standard deviations from the mean."""
+        outputs = outputs_of(data)
+        return torch.cat([outputs, ((outputs - self._mean) / self._deviation.clamp_min(STILL)).square()], -1)
+
+
+class _Compared(NamedTuple):
+    """How errors on images compare with those on originals.
+
+    Attributes:
+        inside: share of the images that lie where transitions do.
+        counts: which controls the element changes, [functions] bool.
+        fields: by field, as shares of the variance, excess of squared errors [M], of those of squares [M], and with
+            each control planted [M, functions].
+    """
+
+    inside: float
+    counts: Tensor
+    fields: dict[str, tuple[Tensor, ...]]
+
+
+class _Sides(NamedTuple):
+    """Predictions of what follows and of the controls, and what they are, [M, T, N, numbers] each."""
+
+    said: Tensor
+    true: Tensor
+    planted_said: Tensor
+    planted_true: Tensor
+
+
+def _trust(said: Tensor, true: Tensor) -> Tensor:
+    """Return by how much to shrink predictions so that they err least, 0 to 1: a predictor takes some noise for law."""
+    return ((said * true).mean((0, 1, 2)) / said.square().mean((0, 1, 2)).clamp_min(1e-20)).clamp(0, 1)
+
+
+def _excess(here: _Sides, there: _Sides, number: int, amounts: Tensor) -> Tensor:
+    """Return by how much a number's squared errors are larger on images, with each control added: [M, T, N, B]."""
+    said, true = (
+        [part[..., [number]] + amounts * planted for part, planted in pairs]
+        for pairs in (
+            ((here.said, here.planted_said), (there.said, there.planted_said)),
+            ((here.true, here.planted_true), (there.true, there.planted_true)),
+        )
+    )
+    trust = _trust(said[0], true[0])
+    return (trust * said[1] - true[1]).square() - (trust * said[0] - true[0]).square()
+
+
+def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the mean of independent samples [M, ...], and its standard error."""
+    samples = samples.double()
+    return samples.mean(0), (samples.std(0) / len(samples) ** 0.5).clamp_min(1e-12)
+
+
+def _is_broken(gap: Tensor | float, error: Tensor | float) -> bool:
+    return bool(gap > SIGNIFICANT * error) and bool(gap > _SEEN * TOLERATED**2)
 
 
 def _in_float32(data: Transitions) -> Transitions:
@@ -90,51 +248,13 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
             raise UserError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
 
 
-def _judge(element: Element, spaces: Spaces, data: Transitions, model: Tensor) -> ElementVerdict:
-    transform = build_transform([element], spaces)
-    declared = is_declared(element, spaces)
-    image = turned(data, transform)
-    if shift := _asymmetry(data.obs[:, 0], image.obs[:, 0]):
-        return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
-    here, there = (_statistics(spaces, part, model) for part in (data, image))
-    layout = spaces.observation
-    verdicts: list[FieldVerdict] = []
-    for name, where in layout.slices().items():
-        moved = bool((data.obs[..., where].abs() > 1e-6).any())
-        verdicts.append(_field_verdict(f"obs.{name}", here, there, where, moved))
-    reward = slice(layout.width, layout.width + 1)
-    verdicts.append(_field_verdict("reward", here, there, reward, True))
-    if data.action_mask is not None:
-        verdicts.append(_field_verdict("action mask", here, there, slice(layout.width + 1, None), True))
-    return ElementVerdict(element.name, declared, tuple(verdicts))
+def _without_tails(reward: Tensor) -> Tensor:
+    """Return rewards of which the rarest hundredth counts as the next: rare large ones hide what is usual."""
+    low, high = torch.quantile(reward.flatten()[: 1 << 24], torch.tensor([0.005, 0.995])).tolist()
+    return reward.clamp(low, high) if low < high else reward
 
 
-def _field_verdict(name: str, here: Tensor, there: Tensor, where: slice, moved: bool) -> FieldVerdict:
-    """Judge the statistics [M, N, features, outputs] of one field."""
-    gap = (here[..., where] - there[..., where]).flatten(1)
-    live = gap.std(0) > 1e-9
-    if not bool(live.any()):
-        return judged(name, gap[:, :1], 1.0, moved)
-    return judged(name, gap[:, live] / here[..., where].flatten(1).std(0)[live].clamp_min(1e-6), 1.0, moved)
-
-
-def _statistics(spaces: Spaces, data: Transitions, model: Tensor) -> Tensor:
-    """Return the products of residuals and linear inputs of each agent, mean over an episode: [M, N, inputs, D + 1].
-
-    Inputs are what the agent sees and does, and what the others do: a wrong order of agents in what it sees shows
-    beside their actions alone.
-    """
-    inputs, outputs = own_inputs(spaces, data.obs, data.action), outputs_of(data)
-    residual = outputs - torch.einsum("mtnf,nfo->mtno", inputs, model)
-    action = spaces.action
-    acted = action.count - 1 if isinstance(action, Discrete) else action.width
-    linear = inputs[..., : 1 + data.obs.shape[-1] + acted]  # a wrong order of actions shows beside actions alone
-    own = linear[..., 1 + data.obs.shape[-1] :]
-    linear = torch.cat([linear, *(own[:, :, order] for order in orders_of_others(spaces.num_agents))], -1)
-    return torch.einsum("mtni,mtno->mnio", linear, residual) / inputs.shape[1]
-
-
-def _asymmetry(start: Tensor, turned: Tensor) -> float:
+def _shift(start: Tensor, turned: Tensor) -> float:
     """Return the largest shift of mean or spread of the starts [M, N, D] in s.d. that is no chance, else 0."""
     start, turned = start.flatten(1).double(), turned.flatten(1).double()
     spread = torch.cat([start, turned]).std(0).clamp_min(1e-3)
@@ -142,6 +262,5 @@ def _asymmetry(start: Tensor, turned: Tensor) -> float:
     for power in (1, 2):
         gap = (start / spread) ** power - (turned / spread) ** power
         size, error = gap.mean(0).abs(), gap.std(0) / len(gap) ** 0.5
-        real = (size > SIGNIFICANT * error) & (size > _ASYMMETRIC)
-        worst = max(worst, float(torch.where(real, size, 0.0).max()))
+        worst = max(worst, float(torch.where(size > SIGNIFICANT * error, size, 0.0).max()))
     return worst

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
-from torch import Tensor
+from scipy.special import ndtr
 
 Outcome = Literal["holds", "broken", "not covered"]
-RANK: dict[Outcome, int] = {"not covered": 0, "holds": 1, "broken": 2}
+RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}
 """The outcome of several verdicts is the one of the highest rank."""
 SIGNIFICANT = 6.0
-"""Standard errors that a gap must exceed: with thousands of comparisons, chance alone reaches 4."""
+"""Standard errors that a gap must exceed to be a breaking: with thousands of comparisons, chance alone reaches 4."""
 NEGLIGIBLE = 1e-3
 """Gap against the field's spread below which a difference is rounding."""
+LEVEL = 0.05
+"""Probability with which an element that is off by the tolerance may be said to hold, at most."""
 
 
 @dataclass(frozen=True)
@@ -23,15 +25,19 @@ class FieldVerdict:
 
     Attributes:
         field: its name, with the space before it: "obs.velocity", "state.position", "reward", "end".
-        outcome: whether it transforms as it says; "not covered" where the data cannot tell.
-        gap: how far it is from that, in standard deviations of the field or, from transitions, as a share of variance.
+        outcome: whether it transforms as it says; "not covered" where the data could not have shown a breaking.
+        gap: how far it is from that, in standard deviations of the field.
         error: standard error of the gap.
+        p_value: how likely a gap this small is, if the field is off by the tolerance or more.
+        share: of the states, those that differ; NaN where chance decides what follows.
     """
 
     field: str
     outcome: Outcome
     gap: float
     error: float
+    p_value: float = 1.0
+    share: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -39,7 +45,7 @@ class ElementVerdict:
     """What was found of one element.
 
     Attributes:
-        element: its name, as `--transforms` takes it; of a map of numbers what each becomes.
+        element: its name, as `--transforms` takes it.
         declared: whether the task's declared symmetry holds it.
         fields: one verdict for each field.
         reason: why the whole element is not covered, if so.
@@ -51,26 +57,31 @@ class ElementVerdict:
     reason: str = ""
 
     @property
+    def worst(self) -> FieldVerdict | None:
+        """The field that decides: broken by most, else not covered, else the one that is surest to hold last."""
+        return max(
+            self.fields, key=lambda f: (RANK[f.outcome], f.gap if f.outcome == "broken" else f.p_value), default=None
+        )
+
+    @property
     def outcome(self) -> Outcome:
-        """Broken if any field is; it holds if some field says so."""
-        outcomes = (verdict.outcome for verdict in self.fields)
-        return max(outcomes, key=RANK.__getitem__, default="not covered")
+        """Broken if any field is; it holds only if every field does."""
+        return self.worst.outcome if self.worst else "not covered"
+
+    @property
+    def p_value(self) -> float:
+        """How likely gaps this small are, if some field is off by the tolerance or more; 1 unless every field holds."""
+        return self.worst.p_value if self.worst and self.outcome == "holds" else 1.0
 
 
-def judged(field: str, samples: Tensor, scale: float, moved: bool) -> FieldVerdict:
-    """Judge a gap whose expectation is 0 under symmetry.
+def concluded(
+    field: str, gap: float, error: float, broken: bool, p_value: float, share: float = math.nan
+) -> FieldVerdict:
+    """Return a verdict: a field holds only where a gap of the tolerance would have been seen."""
+    outcome: Outcome = "broken" if broken else "holds" if p_value <= LEVEL else "not covered"
+    return FieldVerdict(field, outcome, gap, error, 1.0 if broken else p_value, share)
 
-    Args:
-        field: its name.
-        samples: [M, tests] independent rows; each column is one test of the field.
-        scale: spread of the field.
-        moved: whether the element changes anything of the field, or of what it depends on, in these samples.
-    """
-    samples = samples.double()
-    gaps = samples.mean(0).abs()
-    errors = samples.std(0) / len(samples) ** 0.5
-    broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE * scale)
-    scores = torch.where(broken, gaps, 0.0) if bool(broken.any()) else gaps
-    worst = int(scores.argmax())
-    outcome: Outcome = "broken" if bool(broken.any()) else "holds" if moved else "not covered"
-    return FieldVerdict(field, outcome, float(gaps[worst] / scale), float(errors[worst] / scale))
+
+def chance(gap: float, tolerance: float, error: float) -> float:
+    """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
+    return float(ndtr((gap - tolerance) / max(error, 1e-12)))

@@ -20,7 +20,7 @@ from esp_cli.commands.options import (
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.checking import PolicyVerdict, SymmetryReport
+    from esp_cli.checking import ElementVerdict, PolicyVerdict, SymmetryReport
     from esp_envs import Environment
     from esp_envs.conformance import Finding
     from esp_envs.conformance.subject import MakeWorlds
@@ -51,9 +51,11 @@ def check(
     network: OwnNetworkOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Check what every task promises, or a task's declared symmetry; exit code 1 where something is broken.
+    """Check what every task promises, or a task's declared symmetry.
 
-    Symmetry is judged per element and field: it holds, it is broken, or the data does not cover it.
+    Symmetry is judged per element and field: it holds, it is broken, or it is not covered, where nothing could have
+    shown a breaking. Exit code 0: all that is declared holds; 1: something is broken; 2: something declared is not
+    covered.
     """
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
@@ -68,15 +70,16 @@ def check(
         return make(task, num_envs, seeds, chosen)
 
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
-    if what == "task":
-        holds = _check_task(task, spec, make_worlds, json)
-    else:
-        holds = _check_symmetry(make_worlds, transforms, policy, json)
-    if not holds:
-        raise typer.Exit(1)
+    code = (
+        _check_task(task, spec, make_worlds, json)
+        if what == "task"
+        else _check_symmetry(make_worlds, transforms, policy, json)
+    )
+    if code:
+        raise typer.Exit(code)
 
 
-def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | None) -> bool:
+def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | None) -> int:
     from esp_envs.conformance import Subject, check
 
     findings = [_of_the_symmetry(spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
@@ -84,7 +87,7 @@ def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | 
             for f in findings]  # fmt: skip
     title = f"What {task} promises as a task"
     console.result(json, findings, lambda: console.table(("promise", "result", "what happens"), rows, title=title))
-    return not any(finding.broken for finding in findings)
+    return int(any(finding.broken for finding in findings))
 
 
 def _of_the_symmetry(spec: TaskSpec) -> Finding:
@@ -99,7 +102,7 @@ def _of_the_symmetry(spec: TaskSpec) -> Finding:
     return Finding(_SYMMETRY, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
 
 
-def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> bool:
+def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> int:
     from esp_cli.checking import check_policy, check_symmetry
 
     report = check_symmetry(make_worlds, transforms)
@@ -110,21 +113,49 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
         measured = check_policy(open_policy(policy), make_worlds, transforms)
     found = {"report": report, "holds": report.holds, "policy": measured}
     console.result(json, found, lambda: _print(report, measured))
-    return report.holds
+    return 1 if report.broken else 2 if report.uncovered else 0
 
 
 def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
-    rows: list[tuple[str, str, str, str]] = []
-    for element in report.elements:
-        worst = [f for f in element.fields if f.outcome == "broken"]
-        gaps = ", ".join(f"{f.field} {f.gap:.3f} ± {f.error:.3f}" for f in worst)
-        unseen = ", ".join(f.field for f in element.fields if f.outcome == "not covered")
-        told = gaps or element.reason or (f"not covered: {unseen}" if unseen else "")
-        rows.append((element.element, "yes" if element.declared else "no", element.outcome, told))
-    title = f"{report.task} by {report.method}: declared {report.declared}, found {report.found}"
-    caption = "gap and standard error in standard deviations of the field; found: as far as the visited states show"
-    rows += [(name, "no", "not tried", told) for name, told in report.refused.items()]
-    console.table(("element", "declared", "result", "where"), rows, title=title, caption=caption)
+    print_elements(report, f"declared {report.declared}, found {report.found}")
+    if report.uncovered:
+        missing = (
+            "more episodes, or a task that can be set to a state" if report.method == "transitions" else "other states"
+        )
+        console.note(
+            f"declared, but not covered: {', '.join(report.uncovered)}; what was seen could not have shown a breaking "
+            f"of them, {missing} might"
+        )
     if measured:
         agreeing = [(m.element, f"{m.agreement:.3f}") for m in measured]
         console.table(("element", "same greedy action>"), agreeing, title="Symmetry of the policy")
+
+
+def print_elements(report: SymmetryReport, found: str) -> None:
+    """Print what was found of each element."""
+    from esp_cli.checking.task import TOLERATED
+
+    rows: list[tuple[str, ...]] = [
+        (e.element, "yes" if e.declared else "no", e.outcome, f"{e.p_value:.1g}", _where(e)) for e in report.elements
+    ]
+    rows += [(name, "no", "not tried", "", told) for name, told in report.refused.items()]
+    caption = (
+        "gaps and standard errors in standard deviations of the field; p: how likely so small a gap is where a field "
+        f"is off by {TOLERATED[report.method]} or more"
+    )
+    title = f"{report.task} by {report.method}: {found}"
+    console.table(("element", "declared", "result", "p>", "where"), rows, title=title, caption=caption)
+
+
+def _where(element: ElementVerdict) -> str:
+    """Return what decided on an element: the fields that are broken, else those that are not covered."""
+    if element.reason:
+        return element.reason
+    fields = [field for field in element.fields if field.outcome == element.outcome]
+    if element.outcome == "not covered":
+        return ", ".join(field.field for field in fields)
+    shown = fields if element.outcome == "broken" else [field for field in (element.worst,) if field]
+    return ", ".join(
+        f"{f.field} {f.gap:.3f} ± {f.error:.3f}" + (f" (in {f.share:.2%} of the states)" if f.share > 0 else "")
+        for f in shown
+    )

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
+from esp_cli.commands.check import print_elements
 from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_named
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
-    from esp_cli.checking.discovery import Discovery
+    from esp_cli.checking import SymmetryReport
     from esp_envs import Environment
 
 EPILOG = """Examples:\n
@@ -48,17 +49,23 @@ def discover(
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
 
-    What the task declares is not looked at. An element is accepted where it is shown to hold; of all accepted elements
-    at most 5 % are false, in expectation.
+    An element is accepted where a breaking of a tolerance's size would have been seen: of elements that are off by that
+    or more, one of a hundred is accepted. What the data could not have shown is "not covered".
     """
     found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs)
-    console.result(json, found, lambda: _print(found))
+    tried = [
+        {"element": e.element, "outcome": e.outcome, "accepted": e.outcome == "holds", "p_value": e.p_value}
+        | ({"field": e.worst.field, "gap": e.worst.gap, "error": e.worst.error} if e.worst else {"field": e.reason})
+        for e in found.elements
+    ]
+    told = {"source": found.task, "method": found.method, "group": found.found, "transforms": found.transforms}
+    console.result(json, {**told, "tried": tried}, lambda: _print(found))
 
 
 def _discovery(
     what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool
-) -> Discovery:
-    from esp_cli.checking.discovery import discover_in_task, discover_in_transitions
+) -> SymmetryReport:
+    from esp_cli.checking import check_recorded, check_symmetry
     from esp_cli.checking.logs import read_transitions
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
@@ -71,7 +78,7 @@ def _discovery(
         if logs:
             raise UserError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
         spec = make(task, 1, [0], resolve_task_settings(task, settings)).spec
-        return discover_in_transitions(what, spec, read_transitions(path, spec), transforms)
+        return check_recorded(what, spec, read_transitions(path, spec), transforms)
     name = what
     if task is not None and not path.is_dir():
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
@@ -88,26 +95,14 @@ def _discovery(
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
 
-    return discover_in_task(worlds, transforms, logs)
+    return check_symmetry(worlds, transforms, logs)
 
 
-def _print(found: Discovery) -> None:
-    rows = [
-        (
-            one.element,
-            "accepted" if one.accepted else "-",
-            f"{one.p_value:.2g}",
-            f"{one.field} {one.gap:.4f} ± {one.error:.4f}",
-        )
-        for one in found.tried
-    ]
-    unit = "standard deviations" if found.method == "paired states" else "shares of variance"
-    title = f"{found.source} by {found.method}: found {found.group}"
-    caption = f"worst field: gap ± standard error in {unit}; p: that a field is off by the tolerance or more"
-    console.table(("element", "result", "p>", "worst field"), rows, title=title, caption=caption)
-    if found.transforms:
-        console.note(f"use it with: --transforms {found.transforms}")
-    elif any(one.accepted for one in found.tried):
+def _print(report: SymmetryReport) -> None:
+    print_elements(report, f"found {report.found}")
+    if report.transforms:
+        console.note(f"use it with: --transforms {report.transforms}")
+    elif any(element.outcome == "holds" for element in report.elements):
         console.note("what was found has no name that --transforms takes")
     else:
         console.note("nothing that --transforms can name was found: train with --prior none, or with prior.compass")

@@ -65,7 +65,8 @@ class PriorConfig(Strict):
     )
     doubt: float = Field(8.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
-        {}, description="weight of each element by its name; filled in where trust is measured or a gate"
+        {},
+        description="weight of each element by its name, 0 leaves it out; filled in where trust is measured or a gate",
     )
 
     @model_validator(mode="before")

@@ -207,8 +207,11 @@ class SymmetryPrior:
         """Return for each element how likely it is used now, beside the others."""
         if self.config.trust == "full":
             return [self.strength] * len(self._weights)
-        gate = self.config.trust == "gate"  # which weighs rows instead
-        return [1.0 if weight == 1 else self.strength * (1.0 if gate else weight) for weight in self._weights]
+        gate = self.config.trust == "gate"  # which weighs rows instead, of elements that weigh anything
+        weights = [float(weight > 0) if gate else weight for weight in self._weights]
+        return [
+            1.0 if weight == 1 else self.strength * used for weight, used in zip(self._weights, weights, strict=True)
+        ]
 
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:

@@ -1,30 +1,35 @@
-"""Measure what `esp discover` finds: the group of each task, and how well transitions alone tell elements apart.
+"""Measure what checks of symmetry find: in tasks made at random from transitions alone, and in the built-in tasks.
 
+    python tests/benchmarks/discovery.py --random 200 --json docs/measured/discovery-random.json
     python tests/benchmarks/discovery.py [--only navigation] [--logs]
 
-The tasks declare nothing here. Without --logs states are set where a task can be; with it, transitions of the random
-policy are all there is, and the last line is the AUC of symmetric against broken elements by their gap.
+With --random it counts broken elements that are said to hold, and symmetric ones that are not; what is off by less than
+the tolerance counts as neither. The built-in tasks declare nothing here. Without --logs states are set where a task can
+be; with it, transitions of the random policy are all there is.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from esp_cli import machine
 
 if __name__ == "__main__":
     machine.prepare()  # as `esp` does, before torch is imported
 
-import torch
-
-from esp_cli.checking import collect
-from esp_cli.checking.discovery import discover_in_task
-from esp_cli.checking.regression import check_by_regression
-from esp_cli.symmetry import parse_elements
+from esp_cli.checking import candidates, check_symmetry, check_transitions, collect
+from esp_cli.checking.transitions import TOLERATED
+from esp_cli.checking.verdicts import LEVEL
 from esp_envs import Environment, make
+from tests.benchmarks.synthetic import Recipe, broken_by
 
 Settings = Mapping[str, object]
 FORCES: Settings = {"actions": "continuous"}
@@ -47,7 +52,11 @@ CASES: Sequence[tuple[str, Settings, str]] = (
     ("wildlife", {"wind": 0.8, **DRONES}, "flip-x*agents"),
 )
 """Task, settings, and what is there."""
-EPISODES, WORLDS = 1024, 256
+EPISODES, WORLDS = 2048, 256
+TURNS = {"rot45", "rot60", "rot90", "rot120", "rot180", "rot57", "flip-x", "flip-diagonal", "flip30", "flip23"}
+"""Turns and mirrors that are tried where all angles can be."""
+SYMMETRIC = 1e-3
+"""Gap below which an element is symmetric: what rounding leaves."""
 
 
 def found(task: str, settings: Settings, logs: bool) -> str:
@@ -58,34 +67,87 @@ def found(task: str, settings: Settings, logs: bool) -> str:
         env.spec = replace(env.spec, symmetry="c1", nearly="")
         return env
 
-    return discover_in_task(worlds, logs_alone=logs).group
+    return check_symmetry(worlds, from_transitions=logs).found
 
 
-def auc(cases: Sequence[tuple[str, Settings, str]]) -> tuple[float, int, int]:
-    """Return the share of pairs of a broken and a symmetric element in which the broken one has the larger gap."""
-    held, broken = list[float](), list[float]()
-    for task, settings, group in cases:
-        plane = group.split("*")[0].split(" ")[0]
-        env = make(task, WORLDS, [0], settings)
-        largest = {"o2": "d4", "so2": "c4", "c1": ""}.get(plane, plane)
-        true = {element.name for element in parse_elements(largest, 1)} if largest else set[str]()
-        for verdict in check_by_regression(env.spec, collect(env, EPISODES), parse_elements("d4", 1)):
-            gap = max(field.gap for field in verdict.fields if field.outcome != "not covered")
-            (held if verdict.element in true else broken).append(gap)
-    ahead = torch.tensor(broken).unsqueeze(1) > torch.tensor(held)
-    return float(ahead.float().mean()), len(held), len(broken)
+def of_random_task(seed: int) -> dict[str, Any]:
+    """Return what is said of each element of a random task, beside by how much it is off."""
+    recipe, begun = Recipe.drawn(seed), time.process_time()
+    env = recipe.make(WORLDS, [0])
+    elements = candidates(env.spec)
+    if len(elements) > 2 * len(TURNS):
+        elements = [element for element in elements if element.orders or element.name in TURNS]
+    verdicts = check_transitions(env.spec, collect(env, EPISODES), elements)
+    seconds = time.process_time() - begun
+    families = {name: getattr(recipe, name) for name in ("reward", "force", "noise", "tails", "start", "listed")}
+    found = {
+        verdict.element: {
+            "off": gap if gap < math.inf else "never seen",
+            "outcome": verdict.outcome,
+            "p": float(f"{verdict.p_value:.2g}"),
+            "field": verdict.worst.field if verdict.worst else verdict.reason,
+        }
+        for verdict, gap in zip(verdicts, broken_by(recipe, elements), strict=True)
+        if not math.isnan(gap)
+    }
+    sizes = {"seed": seed, "agents": recipe.agents, "marks": recipe.marks}
+    return sizes | families | {"seconds": round(seconds, 1), "elements": found}
+
+
+def counted(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Count what was said falsely of random tasks."""
+    broken, symmetric = list[tuple[int, str, bool]](), list[tuple[int, str, bool]]()
+    for task in tasks:
+        for name, found in task["elements"].items():
+            entry = (task["seed"], name, found["outcome"] == "holds")
+            if found["off"] == "never seen" or found["off"] >= TOLERATED:
+                broken.append(entry)
+            elif found["off"] < SYMMETRIC:
+                symmetric.append(entry)
+    false = [entry[:2] for entry in broken if entry[2]]
+    missed = [entry[:2] for entry in symmetric if not entry[2]]
+    rewards = {task["seed"]: task["reward"] for task in tasks}
+    accepted = len(false) + len(symmetric) - len(missed)
+    return {
+        "tasks": len(tasks),
+        "families": {name: len({task[name] for task in tasks}) for name in ("reward", "force", "noise")},
+        "episodes": EPISODES,
+        "tolerance": TOLERATED,
+        "level": LEVEL,
+        "broken": len(broken),
+        "false acceptances": len(false),
+        "share of broken ones that are accepted": len(false) / max(1, len(broken)),
+        "share of accepted ones that are broken": len(false) / max(1, accepted),
+        "tasks with a false acceptance": len({seed for seed, _ in false}),
+        "symmetric": len(symmetric),
+        "misses": len(missed),
+        "share of symmetric ones that are missed": len(missed) / max(1, len(symmetric)),
+        "falsely accepted": false,
+        "misses by reward": dict(Counter(rewards[seed] for seed, _ in missed).most_common()),
+        "seconds": sum(task["seconds"] for task in tasks),
+    }
 
 
 def main() -> None:
-    """Print a line for each case, then the AUC."""
+    """Print a line for each case, or of random tasks what was counted."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", help="this task alone")
     parser.add_argument("--logs", action="store_true", help="from transitions alone")
+    parser.add_argument("--random", type=int, help="so many random tasks instead, from transitions alone")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first random task")
+    parser.add_argument("--json", help="file for the random tasks")
     args = parser.parse_args()
+    if args.random:
+        tasks: list[dict[str, Any]] = []
+        for seed in range(args.first, args.first + args.random):
+            tasks.append(of_random_task(seed))
+            told = counted(tasks)
+            print(*(f"{name}: {told[name]};" for name in ("tasks", "falsely accepted", "misses by reward")), flush=True)
+            if args.json:
+                Path(args.json).write_text(json.dumps({"counted": told, "tasks": tasks}, indent=1) + "\n")
+        print(json.dumps(told, indent=2))
+        return
     cases = [case for case in CASES if args.only in (None, case[0])]
-    if args.logs:
-        share, held, broken = auc(cases)
-        print(f"AUC {share:.3f} of {broken} broken against {held} symmetric elements", flush=True)
     for task, settings, group in cases:
         begun = time.monotonic()
         answer = found(task, settings, args.logs)

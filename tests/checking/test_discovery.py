@@ -10,25 +10,24 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.checking import Transitions, check_symmetry, collect, measured
-from esp_cli.checking.discovery import (
-    Discovery,
-    accepted_of,
-    discover_in_task,
-    discover_in_transitions,
-    judged_elements,
+from esp_cli.checking import (
+    SymmetryReport,
+    Transitions,
+    check_recorded,
+    check_symmetry,
+    check_transitions,
+    collect,
+    measured,
     named,
 )
 from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
 from esp_cli.checking.paired import _verdict
-from esp_cli.checking.regression import check_by_regression
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, chance, concluded
 from esp_cli.symmetry import parse_elements, transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
-from esp_envs.base import Environment
 from tests.cli.running import esp, refused
 
 FORCES = {"actions": "continuous"}
@@ -57,7 +56,7 @@ def discovered(task: str, settings, transforms: str | None = None, logs_alone: b
         env.spec = replace(env.spec, symmetry="c1", nearly="")
         return env
 
-    return discover_in_task(worlds, transforms, logs_alone)
+    return check_symmetry(worlds, transforms, logs_alone)
 
 
 @pytest.mark.slow
@@ -65,7 +64,7 @@ def discovered(task: str, settings, transforms: str | None = None, logs_alone: b
 def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> None:
     robots = "d4,agents-1-0-2-3,agents-0-2-1-3,agents-0-1-3-2" if task == "formation" else None
     found = discovered(task, settings, robots)
-    assert (found.method, found.group) == ("paired states", group)
+    assert (found.method, found.found) == ("paired states", group)
     assert bool(found.transforms) == (group != "c1")
     if found.transforms:
         assert transform_set(found.transforms, make(task, 1, [0], settings).spec).names
@@ -75,28 +74,27 @@ def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> 
 @pytest.mark.parametrize(("task", "settings", "group"), [*FOUND[:2], *FOUND[3:5]], ids=str)
 def test_logs_alone_show_the_same(task, settings, group) -> None:
     found = discovered(task, settings, logs_alone=True)
-    assert (found.method, found.group) == ("transitions", group)
+    assert (found.method, found.found) == ("transitions", group)
 
 
-def test_logs_tell_symmetric_from_broken_elements() -> None:
-    """The area under the curve of the gap, over elements of six tasks."""
-    held, broken = [], []
-    for task, settings, left in [
-        ("navigation", {}, "d4"),
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "settings", "left"),
+    [
         ("navigation", {"wind": 0.2}, "flip-x"),
         ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal"),
         ("navigation", {"mud": 0.5}, "flip-x"),
         ("predator-prey", {"wind": 0.2}, "flip-x"),
         ("wildlife", {"wind": 0.8, **DRONES}, "flip-x"),
-    ]:
-        env = make(task, 256, [0], settings)
-        true = {element.name for element in parse_elements(left, 1)}
-        for verdict in check_by_regression(env.spec, collect(env, 1024), parse_elements("d4", 1)):
-            gap = max(field.gap for field in verdict.fields if field.outcome != "not covered")
-            (held if verdict.element in true else broken).append(gap)
-    better = torch.tensor(broken).unsqueeze(1) > torch.tensor(held)
-    assert len(held) >= 12
-    assert better.float().mean() >= 0.95
+    ],
+    ids=str,
+)
+def test_transitions_accept_nothing_that_is_broken(task, settings, left) -> None:
+    env = make(task, 256, [0], settings)
+    verdicts = check_transitions(env.spec, collect(env, 1024), parse_elements("d4", 1))
+    outcomes = {verdict.element: verdict.outcome for verdict in verdicts}
+    assert outcomes.pop(left) != "broken"
+    assert "holds" not in outcomes.values()
 
 
 def test_a_policy_that_prefers_a_direction_accuses_no_symmetric_task() -> None:
@@ -115,28 +113,8 @@ def test_a_policy_that_prefers_a_direction_accuses_no_symmetric_task() -> None:
     obs = torch.stack([row.obs[0] for row in rows], 1)
     biased = Transitions(obs[:, :-1], torch.stack(actions, 1), torch.stack(rewards, 1), obs[:, 1:])
     for transitions in (data, biased):
-        verdicts = check_by_regression(env.spec, transitions, parse_elements("d4", 3))
-        assert {verdict.outcome for verdict in verdicts} == {"holds"}
-
-
-def test_the_false_discovery_rate_by_hand() -> None:
-    """Sorted: 0.01 <= 0.0125, 0.02 <= 0.025, 0.04 > 0.0375, 0.9 > 0.05: the first two count."""
-    assert accepted_of([0.04, 0.01, 0.9, 0.02]) == [False, True, False, True]
-    assert accepted_of([0.04, 0.04, 0.04, 0.04]) == [True] * 4, "the last bound is the rate itself"
-    assert accepted_of([0.06]) == [False]
-
-
-def test_the_share_of_false_discoveries_is_what_it_promises() -> None:
-    """Forty elements of which half are off by just the tolerance: of those accepted at most 5 % are, on average."""
-    g = torch.Generator().manual_seed(0)
-    shares = []
-    for _ in range(400):
-        z = torch.randn(40, generator=g, dtype=torch.float64)
-        z[20:] += 3.0  # the tolerance is three standard errors away
-        p = 0.5 * torch.erfc(z / 2**0.5)
-        kept = accepted_of(p.tolist())
-        shares.append(sum(kept[:20]) / max(1, sum(kept)))
-    assert 0.005 < np.mean(shares) <= 0.05
+        verdicts = check_transitions(env.spec, transitions, parse_elements("d4", 3))
+        assert "broken" not in {verdict.outcome for verdict in verdicts}
 
 
 @pytest.mark.parametrize(
@@ -203,7 +181,7 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
     spec = make("navigation", 1, [0], FORCES).spec
     data = read_transitions(path, spec)
     flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
-    assert discover_in_transitions("rows", spec, flat, "rot90,flip-x").group == "flip-x"
+    assert check_recorded("rows", spec, flat, "rot90,flip-x").found == "flip-x"
 
 
 @pytest.mark.parametrize(
@@ -248,7 +226,7 @@ def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:
     mask = torch.ones(*plain.action.shape, 5, dtype=torch.bool)
     mask[..., 2] = plain.obs[..., 0] > 0  # one action, in one half of the plane
     verdicts = [
-        check_by_regression(env.spec, data, parse_elements("rot90", env.spec))[0]
+        check_transitions(env.spec, data, parse_elements("rot90", env.spec))[0]
         for data in (plain, replace(plain, action_mask=mask))
     ]
     assert [verdict.outcome for verdict in verdicts] == ["holds", "broken"]
@@ -259,47 +237,41 @@ def test_one_number_that_is_not_finite_hides_no_gap() -> None:
     x = torch.randn(500, 1, generator=torch.Generator().manual_seed(0))
     hole = x.clone()
     hole[7] = torch.nan
-    found = _verdict("reward", hole, x, x + 3, x + 3, x)
+    found = _verdict("reward", hole, x, x + 3, x + 3)
     assert (found.outcome, found.gap > 1) == ("broken", True)
 
 
-def test_what_could_not_be_looked_at_weighs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    unknown = ElementVerdict("rot90", False, (), "the task raises in the transformed states")
-    monkeypatch.setattr(measured, "check_paired", lambda *_: [unknown])
+@pytest.fixture
+def _measured_anew():
     measured._breaking.cache_clear()
-    config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.transforms": "rot90"})
-    assert prepared(config).prior.weights == {"rot90": 0.0}
+    yield
     measured._breaking.cache_clear()
 
 
-def test_a_gap_of_variance_weighs_as_the_shift_that_costs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A shift of d leaves rows and their copies d / 2 off their mean: d^2 / 4 = 0.04, so d = 0.4 and exp(-8 x 0.4)."""
-    gaps = (FieldVerdict("reward", "broken", 0.04, 0.001), FieldVerdict("obs.velocity", "broken", 0.01, 0.001))
-    off = ElementVerdict("rot90", False, gaps)
-    held = ElementVerdict("rot180", False, (FieldVerdict("reward", "holds", 0.001, 0.001),))
-    monkeypatch.setattr(Environment, "has", lambda *_: False)
-    monkeypatch.setattr(measured, "collect", lambda *_: None)
-    monkeypatch.setattr(measured, "check_by_regression", lambda *_: [off, held])
-    measured._breaking.cache_clear()
-    config = resolve_config("navigation", overrides={"prior.trust": "measured", "prior.transforms": "rot90,rot180"})
-    assert config.prior.doubt == 8
-    assert prepared(config).prior.weights == {"rot90": pytest.approx(0.0408, abs=5e-5), "rot180": 1.0}
-    measured._breaking.cache_clear()
+@pytest.mark.usefixtures("_measured_anew")
+def test_what_is_broken_weighs_little_and_what_is_not_covered_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Off by 0.4: exp(-8 x 0.4)."""
+    off = (FieldVerdict("reward", "broken", 0.4, 0.01), FieldVerdict("obs.velocity", "broken", 0.1, 0.01))
+    unseen = (FieldVerdict("reward", "not covered", 0.0, 0.01), FieldVerdict("obs.velocity", "holds", 0.0, 0.01, 0.0))
+    held = FieldVerdict("reward", "holds", 0.1, 0.001, 0.0)
+    fields = {"rot90": off, "rot180": (held,), "rot270": unseen, "flip-x": ()}
+    verdicts = [ElementVerdict(name, False, found) for name, found in fields.items()]
+    monkeypatch.setattr(measured, "judged", lambda *_: ("transitions", verdicts))
+    config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.transforms": ",".join(fields)})
+    weights = {"rot90": pytest.approx(0.0408, abs=5e-5), "rot180": 1.0, "rot270": 0.0, "flip-x": 0.0}
+    assert prepared(config).prior.weights == weights
 
 
 def test_the_p_value_of_an_element_by_hand() -> None:
     """A tolerance of 0.15 is two standard errors above the worst gap: 2.3 % of a normal variable lies beyond two."""
-    fields = (FieldVerdict("reward", "holds", 0.05, 0.05), FieldVerdict("obs.velocity", "holds", 0.0, 0.01))
-    broken = (*fields, FieldVerdict("end", "broken", 0.2, 0.01))
-    verdicts = [ElementVerdict(name, False, found) for name, found in (("a", fields), ("b", broken))]
-    tried = judged_elements(verdicts, 0.15)
-    assert [one.p_value for one in tried] == pytest.approx([0.02275, 1.0], abs=1e-5)
-    assert [one.accepted for one in tried] == [True, False]
-
-
-def test_a_gap_that_is_no_number_is_not_accepted() -> None:
-    verdicts = [ElementVerdict("a", False, (FieldVerdict("reward", "holds", gap, 0.01),)) for gap in (0.0, np.nan)]
-    assert [one.accepted for one in judged_elements(verdicts, 0.15)] == [True, False]
+    assert chance(0.05, 0.15, 0.05) == pytest.approx(0.02275, abs=1e-5)
+    unsure, sure = concluded("reward", 0.05, 0.05, False, 0.06), concluded("obs.velocity", 0.0, 0.01, False, 1e-9)
+    assert [unsure.outcome, sure.outcome] == ["not covered", "holds"], "one of twenty may be accepted falsely, not more"
+    verdict = ElementVerdict("a", False, (unsure, sure))
+    assert (verdict.outcome, verdict.p_value, verdict.worst) == ("not covered", 1.0, unsure)
+    broken = concluded("end", 0.2, 0.01, True, 0.0)
+    assert ElementVerdict("a", False, (unsure, sure, broken)).worst == broken
+    assert concluded("reward", np.nan, 0.01, False, chance(np.nan, 0.15, 0.01)).outcome == "not covered"
 
 
 def test_agents_that_were_never_exchanged_are_not_claimed() -> None:
@@ -341,10 +313,10 @@ def test_a_task_is_searched_once_however_many_runs_ask(monkeypatch: pytest.Monke
 
     def found(make_worlds):
         asked.append(make_worlds)
-        return Discovery("navigation", "paired states", "c4", "discovered:c4", ())
+        return SymmetryReport("navigation", "paired states", "d4", "c4", "discovered:c4", (), {})
 
     measured._discovered.cache_clear()
-    monkeypatch.setattr(measured, "discover_in_task", found)
+    monkeypatch.setattr(measured, "check_symmetry", found)
     choices = {"prior.transforms": "discovered"}
     for changed in ({}, {"mappo.learning_rate": 0.01}, {"task.horizon": 9}):
         config = prepared(resolve_config("navigation", overrides=choices | changed))
@@ -403,10 +375,5 @@ def test_where_nothing_is_found_there_is_no_prior() -> None:
 
 def test_few_transitions_say_nothing() -> None:
     env = make("navigation", 64, [0])
-    data = collect(env, 128, 1)
-    (verdict,) = check_by_regression(env.spec, data, parse_elements("flip-x", 3))
-    assert (verdict.outcome, verdict.fields) == ("not covered", ())
-    # 226 numbers x 4, of 3 agents at once: 302 episodes, and as many to predict
-    assert verdict.reason == "128 episodes are too few, record at least 604"
-    (enough,) = check_by_regression(env.spec, collect(env, 640, 1), parse_elements("flip-x", 3))
-    assert not enough.reason
+    verdicts = check_transitions(env.spec, collect(env, 64, 1), parse_elements("d4", 3))
+    assert {verdict.outcome for verdict in verdicts} == {"not covered"}

@@ -6,6 +6,8 @@ import pytest
 
 from esp_cli.checking import check_symmetry, paired
 from esp_envs import make
+from esp_envs.moves import discrete_moves
+from tests.benchmarks.synthetic import Recipe
 from tests.checking import faults
 from tests.checking.faults import Fault, declared, field_of, turned_by_first, wind, with_fault
 
@@ -140,3 +142,37 @@ def test_a_clean_task_is_not_accused(task: str, settings) -> None:
     report = check_symmetry(lambda n, seeds: make(task, n, seeds, settings), elements)
     assert report.holds
     assert all(element.outcome == "holds" for element in report.elements)
+
+
+def test_one_state_in_a_hundred_is_a_proof_where_there_is_no_chance() -> None:
+    def corner(reward, seen):
+        return reward - ((seen.obs[..., 2:4] > 0.8).all(-1)).float()
+
+    report = check_symmetry(with_fault(*MOVES, Fault(paid=corner)), "rot90,flip-diagonal")
+    assert [element.outcome for element in report.elements] == ["broken", "holds"]
+    worst = report.elements[0].worst
+    assert worst is not None
+    assert worst.field == "reward"
+    assert 0 < worst.share < 0.2
+
+
+def test_a_reward_that_never_comes_is_not_covered() -> None:
+    report = check_symmetry(with_fault(*MOVES, Fault(paid=lambda reward, seen: 0 * reward)), "rot90")
+    assert (report.uncovered, report.broken, report.holds) == (("rot90",), (), False)
+
+
+@pytest.mark.parametrize("moves", [3, 5, 6])
+def test_the_polygon_of_the_moves_is_found(moves: int) -> None:
+    mark = Recipe(
+        seed=0,
+        reward="distance to the first mark",
+        force="none",
+        noise="none",
+        agents=1,
+        marks=1,
+        start="disc",
+        listed="as they are",
+        tails="normal",
+        action=discrete_moves(moves),
+    )
+    assert check_symmetry(mark.make).found == f"d{moves}"

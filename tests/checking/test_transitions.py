@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
-from esp_cli.checking import Transitions, candidates, check_transitions, collect
-from esp_cli.checking.candidates import found_group, is_declared, refused
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict
+from esp_cli.checking import Transitions, candidates, check_recorded, check_transitions, collect, named
+from esp_cli.checking.candidates import is_declared, refused
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
 from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, layout
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
-HOLDS = FieldVerdict("position", "holds", 0.0, 0.1)
 CONTINUOUS = {"actions": "continuous"}
 
 
@@ -74,37 +74,82 @@ def anybodys(drift: float) -> tuple[Spaces, Transitions]:
 @pytest.mark.parametrize(("drift", "found"), [(0.0, "o2*agents"), (0.02, "flip-x*agents")])
 def test_anybodys_transitions_are_judged(drift: float, found: str) -> None:
     spaces, data = anybodys(drift)
-    verdicts = check_transitions(spaces, data, candidates(spaces))
-    assert found_group(verdicts, spaces) == found
+    assert check_recorded("theirs", spaces, data).found == found
+
+
+def test_a_gap_is_in_standard_deviations_of_the_field() -> None:
+    """A half turn turns a drift of 0.02 round: one of two numbers is off by 0.04, and each has the variance 0.0125."""
+    spaces, data = anybodys(0.02)
+    (verdict,) = check_transitions(spaces, data, parse_elements("rot180", 2))
+    gaps = {field.field: field.gap for field in verdict.fields}
+    assert gaps["obs.position"] == pytest.approx((0.04**2 / 2 / 0.0125) ** 0.5, rel=0.15)
+    assert verdict.worst is not None
+    assert (verdict.outcome, verdict.worst.field) == ("broken", "obs.position")
+
+
+def paid(reward: Callable[[torch.Tensor], torch.Tensor], turn: float = 0.0) -> dict[str, str]:
+    """Return what is said of elements where a point in a square moves by its force, turned, and is paid there."""
+    g = torch.Generator().manual_seed(0)
+    row = layout(Field("position", Kind.VECTOR))
+    spaces = Spaces(num_agents=1, observation=row, state=row, action=FORCE, symmetry="c1")
+    position, action = 2 * torch.rand(2, 2048, 4, 1, 2, generator=g) - 1
+    cos, sin = math.cos(turn), math.sin(turn)
+    after = position + 0.1 * action @ torch.tensor([[cos, sin], [-sin, cos]])
+    data = Transitions(position, action, reward(after), after)
+    elements = parse_elements("rot45,rot90,rot180,rot120,flip-x,flip-y", 1)
+    return {verdict.element: verdict.outcome for verdict in check_transitions(spaces, data, elements)}
+
+
+def test_places_that_nobody_sees_are_no_symmetry() -> None:
+    places = 0.7 * torch.tensor([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
+    found = paid(lambda x: ((x.unsqueeze(-2) - places).norm(dim=-1) < 0.25).any(-1).float())
+    assert (found.pop("flip-x"), found.pop("rot120")) == ("holds", "holds")
+    assert set(found.values()) == {"broken"}
+
+
+def test_a_square_is_no_circle() -> None:
+    found = paid(lambda x: -x.abs().amax(-1), turn=0.5)
+    assert (found["rot90"], found["rot180"]) == ("holds", "holds")
+    assert (found["rot45"], found["flip-x"]) == ("broken", "broken")
+
+
+def test_a_reward_that_never_comes_is_not_covered_and_one_that_is_noise_is() -> None:
+    noise = torch.Generator().manual_seed(1)
+    assert set(paid(lambda x: 0 * x[..., 0]).values()) == {"not covered"}
+    assert set(paid(lambda x: torch.randn(x.shape[:-1], generator=noise)).values()) == {"holds"}
 
 
 def test_one_exchange_is_not_all_orders() -> None:
-    row = layout(Field("position", Kind.VECTOR))
-    state = layout(Field("position", Kind.VECTOR, 3, items=Items.AGENTS))
-    spaces = Spaces(num_agents=3, observation=row, state=state, action=FORCE, symmetry="c1")
-    swap, around = (ElementVerdict(name, False, (HOLDS,)) for name in ("agents-1-0-2", "agents-1-2-0"))
-    broken = replace(around, fields=(replace(HOLDS, outcome="broken"),))
-    assert found_group([swap, broken], spaces) == "c1"
-    assert found_group([swap, around], spaces) == "c1*agents"
+    swap, around, last = parse_elements("agents-1-0-2,agents-1-2-0,agents-0-2-1", 3)
+    assert named([swap], [swap, last])[0] == "c1 and agents-1-0-2"
+    assert [named(found, found)[0] for found in ([swap, last], [swap, around])] == ["c1*agents", "c1*agents"]
 
 
 @pytest.mark.parametrize(
     ("tried", "found"),
-    [("rot90", "c4"), ("rot90,flip-x", "d4"), ("rot180", "c2"), ("flip-x", "flip-x"), ("rot45", "c8")],
+    [
+        ("rot90", "c4"),
+        ("rot90,flip-x", "d4"),
+        ("rot180", "c2"),
+        ("flip-x", "flip-x"),
+        ("rot45", "c8"),
+        ("rot60", "c6"),
+        ("c6", "c6"),
+        ("d5", "d5"),
+        ("rot120,flip-x", "d3"),
+        ("o2", "o2"),
+        ("so2", "so2"),
+        ("c8,rot57", "so2"),
+    ],
 )
 def test_what_the_tried_elements_generate_is_found(tried: str, found: str) -> None:
-    spaces, _ = anybodys(0.0)
-    verdicts = [ElementVerdict(element.name, False, (HOLDS,)) for element in parse_elements(tried, 2)]
-    assert found_group(verdicts, spaces) == found
+    elements = candidates(anybodys(0.0)[0], tried)
+    assert named(elements, elements)[0] == found
 
 
 def test_any_angle_needs_the_steps_too() -> None:
-    spaces, _ = anybodys(0.0)
-    names = [element.name for element in parse_elements("c8,rot57", 2)]
-    verdicts = [ElementVerdict(name, False, (HOLDS,)) for name in names]
-    assert found_group(verdicts, spaces) == "so2"
-    verdicts[0] = replace(verdicts[0], fields=(replace(HOLDS, outcome="broken"),))
-    assert found_group(verdicts, spaces) != "so2"
+    tried = parse_elements("c8,rot57", 2)
+    assert named(tried[1:], tried)[0] != "so2"
 
 
 def test_an_order_that_is_declared_alone_is_declared() -> None:
@@ -143,7 +188,7 @@ def test_what_no_action_carries_is_not_tried() -> None:
 
 
 def test_what_moves_no_number_is_not_tried() -> None:
-    numbers = layout(Field("speed", Kind.SCALAR, 2))
+    numbers = layout(Field("speed", Kind.SCALAR))
     push = Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("stay", "push"))
     spaces = Spaces(num_agents=1, observation=numbers, state=numbers, action=push, symmetry="o2")
     with pytest.raises(ValueError, match=r"no transform can be tried on the task: rot45 moves no number of it"):

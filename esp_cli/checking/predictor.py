@@ -1,0 +1,125 @@
+"""Predict what follows a step: by a ridge regression on products and bumps, and by a network what that leaves over."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from esp_cli.algorithms.adam import SeedAdam
+from esp_cli.checking.controls import STILL, planes
+from esp_cli.checking.recorded import Transitions
+from esp_cli.prior.regression import inputs_of, moments, orders_of_others, ridge
+from esp_envs.spec import Discrete, Spaces
+
+_HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3
+_RIDGE = 1e-2
+_BUMPS, _BREADTH = 32, 0.6
+"""Bumps for each vector, and how broad one is, in standard deviations of the vector."""
+_ROUNDING = 1e-3
+_CHUNK = 512
+"""Episodes whose features are held at once."""
+
+
+class Predictor:
+    """Predicts numbers of each agent and step from what agents see and do.
+
+    The regression is on what all agents see and do, products of two of an agent's own numbers, what each agent does,
+    and bumps of each vector.
+
+    Args:
+        spaces: what the numbers are.
+        data: transitions to fit.
+        outputs: [M, T, N, O], what follows.
+        functions: [M, T, N, B], predicted by the regression alone.
+    """
+
+    def __init__(self, spaces: Spaces, data: Transitions, outputs: Tensor, functions: Tensor) -> None:
+        self._spaces, self._count = spaces, outputs.shape[-1]
+        x = self._seen(data)
+        self._centre, self._width = x.mean((0, 1, 2)), x.std((0, 1, 2)).clamp_min(STILL)
+        rows = self._standard(x).flatten(0, 2)
+        self._range = rows.min(0).values - _ROUNDING, rows.max(0).values + _ROUNDING
+        picked = torch.randint(len(rows), (_BUMPS,), generator=torch.Generator().manual_seed(0))
+        self._planes = torch.tensor(planes(spaces.observation, data.obs))
+        self._middles = rows[picked][:, self._planes]
+        self._weights = self._regressed(data, torch.cat([outputs, functions], -1))
+        rest = (outputs - self._linear(data)[..., : self._count]).flatten(0, 2)
+        self._scale = torch.maximum(rest.std(0), 1e-3 * outputs.flatten(0, 2).std(0)).clamp_min(STILL)
+        self._net = _Network(rows, rest / self._scale)
+
+    @torch.no_grad()
+    def __call__(self, data: Transitions) -> tuple[Tensor, Tensor]:
+        """Return what is expected to follow, [M, T, N, O], and the functions, [M, T, N, B]."""
+        outputs, functions = self._linear(data).tensor_split([self._count], -1)
+        rest = self._net(self._standard(self._seen(data)).flatten(0, 2)) * self._scale
+        return outputs + rest.view_as(outputs), functions
+
+    def covers(self, data: Transitions) -> Tensor:
+        """Return for which steps [M, T, N] each number that is seen or done lies in the range of what was fitted."""
+        x, (low, high) = self._standard(self._seen(data)), self._range
+        return ((x >= low) & (x <= high)).all(-1)
+
+    def _regressed(self, data: Transitions, outputs: Tensor) -> Tensor:
+        """Return weights [features, O + B]."""
+        gram = cross = torch.zeros(())
+        for start in range(0, len(outputs), _CHUNK):
+            where = slice(start, start + _CHUNK)
+            features = self._features(data.episodes(where)).flatten(1, 2).unsqueeze(2)
+            parts = moments(features, outputs[where].flatten(1, 2).unsqueeze(2))
+            gram, cross = gram + parts[0], cross + parts[1]
+        return ridge(gram, cross, strength=_RIDGE)[0]
+
+    def _linear(self, data: Transitions) -> Tensor:
+        count = len(data.obs)
+        parts = (data.episodes(slice(start, start + _CHUNK)) for start in range(0, count, _CHUNK))
+        return torch.cat([self._features(part) @ self._weights for part in parts])
+
+    def _features(self, data: Transitions) -> Tensor:
+        agents = self._spaces.num_agents
+        seen = self._standard(self._seen(data))
+        vectors = seen[..., self._planes].unsqueeze(-3)
+        bumps = (-(vectors - self._middles).square().sum(-1) / (2 * _BREADTH**2)).exp().flatten(-2)
+        parts = [inputs_of(self._spaces, data.obs, data.action), bumps]
+        if agents > 1:
+            own = torch.cat([torch.ones_like(seen[..., :1]), self._done(data)], -1)
+            parts.append((torch.eye(agents).unsqueeze(-1) * own.unsqueeze(-2)).flatten(-2))
+        return torch.cat(parts, -1)
+
+    def _standard(self, x: Tensor) -> Tensor:
+        return (x - self._centre) / self._width
+
+    def _done(self, data: Transitions) -> Tensor:
+        action = self._spaces.action
+        return F.one_hot(data.action, action.count).float() if isinstance(action, Discrete) else data.action
+
+    def _seen(self, data: Transitions) -> Tensor:
+        """Return what each agent sees and does, what the others do, and who it is: [M, T, N, numbers]."""
+        acted, agents = self._done(data), self._spaces.num_agents
+        others = [acted[:, :, order] for order in orders_of_others(agents)]
+        return torch.cat([data.obs, acted, *others, torch.eye(agents).expand(*data.obs.shape[:3], -1)], -1)
+
+
+class _Network:
+    """Two hidden layers, fitted by least squares to [rows, inputs] and [rows, outputs]."""
+
+    def __init__(self, x: Tensor, y: Tensor) -> None:
+        generator = torch.Generator().manual_seed(0)
+        parameters = []
+        for fan_in, fan_out in itertools.pairwise((x.shape[1], _HIDDEN, _HIDDEN, y.shape[1])):
+            bound = fan_in**-0.5
+            drawn = [torch.rand(1, rows, fan_out, generator=generator) * 2 - 1 for rows in (fan_in, 1)]
+            parameters += [nn.Parameter(part * bound) for part in drawn]
+        adam = SeedAdam(parameters, learning_rate=_RATE, epsilon=1e-8, max_grad_norm=1.0)
+        self._layers = list(zip(adam.parameters.parameters[::2], adam.parameters.parameters[1::2], strict=True))
+        for k in range(_UPDATES):
+            rows = torch.randint(len(x), (_BATCH,), generator=generator)
+            adam.anneal(1 - k / _UPDATES)
+            adam.step(adam.gradient((self(x[rows]) - y[rows]).square().mean()))
+
+    def __call__(self, x: Tensor) -> Tensor:
+        for k, (weight, bias) in enumerate(self._layers):
+            x = torch.addmm(bias[0], x.relu() if k else x, weight[0])
+        return x
