@@ -16,7 +16,7 @@ STILL = 1e-6
 _PLANES = 12
 """Vectors that are looked at one by one, at most."""
 _COUNT = 28
-_FEWEST = 0.3
+_FEWEST = 0.8
 """An element is confronted with a function whose squared difference from its image is at least this, in variances."""
 
 

@@ -62,9 +62,11 @@ def _polygon_groups(tried: Sequence[Element]) -> list[tuple[str, tuple[Element, 
     mirrored = [PlaneElement.of(e).mirrored for e in tried]
     turns = (PlaneElement.of(e).turn for e, is_mirror in zip(tried, mirrored, strict=True) if not is_mirror)
     folds = sorted({turn.denominator for turn in turns})
-    found = [(f"c{fold}", _listed(f"c{fold}")) for fold in folds]
-    for axis in (e for e, is_mirror in zip(tried, mirrored, strict=True) if is_mirror):
-        found.append((axis.name, (axis,)))
+    axes = [e for e, is_mirror in zip(tried, mirrored, strict=True) if is_mirror]
+    found: list[tuple[str, tuple[Element, ...]]] = [(axis.name, (axis,)) for axis in axes] + [
+        (f"c{fold}", _listed(f"c{fold}")) for fold in folds
+    ]
+    for axis in axes:
         for fold in folds:
             turned = _listed(f"c{fold}")
             group = (*turned, *sorted((axis, *(turn @ axis for turn in turned)), key=lambda e: e.sort_key))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, strength
@@ -41,8 +42,8 @@ _MOST_ROWS = 1 << 15
 _FEWEST_INSIDE = 0.05
 """Share of the images that lie where transitions do, below which they show nothing; these alone are judged."""
 _PREFERS, _ELSEWHERE = 0.05, 0.5
-"""Shifts of the starts, in standard deviations: from the first on, what looks broken may be a preference of the starts;
-from the second on, images lie where no transition does."""
+"""Shifts of starts or first actions, in standard deviations: from the first on, what looks broken may be a preference;
+from the second on, of starts, images lie where no transition does."""
 
 
 def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
@@ -65,10 +66,11 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     parts = thinned.episodes(slice(half)), thinned.episodes(slice(half, None))
     controls = Controls(spaces.observation, thinned)
     halves = [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
-    return [_judge(element, spaces, halves, data.obs[:, 0]) for element in elements]
+    first = Transitions(*(part[:, :1] for part in vars(data).values() if part is not None))
+    return [_judge(element, spaces, halves, first) for element in elements]
 
 
-def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], start: Tensor) -> ElementVerdict:
+def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions) -> ElementVerdict:
     declared, transform = is_declared(element, spaces), build_transform([element], spaces)
     compared = [half.compared(transform) for half in halves]
     if (share := min(one.inside for one in compared)) < _FEWEST_INSIDE:
@@ -81,9 +83,13 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], start: Ten
         still = halves[0].is_still(name)
         verdicts.append(_of_nothing(name) if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
-    shift = _shift(start, transform.obs(start.unsqueeze(0))[0])
+    image = turned(first, transform)
+    shift, preference = _shift(first.obs, image.obs), _shift(_done(first, spaces), _done(image, spaces))
     if shift > (_PREFERS if found.outcome == "broken" else _ELSEWHERE):
         return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
+    if preference > _PREFERS and found.outcome == "broken":
+        reason = f"the first actions differ from their image by {preference:.2f} s.d."
+        return ElementVerdict(element.name, declared, (), reason)
     return found
 
 
@@ -254,8 +260,14 @@ def _without_tails(reward: Tensor) -> Tensor:
     return reward.clamp(low, high) if low < high else reward
 
 
+def _done(data: Transitions, spaces: Spaces) -> Tensor:
+    """Return actions as numbers [M, T, N, A], a discrete one as one for each choice."""
+    action = spaces.action
+    return F.one_hot(data.action, action.count).float() if isinstance(action, Discrete) else data.action
+
+
 def _shift(start: Tensor, turned: Tensor) -> float:
-    """Return the largest shift of mean or spread of the starts [M, N, D] in s.d. that is no chance, else 0."""
+    """Return the largest shift of mean or spread of starts [M, 1, N, D] in s.d. that is no chance, else 0."""
     start, turned = start.flatten(1).double(), turned.flatten(1).double()
     spread = torch.cat([start, turned]).std(0).clamp_min(1e-3)
     worst = 0.0

@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
-
 from esp_envs.lockstep import to_others
+from torch import Tensor
 
 Rng = np.random.Generator
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from esp_envs.lockstep import BatchedTask, to_others
+from esp_envs.moves import discrete_moves
 from torch import Tensor
 
 from esp_cli.symmetry import Element, build_transform
 from esp_envs.base import TaskSettings
-from esp_envs.lockstep import BatchedTask, to_others
-from esp_envs.moves import discrete_moves
 from esp_envs.mpe.task import FORCE
 from esp_envs.spec import ActionSpace, Discrete, Field, Items, Kind, Layout, TaskSpec, layout
 from tests.benchmarks.laws import Scene, forces, noises, rewards

@@ -23,7 +23,7 @@ CONTINUOUS = {"actions": "continuous"}
 def outcomes(make_worlds, text: str = "rot90,flip-x,flip-y") -> dict[str, str]:
     env = make_worlds(128, [0])
     elements = parse_elements(text, env.spec.num_agents)
-    return {v.element: v.outcome for v in check_transitions(env.spec, collect(env, episodes=1536), elements)}
+    return {v.element: v.outcome for v in check_transitions(env.spec, collect(env, episodes=3072), elements)}
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,9 @@ def outcomes(make_worlds, text: str = "rot90,flip-x,flip-y") -> dict[str, str]:
 )
 def test_a_clean_task_is_not_accused(task, settings) -> None:
     found = outcomes(lambda n, seeds: make(task, n, seeds, settings), "rot90,flip-x,agents-1-0-2")
-    assert set(found.values()) == {"holds"}
+    assert "broken" not in found.values()
+    assert found["agents-1-0-2"] == "holds"
+    assert task == "predator-prey" or set(found.values()) == {"holds"}, "captures are rare: turns are not covered"
 
 
 def test_wind_breaks_what_turns_it() -> None:

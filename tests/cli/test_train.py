@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import signal
 from dataclasses import replace
@@ -15,8 +16,7 @@ import torch
 from esp_cli import console
 from esp_cli.algorithms.learner import Iteration
 from esp_cli.algorithms.mappo import Mappo
-from esp_cli.checking import measured
-from esp_cli.checking.discovery import Discovery
+from esp_cli.checking import SymmetryReport, measured
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -120,15 +120,16 @@ def test_a_setting_of_a_small_file_that_changes_nothing_is_named_and_of_a_whole_
 
 def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("rot90", "rot180", "rot270", "flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal")
-    gaps = (0.0, 0.0, 0.0, 0.1, 0.5, 0.5, 0.5)
+    gaps = (0.0, math.inf, 0.0, 0.1, 0.5, 0.5, 0.5)
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple(zip(names, gaps, strict=True)))
     told = esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "auto").stderr
-    weighed = "prior esp (d4, c = 0.1), 4 of 7 elements broken and weighed 0.018 to 0.45"
+    left_out = "1 of 7 elements not covered and left out: rot180"
+    weighed = f"prior esp (d4, c = 0.1), {left_out}, 4 of 7 elements broken and weighed 0.018 to 0.45"
     assert f"{weighed}, fading out over 50% of the run, 1 seed(s)" in told
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple((name, 0.0) for name in names))
     assert "broken" not in esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "b").stderr
-    nothing = Discovery("navigation", "paired states", "c1", "", ())
-    monkeypatch.setattr(measured, "discover_in_task", lambda *_: nothing)
+    nothing = SymmetryReport("navigation", "paired states", "d4", "c1", "", (), {})
+    monkeypatch.setattr(measured, "check_symmetry", lambda *_: nothing)
     told = esp("train", *TINY_OPTIONS, "--steps", 50, "--transforms", "discovered", "--out", tmp_path / "c").stderr
     assert "no prior (no symmetry was discovered)" in told
 
