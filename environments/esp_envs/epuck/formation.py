@@ -82,6 +82,7 @@ class Formation(BatchedTask):
 
     Settings: ClassVar[type[TaskSettings]] = FormationSettings
     heuristics = ("avoid", "straight")
+    makes_new_tensors = True
     robot: ClassVar[Mapping[str, float]] = {**DIMENSIONS, "fading_m": FADING_M}
     settings: FormationSettings
 
