@@ -73,7 +73,7 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     Args:
         spaces: of the task.
         weighed: whether each element counts by how nearly it holds, so that nothing has to be declared: then d4
-            wherever actions and layouts carry it, and such orders beside it.
+            wherever actions and layouts carry it, and such orders, or elements coupled with some, beside it.
 
     Raises:
         UserError: its symmetry means nothing.
@@ -86,7 +86,7 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     found = parse_elements(chosen, spaces.num_agents)
     if isinstance(found, Group) or len(found) > _FEW_ORDERS:
         return "d4"
-    return f"d4,{chosen}" if all(element.in_place.is_identity for element in found) else "d4"
+    return f"d4,{chosen}" if all(element.orders for element in found) else "d4"
 
 
 def admit_declared(spaces: Spaces) -> None:

@@ -13,7 +13,7 @@ from esp_cli.symmetry.representation import action_map, joint_sources, rows_oper
 from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
-KINDS = [Kind.SCALAR, Kind.PSEUDOSCALAR, Kind.VECTOR, Kind.WHEELS, Kind.PICTURE]
+KINDS = [kind for kind in vars(Kind).values() if isinstance(kind, Kind)]
 D4, D8 = dihedral(4), dihedral(8)
 D4_AGENTS = direct_product(D4, agent_permutations(3))
 
@@ -27,13 +27,19 @@ def joint(row_layout: Layout, *elements: Element, num_agents: int = 3) -> np.nda
 
 
 def field_of(name: str, kind: Kind, count: int = 1, items: Items = Items.FIXED) -> Field:
-    """Return a field of any kind; a picture has 3 x 3 pixels."""
-    return Field(name, kind, count, items=items, pixels=(3, 3) if kind == Kind.PICTURE else None)
+    """Return a field of any kind; a picture has 3 x 3 pixels, a ring 8 rays, a record three parts."""
+    parts = (Field("way", Kind.VECTOR), Field("spin", Kind.PSEUDOSCALAR), Field("seen", Kind.RING, 2, rays=8))
+    shapes = {Kind.PICTURE: {"pixels": (3, 3)}, Kind.RING: {"rays": 8}, Kind.RECORD: {"parts": parts}}
+    return Field(name, kind, count, items=items, **shapes.get(kind, {}))
 
 
 def test_others_by_hand() -> None:
     assert others_of(3) == [[1, 2], [0, 2], [0, 1]]
     assert others_of(1) == [[]]
+
+
+def test_all_kinds_are_tried() -> None:
+    assert {kind.name for kind in KINDS} >= {"scalar", "pseudoscalar", "vector", "wheels", "picture", "ring", "record"}
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
