@@ -13,9 +13,9 @@ Mode = Literal["greedy", "stochastic"]
 STEPS = 1_000_000
 """Environment steps per seed of a run."""
 EPISODES = 320
-"""Of an evaluation, per seed."""
+"""Episodes of an evaluation, per seed."""
 STUDY_SEEDS = tuple(range(10))
-"""Of a study: as many as the paper has."""
+"""Seeds of a study: as many as the paper has."""
 SLOWEST = 0.01
 """Speed of a film, times real time, at least."""
 MAX_STEPS = 10**12

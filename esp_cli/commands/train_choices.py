@@ -43,12 +43,12 @@ def plan_run(
     from esp_cli.run import plan
     from esp_cli.training.config import resolve_config
 
-    said = set(settings)
+    chosen = set(settings)
     if file is not None:
-        choices, settings, said = _with_file(context, file, choices, settings)
+        choices, settings, chosen = _with_file(context, file, choices, settings)
     start = choices.pop("init_from")
     choices["device"] = resolve_device(choices["device"])
-    idle = said & resolve_config(**choices, overrides=settings).without_effect()
+    idle = chosen & resolve_config(**choices, overrides=settings).without_effect()
     config, weights = plan(algo=choices.pop("algorithm"), settings=settings, init_from=start, **choices)
     return config, weights, idle
 
@@ -74,17 +74,17 @@ def _with_file(
     from esp_cli.training.config_file import read_config_file
 
     file = read_config_file(path)
-    said = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
-    said |= {"seeds"} if was_given(context, "seed_list") else set()
+    named = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
+    named |= {"seeds"} if was_given(context, "seed_list") else set()
     if file.is_complete:
         for name in ("task", "algorithm", "preset"):
-            if name in said and given[name] != file.choices[name]:
+            if name in named and given[name] != file.choices[name]:
                 flag = _flag(name)
                 raise UserError(
                     f"{path} holds every setting of a run with {flag} {file.choices[name]}; leave {flag} out, "
                     "or name a file with only what differs"
                 )
-    filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in said}
+    filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in named}
     if file.config is not None and "init_from" in filled:
         filled["init_from"] = _start_of(path, file.config, filled["init_from"])
     kept = file.settings

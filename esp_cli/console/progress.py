@@ -29,16 +29,16 @@ def progress_line(description: str, share: float, status: Sequence[str], width: 
         status: what to say, most important first: the first two stay, then come description, bar and the rest.
         width: of the terminal.
     """
-    said = "  ".join(status[:2])
-    head = f"{description} " if len(description) + 1 + len(said) <= width else ""
+    shown = "  ".join(status[:2])
+    head = f"{description} " if len(description) + 1 + len(shown) <= width else ""
     for item in status[2:]:
-        if len(head) + len(said) + 2 + len(item) <= width:
-            said += f"  {item}"
-    bar = min(_WIDEST_BAR, width - len(head) - len(said) - 2)
+        if len(head) + len(shown) + 2 + len(item) <= width:
+            shown += f"  {item}"
+    bar = min(_WIDEST_BAR, width - len(head) - len(shown) - 2)
     if bar >= 5:
         done = round(bar * min(max(share, 0.0), 1.0))
         head += f"{'━' * done}{'╌' * (bar - done)}  "
-    return head + said
+    return head + shown
 
 
 class LineColumn(ProgressColumn):

@@ -9,11 +9,11 @@ from esp_cli.files.writing import TEMPORARY_PREFIX
 CONFIG, METRICS, CHECKPOINTS = "config.json", "metrics.jsonl", "checkpoints"
 POLICY, INITIAL, LOCK = "policy.safetensors", "initial-policy.safetensors", "run.lock"
 LOG, FINAL = "log.txt", "final-evaluation.json"
-"""Of the run of a study."""
+"""Names of what a study adds to the folder of a run."""
 STUDY, TUNING, STUDY_LOCK, JOURNAL = "study.json", "tuning.json", "study.lock", "journal.jsonl"
-"""Of the folder of a study or a tuning."""
+"""Names in the folder of a study or a tuning."""
 FRESH = "fresh"
-"""Of the folder of the study that evaluates the best settings of a tuning."""
+"""Name of the study, inside a tuning, that evaluates its best settings."""
 
 
 def is_leftover(entry: Path) -> bool:

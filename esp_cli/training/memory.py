@@ -19,7 +19,7 @@ _COPIES_OF_WEIGHTS = 4
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 """Where Linux says what the processes of a container may take, in its second and first version of control groups."""
 _PROCESS_BYTES = 500 * 2**20
-"""Of a process with torch and its libraries, before it trains."""
+"""Memory of a process with torch and its libraries, before it trains."""
 
 
 def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> None:

@@ -33,7 +33,7 @@ def checkpoint_seconds() -> float:
         UserError: it is not a number of seconds.
     """
     text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
-    if not re.fullmatch(r"\d+(\.\d*)?", text):
+    if not re.fullmatch(r"\d{1,9}(\.\d{0,9})?", text):
         raise UserError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
     return float(text)
 
