@@ -13,7 +13,7 @@ from esp_cli.training.checkpoint import CheckpointError, read_description
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG
 from esp_envs.mpe.frozen_prey import digest
 
-FILE_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
+_FILE_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 KEPT_CHECKPOINTS = 2
 """Two, so that a damaged newest one leaves another to go on from."""
 RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"
@@ -68,15 +68,10 @@ def file_name(step: int, final: bool) -> str:
     return f"step-{step:012d}{'-final' if final else ''}.safetensors"
 
 
-def place_of(run: Path, name: str) -> Path:
-    """Return where a file of a run folder is: checkpoints have a folder of their own."""
-    return run / CHECKPOINTS / name if FILE_NAME.fullmatch(name) else run / name
-
-
 def checkpoints_in(run: Path) -> list[Path]:
     """Return the checkpoint files of a run folder, oldest first."""
     folder = run / CHECKPOINTS
-    return sorted(file for file in folder.iterdir() if FILE_NAME.fullmatch(file.name)) if folder.is_dir() else []
+    return sorted(file for file in folder.iterdir() if _FILE_NAME.fullmatch(file.name)) if folder.is_dir() else []
 
 
 def step_of(path: Path) -> int:

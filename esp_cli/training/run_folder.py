@@ -45,7 +45,6 @@ from esp_cli.training.checkpoint_names import (
     checkpoints_in,
     file_name,
     is_final,
-    place_of,
     step_of,
     superseded,
 )
@@ -187,7 +186,7 @@ class RunFolder:
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""
-        return place_of(self.path, file_name(step, final))
+        return self.path / CHECKPOINTS / file_name(step, final)
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint files, oldest first."""
