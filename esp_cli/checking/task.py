@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from esp_cli.checking import paired, transitions
 from esp_cli.checking.candidates import candidates, refused
 from esp_cli.checking.naming import named
-from esp_cli.checking.recorded import EPISODES, Transitions, collect
+from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.parse import Factors
@@ -20,6 +20,7 @@ TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 """Standard deviations that a field may be off and yet hold, by method."""
 _COPIES = 256
 """Worlds of a task that cannot be set to a state, at most."""
+_EPISODES = 4096
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def judged(
     if probe.has("set_state") and not from_transitions:
         return PAIRED, paired.check_paired(make, elements)
     worlds = make(min(_COPIES, max(32, 8192 // probe.spec.horizon)), [0])
-    return TRANSITIONS, transitions.check_transitions(probe.spec, collect(worlds, EPISODES), elements)
+    return TRANSITIONS, transitions.check_transitions(probe.spec, collect(worlds, _EPISODES), elements)
 
 
 def _reported(

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from esp_envs.lockstep import to_others
 from torch import Tensor
+
+from esp_envs.batched import to_others
 
 Rng = np.random.Generator
 

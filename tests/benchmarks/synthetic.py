@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from esp_envs.lockstep import BatchedTask, to_others
-from esp_envs.moves import discrete_moves
 from torch import Tensor
 
 from esp_cli.symmetry import Element, build_transform
+from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.base import TaskSettings
+from esp_envs.batched import BatchedTask, to_others
 from esp_envs.mpe.task import FORCE
-from esp_envs.spec import ActionSpace, Discrete, Field, Items, Kind, Layout, TaskSpec, layout
+from esp_envs.spec import ActionSpace, Discrete, Field, Items, Kind, Layout, TaskSpec, discrete_moves, layout
 from tests.benchmarks.laws import Scene, forces, noises, rewards
 
 _CROSS = ("stay", "right", "up", "left", "down")
@@ -201,7 +201,7 @@ def broken_by(recipe: Recipe, elements: Sequence[Element], worlds: int = 256, st
         scene = quiet.scene_of(quiet._split(state), action)
         moved = quiet.scene_of(quiet._split(moved_state), moved_action)
         pushed = loud.noise[1](moved)
-        matrix = torch.as_tensor(element.block(Field("one", Kind.VECTOR)), dtype=torch.float32)
+        matrix = torch.as_tensor(PlaneElement.of(element).matrix, dtype=torch.float32)
         own = matrix @ torch.diag_embed(loud.noise[1](scene) ** 2) @ matrix.T
         if element.permutation is not None:
             own = own[:, :, torch.tensor(element.permutation).argsort()]

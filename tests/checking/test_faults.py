@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from esp_envs.moves import discrete_moves
 
 from esp_cli.checking import check_symmetry, paired
 from esp_envs import make
+from esp_envs.spec import discrete_moves
 from tests.benchmarks.synthetic import Recipe
 from tests.checking import faults
 from tests.checking.faults import Fault, declared, field_of, turned_by_first, wind, with_fault

@@ -492,10 +492,10 @@ def test_a_mirror_that_exchanges_limbs_is_one_element_by_hand() -> None:
     assert rows[1].tolist() == [-2, -1, -4, -3, 6, 5, 8, 7, 9, -10]
     assert actions[1].tolist() == [-2, -1, -4, -3, 6, 5, 8, 7]
     generator = torch.Generator().manual_seed(0)
-    state = torch.randn(400, 1, 10, generator=generator)
-    torque = torch.rand(400, 1, 8, generator=generator) * 2 - 1
+    state = torch.randn(6000, 1, 10, generator=generator)
+    torque = torch.rand(6000, 1, 8, generator=generator) * 2 - 1
     pull = torch.tensor([0.0, 0, 0, 0, 0.3, 0.3, 0, 0, 0.3, 0])
-    after = 0.8 * state + 0.3 * torch.cat([torque, torque.new_zeros(400, 1, 2)], -1) - pull
+    after = 0.8 * state + 0.3 * torch.cat([torque, torque.new_zeros(6000, 1, 2)], -1) - pull
     data = Transitions(state, torque, -after.square().sum(-1) - after[..., 0] * after[..., 1], after)
     for group, outcome in (
         ("flip-x*hips-1-0-3-2*knees-1-0-3-2", "holds"),
