@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -46,9 +47,12 @@ class Critic(nn.Module):
     def unroll_with_vjp(self, obs: Tensor, state: Tensor, truncation: int = 0) -> WithVJP:
         """Return what `unroll` does, for losses."""
         outputs, vjp = self.network.unroll_with_vjp(self._rows(obs, state), truncation)
-        return WithVJP(
-            self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), [*self.network.parameters()]
-        )
+        return WithVJP(self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), self._learned)
+
+    @cached_property
+    def _learned(self) -> list[Tensor]:
+        """The parameters; to list them takes as long as a product."""
+        return [*self.network.parameters()]
 
     def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
         """Return what the network reads, [S, B, T, 1 or N, width]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -98,7 +99,12 @@ class StochasticPolicy(Policy):
     def unroll_with_vjp(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> WithVJP:
         """Return the outputs as they are but for the mask, for losses; see `unroll`."""
         outputs, vjp = self.actor.unroll_with_vjp(obs, truncation)
-        return WithVJP(masked(outputs, action_mask), vjp, [*self.actor.parameters()])
+        return WithVJP(masked(outputs, action_mask), vjp, self._learned)
+
+    @cached_property
+    def _learned(self) -> list[Tensor]:
+        """The actor's parameters; to list them takes as long as a product."""
+        return [*self.actor.parameters()]
 
 
 class HistoryPolicy(Policy):
