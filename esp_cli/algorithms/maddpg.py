@@ -16,7 +16,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedParameters
 from esp_cli.algorithms.objectives import value_loss
-from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
+from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
@@ -29,7 +29,7 @@ from esp_envs.base import Environment
 from esp_envs.spec import Discrete, TaskSpec
 
 
-class MaddpgConfig(OffPolicyConfig):
+class MaddpgConfig(ExploringConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
     learning_rate: float = Field(4e-3, gt=0, description="of the critic; paper: 7e-4")
@@ -52,7 +52,7 @@ class MaddpgConfig(OffPolicyConfig):
         return frozenset() if isinstance(spec().action, Discrete) else frozenset({"actor_gradient"})
 
 
-class Maddpg(OffPolicyLearner):
+class Maddpg(ExploringLearner):
     """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`.
 
     The critic is a plain perceptron whatever the actors are: it sees all that there is to see at a step.

@@ -25,7 +25,7 @@ from esp_envs.errors import UserError
 
 
 class OffPolicyConfig(LearnerConfig):
-    """Hyperparameters of both off-policy learners; every default stands here, or in the algorithm's own file."""
+    """Hyperparameters of off-policy learners; every default stands here, or in the algorithm's own file."""
 
     num_envs: int = Field(8, ge=1, description="worlds per seed, one episode each a round; paper: 1")
     rounds: int = Field(1, ge=1, le=1000, description="rounds of collecting and learning between two lines of metrics")
@@ -33,9 +33,6 @@ class OffPolicyConfig(LearnerConfig):
     batch_episodes: int = Field(32, ge=1, description="episodes per seed of a gradient step")
     replay_episodes: int = Field(1000, ge=1, description="episodes that each seed remembers; paper: 5000")
     warmup_episodes: int = Field(5, ge=0, description="episodes of random actions before learning begins")
-    epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
-    epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration at the end")
-    epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
     learning_rate: float = Field(gt=0, description="of Adam")
     anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run; paper: off")
     adam_epsilon: float = Field(1e-5, gt=0, description="Adam's epsilon")
@@ -51,8 +48,18 @@ class OffPolicyConfig(LearnerConfig):
     critic_sees_time: bool = Field(True, description="the critic (the mixer) also sees the share of the horizon gone")
 
 
+class ExploringConfig(OffPolicyConfig):
+    """Hyperparameters of learners that explore by a schedule."""
+
+    epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
+    epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration at the end")
+    epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
+
+
 class OffPolicyLearner(Learner):
     """Replay, behaviour, targets and the prior's copies; a subclass says what a gradient step is.
+
+    The policy draws its actions as its head does; see `ExploringLearner` for a schedule of exploration.
 
     Arguments as of `Learner`.
 
@@ -103,7 +110,7 @@ class OffPolicyLearner(Learner):
             self.anneal(1.0 - progress)
         learned = 0
         for _ in range(config.rounds):
-            self.policy.head.explore(self._epsilon())
+            self.explore()
             episodes, mean_return = self.collector.collect()
             returns.append(mean_return)
             self._store(episodes)
@@ -115,7 +122,7 @@ class OffPolicyLearner(Learner):
                     sums[name] = sums.get(name, 0.0) + value.detach()
                 self.updates += 1
                 learned += 1
-        metrics = {"train/return": torch.stack(returns).mean(0), "train/epsilon": self.policy.head.epsilon.clone()}
+        metrics = {"train/return": torch.stack(returns).mean(0), **self.exploration()}
         metrics["train/augmented_share"] = self.prior.augmented_share(len(mean_return))
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
@@ -131,13 +138,12 @@ class OffPolicyLearner(Learner):
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return what the networks say of rows, for `SymmetryPrior.errors`."""
 
-    def _epsilon(self) -> float:
-        """Return the exploration of the next round."""
-        config = self.config
-        if self.episodes < config.warmup_episodes:
-            return 1.0
-        share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
-        return config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
+    def explore(self) -> None:
+        """Set how the policy explores in the next round."""
+
+    def exploration(self) -> dict[str, Tensor]:
+        """Return what is logged of the exploration, each [S]."""
+        return {}
 
     def _store(self, episodes: EpisodeBatch) -> None:
         """Remember episodes and, where the prior says so, their copies; originals alone enter the statistics."""
@@ -227,6 +233,28 @@ class OffPolicyLearner(Learner):
         self.episodes, self.updates = tensors["counters"].tolist()
         if replay:
             self.replay.load_state_dict(replay)
+
+
+class ExploringLearner(OffPolicyLearner):
+    """Explores at random in the warm-up, then by a measure epsilon that falls linearly; see `ExploringHead`."""
+
+    config: ExploringConfig
+
+    def explore(self) -> None:
+        """Set epsilon of the next round."""
+        self.policy.head.explore(self._epsilon())
+
+    def exploration(self) -> dict[str, Tensor]:
+        """Return epsilon as it was last."""
+        return {"train/epsilon": self.policy.head.epsilon.clone()}
+
+    def _epsilon(self) -> float:
+        """Return the exploration of the next round."""
+        config = self.config
+        if self.episodes < config.warmup_episodes:
+            return 1.0
+        share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
+        return config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
 
 
 PROBE_EPISODES = 4

@@ -18,7 +18,7 @@ from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.objectives import value_loss
-from esp_cli.algorithms.off_policy import OffPolicyConfig, OffPolicyLearner
+from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
@@ -32,7 +32,7 @@ from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
 
-class QmixConfig(OffPolicyConfig):
+class QmixConfig(ExploringConfig):
     """Hyperparameters; every default stands here, or in `OffPolicyConfig`, and nowhere else."""
 
     learning_rate: float = Field(4e-3, gt=0, description="of Adam; paper: 7e-4")
@@ -47,7 +47,7 @@ VALUE_GAIN = 0.1
 """Orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards."""
 
 
-class Qmix(OffPolicyLearner):
+class Qmix(ExploringLearner):
     """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`.
 
     Raises:

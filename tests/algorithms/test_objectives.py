@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -305,3 +307,21 @@ def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch)
             "value_loss": 2,
             "value_consistency_loss": 1,
         } | ({"policy_consistency_loss": 1} if actor else {})
+
+
+@pytest.mark.parametrize(
+    ("equation", "functions"),
+    [
+        ("Eq. 3", {"ppo_loss"}),
+        ("Eq. 4", {"value_loss"}),
+        ("Eq. 8, S_pi", {"policy_consistency_loss"}),
+        ("Eq. 9, S_V", {"value_consistency_loss"}),
+        ("Eq. 10, c", {"Copies.penalty"}),
+        ("supplement eq. 19, S_Q", {"value_consistency_loss"}),
+    ],
+)
+def test_the_page_points_at_the_functions_that_are_counted_above(equation, functions):
+    page = (Path(__file__).parents[2] / "docs" / "paper-to-code.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| {equation} |"))
+    code = row.split("|")[3]
+    assert functions <= set(re.findall(r"`(?:[\w.]+:)?([\w.]+)`", code))
