@@ -21,7 +21,7 @@ from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
-from esp_cli.networks.joint_q import OneValueEach
+from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
@@ -68,7 +68,7 @@ class Maddpg(ExploringLearner):
         config, spec, generators = self.config, self.spec, self.generators["learner"]
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
         if not spec.shared_reward:
-            self.joint = OneValueEach(spec, config.critic_input)
+            self.joint = PerAgentCriticInput(spec, config.critic_input)
         shape = perceptron(network, config.critic_activation)
         width = self.critic_width + spec.num_agents * self.head.action_width
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)

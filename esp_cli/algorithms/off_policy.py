@@ -17,7 +17,7 @@ from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.networks.joint_q import OneValue
+from esp_cli.networks.joint_q import SharedCriticInput
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers, mean_per_seed
 from esp_envs.base import Environment
@@ -84,7 +84,7 @@ class OffPolicyLearner(Learner):
             raise UserError(
                 f"one round brings {per_round} episodes, but replay_episodes is {config.replay_episodes}; raise it"
             )
-        self.joint = OneValue(spec, config.critic_input)
+        self.joint = SharedCriticInput(spec, config.critic_input)
         self.policy = self.build_policy(spec, network, generators).to(device)  # type: ignore[assignment]
         self.reward_scale = ValueNormaliser(env.num_seeds, config.reward_decay**config.num_envs).to(device)
         self.replay = EpisodeReplay(spec, env.num_seeds, config.replay_episodes, device)

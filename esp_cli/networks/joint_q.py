@@ -15,7 +15,7 @@ from esp_cli.networks.perceptron import affine
 from esp_envs.spec import Spaces
 
 
-class OneValue:
+class SharedCriticInput:
     """One value for agents that share their reward: the critic sees a scene once, with all actions in agent order.
 
     Args:
@@ -62,10 +62,10 @@ class OneValue:
         """
         shape = joint.shape[1:-2]
         rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
-        return with_one_exchanged(critic, *rows).unflatten(1, shape).squeeze(-1)
+        return counterfactual_values(critic, *rows).unflatten(1, shape).squeeze(-1)
 
 
-class OneValueEach(OneValue):
+class PerAgentCriticInput(SharedCriticInput):
     """One value per agent, for agents with their own rewards: one shared critic sees a scene once per agent.
 
     The row of an agent lists all agents in circular order and ends with that agent. Beside a global state, the critic
@@ -80,25 +80,25 @@ class OneValueEach(OneValue):
     def rows(self, obs: Tensor, state: Tensor) -> Tensor:
         """Return what the critic sees of scenes, for each agent: [S, W, N, width]."""
         if self.reads == "observations":
-            return in_a_circle(obs)
+            return in_circular_order(obs)
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
     def joint_action(self, action: Tensor) -> Tensor:
         """Return encoded joint actions [S, W, N, A] for each agent: [S, W, N, N A]."""
-        return in_a_circle(action)
+        return in_circular_order(action)
 
     def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""
         return super().value(critic, seen, action).squeeze(-1)
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-        """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `OneValue`."""
+        """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `SharedCriticInput`."""
         # the agent's own action is the last of its row, and the only one that is exchanged
-        seen = torch.cat([seen, in_a_circle(joint)[..., : -joint.shape[-1]]], -1)
+        seen = torch.cat([seen, in_circular_order(joint)[..., : -joint.shape[-1]]], -1)
         return super().exchanged(critic, seen, joint.unsqueeze(-2), others.unsqueeze(-3)).squeeze(-2)
 
 
-def in_a_circle(items: Tensor) -> Tensor:
+def in_circular_order(items: Tensor) -> Tensor:
     """Return N rows of all items: row i lists the items in circular order and ends with item i.
 
     Args:
@@ -113,7 +113,7 @@ def in_a_circle(items: Tensor) -> Tensor:
     return items[..., order, :].flatten(-2)
 
 
-def with_one_exchanged(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
+def counterfactual_values(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
     """Return the outputs for rows that end in N items, with one item at a time replaced by each of K others.
 
     The N K rows share nearly all of the first layer's sums, which are computed once.

@@ -53,13 +53,14 @@ class SeedGRU(nn.Module):
         gradients through time are cut every `truncation` steps (0: never).
         """
         layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
-        if computes(self.compiled, x):
-            if torch.is_grad_enabled():
-                return _CompiledUnrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
-            return CompiledUnroll(x, layers, truncation, keep=False).memories
         if torch.is_grad_enabled():
-            return _Unrolled.apply(x, truncation, *layers)  # type: ignore[no-untyped-call]
-        return _advanced(x, *layers)[0][:, 1:]
+            return _Unrolled.apply(x, truncation, self.compiled, *layers)  # type: ignore[no-untyped-call]
+        return _run(x, truncation, self.compiled, layers, keep=False).memories
+
+
+def _run(x: Tensor, truncation: int, compiled: bool, layers: Sequence[Tensor], keep: bool) -> _Unroll | CompiledUnroll:
+    """Return a run by the kernel where it is chosen, else by torch's operations."""
+    return (CompiledUnroll if computes(compiled, x) else _Unroll)(x, layers, truncation, keep)
 
 
 def _gates(weight: Tensor) -> Tensor:
@@ -67,85 +68,79 @@ def _gates(weight: Tensor) -> Tensor:
     return weight.unflatten(2, (3, -1)).permute(2, 0, 1, 3).contiguous()
 
 
-def _advanced(
-    x: Tensor, weight: Tensor, bias: Tensor, recurrent: Tensor, inner_bias: Tensor, keep: bool = False
-) -> tuple[Tensor, list[Tensor], list[Tensor]]:
-    """Return all memories [S, 1 + T, B, H], and if kept r, z, n [3, S, B, H] and h U_n + b_n [S, B, H] of every step.
+class _Unroll:
+    """All steps of a gated recurrent unit from empty memory by torch; `backward` needs what is kept where asked.
 
-    The memory of t = 0 is empty.
+    Args:
+        x: [S, T, B, in].
+        layers: W, its bias, U and its bias.
+        truncation: steps after which gradients through time are cut; 0: never.
+        keep: whether there will be a backward.
+
+    Attributes:
+        memories: [S, T, B, H] after every step.
     """
-    num_seeds, num_steps, batch = x.shape[:3]
-    (w_r, w_z, w_n), (u_r, u_z, u_n) = _gates(weight), _gates(recurrent)
-    (b_r, b_z, _), (_, _, c_n), (_, _, b_n) = _gates(bias + inner_bias), _gates(inner_bias), _gates(bias)
-    memories = x.new_empty(num_seeds, 1 + num_steps, batch, recurrent.shape[1])
-    memories[:, 0] = 0
-    gates, inner = x.new_empty(3, *memories[:, 0].shape), torch.empty_like(memories[:, 0])
-    every: tuple[list[Tensor], list[Tensor]] = ([], [])
-    for t in range(num_steps):
-        if keep and t:
-            gates, inner = torch.empty_like(gates), torch.empty_like(inner)
-        now, memory, (reset, update, candidate) = x[:, t], memories[:, t], gates
-        torch.baddbmm(b_r, now, w_r, out=reset).baddbmm_(memory, u_r)
-        torch.baddbmm(b_z, now, w_z, out=update).baddbmm_(memory, u_z)
-        gates[:2].sigmoid_()
-        torch.baddbmm(c_n, memory, u_n, out=inner)
-        torch.baddbmm(b_n, now, w_n, out=candidate).addcmul_(reset, inner)
-        activate_(candidate, "tanh")
-        torch.lerp(candidate, memory, update, out=memories[:, t + 1])
-        every[0].append(gates)
-        every[1].append(inner)
-    return memories, *every
+
+    def __init__(self, x: Tensor, layers: Sequence[Tensor], truncation: int, keep: bool) -> None:
+        weight, bias, recurrent, inner_bias = layers
+        self._x, self._weights, self._truncation = x, (weight, recurrent), truncation
+        (w_r, w_z, w_n), (u_r, u_z, u_n) = _gates(weight), _gates(recurrent)
+        (b_r, b_z, _), (_, _, c_n), (_, _, b_n) = _gates(bias + inner_bias), _gates(inner_bias), _gates(bias)
+        self._all = x.new_empty(x.shape[0], 1 + x.shape[1], x.shape[2], recurrent.shape[1])  # empty memory first
+        self._all[:, 0] = 0
+        self._kept: list[tuple[Tensor, Tensor]] = []  # r, z, n [3, S, B, H] and h U_n + b_n [S, B, H] of every step
+        gates, inner = x.new_empty(3, *self._all[:, 0].shape), torch.empty_like(self._all[:, 0])
+        for t in range(x.shape[1]):
+            if keep:
+                gates, inner = torch.empty_like(gates), torch.empty_like(inner)
+                self._kept.append((gates, inner))
+            now, memory, (reset, update, candidate) = x[:, t], self._all[:, t], gates
+            torch.baddbmm(b_r, now, w_r, out=reset).baddbmm_(memory, u_r)
+            torch.baddbmm(b_z, now, w_z, out=update).baddbmm_(memory, u_z)
+            gates[:2].sigmoid_()
+            torch.baddbmm(c_n, memory, u_n, out=inner)
+            torch.baddbmm(b_n, now, w_n, out=candidate).addcmul_(reset, inner)
+            activate_(candidate, "tanh")
+            torch.lerp(candidate, memory, update, out=self._all[:, t + 1])
+        self.memories = self._all[:, 1:]
+
+    def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the gradients by x and by the layers of what has this gradient by the memories."""
+        x, learned = self._x, _Learned(*self._weights)
+        by_x, carry = torch.empty_like(x), torch.zeros_like(self._all[:, 0])
+        d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
+        gap = torch.empty_like(carry)
+        for t, (gates, inner) in reversed([*enumerate(self._kept)]):
+            (reset, update, candidate), before = gates, self._all[:, t]
+            carry += grad[:, t]
+            passed = carry * update
+            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=d[2])
+            torch.mul(d[2], inner, out=d[0])
+            torch.mul(torch.sub(before, candidate, out=gap), carry, out=d[1])
+            torch.ops.aten.sigmoid_backward.grad_input(d[:2], gates[:2], grad_input=d[:2])
+            torch.mul(d[2], reset, out=d[3])
+            by_x[:, t] = learned.add(d, x[:, t], before)
+            if self._truncation and t % self._truncation == 0:
+                carry.zero_()
+            else:
+                carry = learned.through_time(d, passed)
+        return by_x, learned.gradients()
 
 
 class _Unrolled(Function):
     """All steps of a gated recurrent unit; `SeedGRU.forward` under autograd is the reference in the tests."""
 
     @staticmethod
-    def forward(ctx, x, truncation, weight, bias, recurrent, inner_bias):  # type: ignore[no-untyped-def]
-        memories, gates, inner = _advanced(x, weight, bias, recurrent, inner_bias, keep=True)
-        ctx.save_for_backward(x, weight, recurrent, memories, *gates, *inner)
-        ctx.truncation = truncation
-        return memories[:, 1:]
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        x, weight, recurrent, memories, *kept = ctx.saved_tensors
-        num_steps = len(kept) // 2
-        learned = _Learned(weight, recurrent)
-        by_x, carry = torch.empty_like(x), torch.zeros_like(memories[:, 0])
-        d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
-        gap = torch.empty_like(carry)
-        for t in reversed(range(num_steps)):
-            (reset, update, candidate), inner, before = kept[t], kept[num_steps + t], memories[:, t]
-            carry += grad[:, t]
-            passed = carry * update
-            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=d[2])
-            torch.mul(d[2], inner, out=d[0])
-            torch.mul(torch.sub(before, candidate, out=gap), carry, out=d[1])
-            torch.ops.aten.sigmoid_backward.grad_input(d[:2], kept[t][:2], grad_input=d[:2])
-            torch.mul(d[2], reset, out=d[3])
-            by_x[:, t] = learned.add(d, x[:, t], before)
-            if ctx.truncation and t % ctx.truncation == 0:
-                carry.zero_()
-            else:
-                carry = learned.through_time(d, passed)
-        return by_x, None, *learned.gradients()
-
-
-class _CompiledUnrolled(Function):
-    """The same by the kernel."""
-
-    @staticmethod
-    def forward(ctx, x, truncation, *layers):  # type: ignore[no-untyped-def]
-        ctx.run = CompiledUnroll(x, layers, truncation, keep=True)
+    def forward(ctx, x, truncation, compiled, *layers):  # type: ignore[no-untyped-def]
+        ctx.run = _run(x, truncation, compiled, layers, keep=True)
         ctx.save_for_backward(x, *layers)  # so that autograd notices a change of them
         return ctx.run.memories.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         _ = ctx.saved_tensors
-        by_x, found = ctx.run.backward(grad)
-        return by_x, None, *found
+        by_x, by_layers = ctx.run.backward(grad)
+        return by_x, None, None, *by_layers
 
 
 class _Learned:

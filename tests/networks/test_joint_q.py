@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.networks.joint_q import _one_by_one, in_a_circle, with_one_exchanged
+from esp_cli.networks.joint_q import _one_by_one, counterfactual_values, in_circular_order
 from esp_cli.networks.layers import SeedMLP
 from tests.networks.gradients import assert_same_gradients
 
@@ -21,7 +21,7 @@ def drawn(num_items=3, num_others=2, width=4, rows=11):
 def test_a_circle_ends_with_each_item_in_turn():
     items = torch.tensor([[1.0, 10.0], [2.0, 20.0], [3.0, 30.0]])
     rows = [[2, 20, 3, 30, 1, 10], [3, 30, 1, 10, 2, 20], [1, 10, 2, 20, 3, 30]]
-    torch.testing.assert_close(in_a_circle(items), torch.tensor(rows).float())
+    torch.testing.assert_close(in_circular_order(items), torch.tensor(rows).float())
 
 
 def test_by_hand():
@@ -31,7 +31,7 @@ def test_by_hand():
     rows = torch.full((2, 1, 1), 7.0)
     items = torch.tensor([1.0, 2.0]).view(1, 1, 2, 1).expand(2, -1, -1, -1)
     others = torch.tensor([[10.0, 30.0], [20.0, 40.0]]).view(1, 1, 2, 2, 1).expand(2, -1, -1, -1, -1)
-    out = with_one_exchanged(network, rows, items, others)
+    out = counterfactual_values(network, rows, items, others)
     expected = torch.tensor([[7.0 + 30 + 10, 7.0 + 90 + 10], [7.0 + 3 + 100, 7.0 + 3 + 200]])
     torch.testing.assert_close(out.squeeze(-1), expected.expand(2, 1, 2, 2))
 
@@ -44,7 +44,7 @@ def test_values_and_gradients_are_those_of_every_row_asked_for_by_itself(sizes, 
     rows, items, others = drawn()
     others.requires_grad_()
     weight = torch.randn(2, 11, 3, 2, sizes[-1])
-    ours, theirs = (ask(network, rows, items, others) for ask in (with_one_exchanged, _one_by_one))
+    ours, theirs = (ask(network, rows, items, others) for ask in (counterfactual_values, _one_by_one))
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
     assert_same_gradients(ours, theirs, weight, [others])
     assert not torch.allclose(ours[:, :, 0], ours[:, :, 1]), "every item is another exchange"
@@ -52,8 +52,8 @@ def test_values_and_gradients_are_those_of_every_row_asked_for_by_itself(sizes, 
 
 def test_bfloat16_products_stay_near_float32():
     rows, items, others = drawn()
-    exact = with_one_exchanged(perceptron((18, 16, 8, 1)), rows, items, others)
-    rounded = with_one_exchanged(perceptron((18, 16, 8, 1), precision=torch.bfloat16), rows, items, others)
+    exact = counterfactual_values(perceptron((18, 16, 8, 1)), rows, items, others)
+    rounded = counterfactual_values(perceptron((18, 16, 8, 1), precision=torch.bfloat16), rows, items, others)
     assert rounded.dtype == torch.float32
     torch.testing.assert_close(rounded, exact, rtol=0.05, atol=0.05)
     assert not torch.equal(rounded, exact)
@@ -65,4 +65,4 @@ def test_a_normalised_input_is_built_anew_for_every_exchange():
     exchanged = items.clone()
     exchanged[:, :, 1] = others[:, :, 1, 0]
     expected = network(torch.cat([rows, exchanged.flatten(2)], -1))
-    torch.testing.assert_close(with_one_exchanged(network, rows, items, others)[:, :, 1, 0], expected)
+    torch.testing.assert_close(counterfactual_values(network, rows, items, others)[:, :, 1, 0], expected)
