@@ -70,7 +70,7 @@ class Maddpg(ExploringLearner):
         if not spec.shared_reward:
             self.joint = PerAgentCriticInput(spec, config.critic_input)
         shape = perceptron(network, config.critic_activation)
-        width = self.critic_width + spec.num_agents * self.head.action_width
+        width = self.critic_width + spec.num_agents * self.head.num_outputs
         self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
@@ -103,7 +103,7 @@ class Maddpg(ExploringLearner):
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Take one gradient step of the critic, then one of the actor, then move the targets."""
         copies = self.prior.copies(batch, self.generators["prior"])
-        seen = self._critic_rows(copies.rows)
+        seen = self.critic_rows(copies.rows)
         here = seen[:, :, :-1].contiguous()
         metrics = self._learn_critic(copies, seen, here) | self._learn_actor(copies, here)
         for target, online in self._targets_of:
@@ -112,7 +112,7 @@ class Maddpg(ExploringLearner):
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return what actor and critic say of rows, for `SymmetryPrior.errors`."""
-        values = self.joint.value(self.critic, self._critic_rows(rows)[:, :, :-1], self._encoded(rows))
+        values = self.joint.value(self.critic, self.critic_rows(rows)[:, :, :-1], self._encoded(rows))
         return {"policy": (self.head, self._outputs(rows)), "value": values}
 
     def _outputs(self, rows: EpisodeBatch) -> Tensor:
@@ -131,7 +131,7 @@ class Maddpg(ExploringLearner):
         target = self._targets(copies.originals, copies.original(seen))
         loss = value_loss(values, target, copies, self.config.huber_delta) + copies.penalty(value=values)
         (norm,) = self.critic_optimiser.step(loss)
-        return self._td_metrics(copies.original(values), target, copies.originals) | {"critic_grad_norm": norm}
+        return self.td_metrics(copies.original(values), target, copies.originals) | {"critic_grad_norm": norm}
 
     def _learn_actor(self, copies: Copies[EpisodeBatch], here: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `here` is what the critic sees of every row."""
@@ -177,7 +177,7 @@ class Maddpg(ExploringLearner):
         """Return the share of the critic's hidden units that a whole batch leaves at 0."""
         if self.config.critic_activation != "relu":
             return {}
-        rows = self.joint.inputs(self._critic_rows(batch)[:, :, :-1], self._encoded(batch))
+        rows = self.joint.inputs(self.critic_rows(batch)[:, :, :-1], self._encoded(batch))
         return {"train/critic_idle_units": self.critic.idle_units(rows.flatten(1, -2))}
 
     @torch.no_grad()
@@ -185,4 +185,4 @@ class Maddpg(ExploringLearner):
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""
         outputs = self.target_policy.unroll(batch.obs, batch.action, batch.action_mask)[:, :, 1:]
         following = batch.of_living(self.head.encode(self.head.mode(outputs)), after=True)
-        return self._td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))
+        return self.td_targets(batch, batch.reward, self.joint.value(self.target_critic, seen[:, :, 1:], following))

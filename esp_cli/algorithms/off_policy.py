@@ -1,4 +1,4 @@
-"""What MADDPG and QMIX share: collect whole episodes, store them, draw batches, take gradient steps."""
+"""What off-policy learners share: collect whole episodes, store them, draw batches, take gradient steps."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class OffPolicyLearner(Learner):
             self.replay.add(copies)
         self.episodes += self.config.num_envs
 
-    def _critic_rows(self, batch: EpisodeBatch) -> Tensor:
+    def critic_rows(self, batch: EpisodeBatch) -> Tensor:
         """Return what the critic or the mixer sees of every state: [S, B, T + 1(, N), critic width]."""
         return self._with_time(self.joint.rows(batch.obs, batch.state))
 
@@ -168,13 +168,21 @@ class OffPolicyLearner(Learner):
         return torch.cat([rows, time.expand(*rows.shape[:-1], 1)], -1)
 
     @torch.no_grad()
-    def _td_targets(self, batch: EpisodeBatch, reward: Tensor, next_value: Tensor) -> Tensor:
+    def td_targets(
+        self, batch: EpisodeBatch, reward: Tensor, next_value: Tensor, bonus: Tensor | None = None
+    ) -> Tensor:
         """Return targets [S, B, T, C] from standardised rewards and the target network's values of what followed.
 
         Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
         values, and with them S_Q and c, mean about the same in every task. Mean and variance are those of one agent's
         reward; a team's, the mean of rewards of the agents' own, varies less. Where an episode or an agent may end
         early, the mean is not taken off: it would pay for each step that is still to come, or charge for it.
+
+        Args:
+            batch: the originals.
+            reward: [S, B, T, C] as it was paid.
+            next_value: [S, B, T, C].
+            bonus: [S, B, T, C], added to the value of what followed and to the lambda-return from there: an entropy.
         """
         config = self.config
         ended = batch.terminated.clone()
@@ -186,10 +194,12 @@ class OffPolicyLearner(Learner):
         over = ended.unsqueeze(-1)
         if batch.alive is not None and next_value.shape[-1] > 1:
             over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own
+        if bonus is not None:
+            reward = reward + torch.where(over, 0.0, config.gamma * bonus)
         return td_targets(reward, next_value, over, config.gamma, config.td_lambda)
 
     @torch.no_grad()
-    def _td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:
+    def td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Return what is logged of a step: L_TD and the mean value, over the originals; [S, B, T, C] each."""
         loss = value_loss(values, target, self.prior.alone(batch), self.config.huber_delta)
         return {"td_loss": loss.value, "value": mean_per_seed(values, batch.valued(values.shape[-1]))}

@@ -94,7 +94,7 @@ class Qmix(ExploringLearner):
         """Take one gradient step down L_TD + c S_Q."""
         copies = self.prior.copies(batch, self.generators["prior"])
         utilities = self._utilities(copies.rows)
-        seen = self._critic_rows(copies.rows)
+        seen = self.critic_rows(copies.rows)
         values = self._total(utilities, copies.rows, seen)
         target = self._targets(batch, copies.original(utilities).detach(), copies.original(seen))
         loss = value_loss(values, target, copies, self.config.huber_delta) + copies.penalty(value=values)
@@ -102,11 +102,11 @@ class Qmix(ExploringLearner):
         if (self.updates + 1) % self.config.target_every == 0:
             self.target_policy.load_state_dict(self.policy.state_dict())
             self.target_mixer.load_state_dict(self.mixer.state_dict())
-        return self._td_metrics(copies.original(values), target, batch) | {"grad_norm": norm}
+        return self.td_metrics(copies.original(values), target, batch) | {"grad_norm": norm}
 
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return Q_tot of rows, for `SymmetryPrior.errors`."""
-        return {"value": self._total(self._utilities(rows), rows, self._critic_rows(rows))}
+        return {"value": self._total(self._utilities(rows), rows, self.critic_rows(rows))}
 
     def _utilities(self, rows: EpisodeBatch) -> Tensor:
         return self.policy.unroll(rows.obs, rows.action, rows.action_mask)
@@ -124,4 +124,4 @@ class Qmix(ExploringLearner):
         chosen = following.gather(-1, best(chooser).unsqueeze(-1)).squeeze(-1)
         chosen = batch.of_living(chosen, after=True)
         next_value = self.target_mixer(chosen, seen[:, :, 1:]).unsqueeze(-1)
-        return self._td_targets(batch, batch.reward.mean(-1, keepdim=True), next_value)
+        return self.td_targets(batch, batch.reward.mean(-1, keepdim=True), next_value)

@@ -37,7 +37,7 @@ def program_of(policy: Policy) -> Program:
         groups = _groups(head.disc)
     else:
         raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
-    previous = policy.head.action_width if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
+    previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
     if isinstance(actor, MessagePassing):
         inputs = max(actor.picture.stop, actor.others.stop)
     else:

@@ -7,15 +7,13 @@ Shapes: outputs [S, ..., N, outputs], action [S, ..., N] (discrete) or [S, ..., 
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.autograd import Function
-from torch.nn.functional import embedding
 
-from esp_cli.networks.heads import MASKED, Categorical, Head, best, drawn, same_disc, squash
+from esp_cli.networks.heads import MASKED, Categorical, Choice, Head, best, drawn, same_disc, squash
 from esp_envs.base import random_choice
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
@@ -24,11 +22,8 @@ class ExploringHead(Head):
     """A head with a measure of exploration per seed.
 
     Attributes:
-        action_width: numbers of an encoded action.
         epsilon: [S] in [0, 1].
     """
-
-    action_width: int
 
     def __init__(self, num_seeds: int) -> None:
         nn.Module.__init__(self)  # not super(): the constructor of a head beside this one wants other arguments
@@ -39,24 +34,16 @@ class ExploringHead(Head):
         """Set the measure of exploration of all seeds."""
         self.epsilon.fill_(epsilon)
 
-    @abstractmethod
-    def encode(self, action: Tensor) -> Tensor:
-        """Return actions as numbers that a network can read: [..., N, action_width]."""
-
     def _epsilon(self, like: Tensor) -> Tensor:
         return self.epsilon.view(-1, *[1] * (like.dim() - 1))
 
 
-class ExploringChoice(ExploringHead):
-    """A head that chooses one of A actions."""
+class ExploringChoice(ExploringHead, Choice):
+    """A head that explores and chooses one of A actions."""
 
     def __init__(self, space: Discrete, num_seeds: int) -> None:
         super().__init__(num_seeds)
-        self.num_outputs = self.action_width = space.count
-
-    def encode(self, action: Tensor) -> Tensor:
-        """Return one-hot rows."""
-        return embedding(action, torch.eye(self.num_outputs, device=action.device))
+        self.num_outputs = space.count
 
 
 class EpsilonGreedy(ExploringChoice):
@@ -156,7 +143,7 @@ class BoundedPoint(ExploringHead):
 
     def __init__(self, space: Continuous, num_seeds: int) -> None:
         super().__init__(num_seeds)
-        self.num_outputs = self.action_width = space.width
+        self.num_outputs = space.width
         self.disc: Tensor
         self.register_buffer("disc", same_disc(space), False)
 
@@ -176,10 +163,6 @@ class BoundedPoint(ExploringHead):
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
         """Return half the squared distance of the actions, the KL of two Gaussians of deviation 1: [S, B, N]."""
         return 0.5 * (self.mode(p) - self.mode(q)).square().sum(-1)
-
-    def encode(self, action: Tensor) -> Tensor:
-        """Return the action's own numbers."""
-        return action
 
     def relaxed(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action itself, through which gradients flow."""

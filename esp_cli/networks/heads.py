@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import embedding
 
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.policies import CategoricalPolicies, Frame, GaussianPolicies, divergence_by_choice
@@ -44,6 +45,7 @@ class Head(nn.Module, ABC):
     """Reads actions out of a network's outputs; what every learner's policy has at its end.
 
     Attributes:
+        num_outputs: numbers that it reads of an agent; an encoded action has as many.
         masks: whether outputs come with masked actions.
     """
 
@@ -74,13 +76,25 @@ class Head(nn.Module, ABC):
         """Return what `Environment.step` takes: the action as it is, unless a head says more."""
         return action
 
+    def encode(self, action: Tensor) -> Tensor:
+        """Return actions as numbers that a network can read [..., N, outputs]: those of a continuous one."""
+        return self.to_environment(action)
 
-class Categorical(Head):
-    """One of A actions with probabilities softmax(outputs)."""
+
+class Choice(Head):
+    """A head that chooses one of A actions."""
 
     def __init__(self, space: Discrete) -> None:
         super().__init__()
         self.num_outputs = space.count
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Return one-hot rows."""
+        return embedding(action, torch.eye(self.num_outputs, device=action.device))
+
+
+class Categorical(Choice):
+    """One of A actions with probabilities softmax(outputs)."""
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
         """Draw what `sample` needs for actions of `shape`, per seed from its own generator: uniform [S, *shape]."""

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from esp_cli.networks.build import Network, NetworkConfig, build_network
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.plain import PlainConfig
@@ -108,36 +107,34 @@ class StochasticPolicy(Policy):
 
 
 class HistoryPolicy(Policy):
-    """A policy that explores by a schedule; a recurrent one sees its history (a_0, o_1, a_1, ..., a_{t-1}, o_t).
+    """A policy of learners with a replay; a recurrent one sees its history (a_0, o_1, a_1, ..., a_{t-1}, o_t).
 
     The previous action is part of its memory [S, B * N, H + width]: zeros at the start of an episode, then the one-hot
     of a discrete action or the numbers of a continuous one. A perceptron sees the observation alone.
     """
-
-    head: ExploringHead
 
     def __init__(
         self,
         spec: Spaces,
         network: NetworkConfig,
         generators: Sequence[torch.Generator],
-        head: ExploringHead,
+        head: Head,
         output_gain: float,
     ) -> None:
-        extra = head.action_width if network.recurrent else 0
+        extra = head.num_outputs if network.recurrent else 0
         super().__init__(spec, network, generators, head, output_gain, extra)
         self.recurrent = self.actor.memory_width > 0
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H + width] with which an episode begins; [S, E * N, 0] of a perceptron."""
         hidden = super().initial_memory(num_envs, like)
-        return torch.nn.functional.pad(hidden, (0, self.head.action_width)) if self.recurrent else hidden
+        return torch.nn.functional.pad(hidden, (0, self.head.num_outputs)) if self.recurrent else hidden
 
     def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the normalised outputs for obs [S, E, N, D], and the memory, in which the action is still missing."""
         if not self.recurrent:
             return super().step(obs, memory, action_mask)
-        hidden, previous = memory.split((self.actor.memory_width, self.head.action_width), -1)
+        hidden, previous = memory.split((self.actor.memory_width, self.head.num_outputs), -1)
         outputs, hidden = self.actor.step(torch.cat([obs.flatten(1, 2), previous], -1), hidden)
         outputs = self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask)
         return outputs, torch.cat([hidden, previous], -1)

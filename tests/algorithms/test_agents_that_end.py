@@ -206,7 +206,7 @@ def test_an_ended_agents_value_enters_qmixs_mixer_as_0():
     seen = []
     trained.mixer.forward = lambda chosen, state: seen.append(chosen) or chosen.sum(-1)
     trained.target_mixer.forward = trained.mixer.forward
-    utilities, rows = torch.full((2, 2, 7, 3, 2), 5.0), trained._critic_rows(batch)
+    utilities, rows = torch.full((2, 2, 7, 3, 2), 5.0), trained.critic_rows(batch)
     trained._total(utilities, batch, rows)
     assert torch.equal(seen[0] == 0, ~batch.alive[:, :, :-1])
     trained.target_policy.unroll = lambda *rows: utilities

@@ -41,7 +41,7 @@ def test_targets_by_hand_on_the_last_two_transitions():
     outputs = torch.zeros(2, 2, 26, 2, 5)
     outputs[:, :, 24, 0, 3] = outputs[:, :, 24, 1, 1] = 1.0  # encoded at 3 and 5 + 1
     trained.target_policy.unroll = lambda obs, action, mask: outputs
-    y = trained._targets(episodes, trained._critic_rows(episodes))
+    y = trained._targets(episodes, trained.critic_rows(episodes))
     torch.testing.assert_close(y[:, :, 23], episodes.reward[:, :, 23] + 0.5 * 9.0)
     torch.testing.assert_close(y[:, :, 24], episodes.reward[:, :, 24])
 
@@ -57,7 +57,7 @@ def test_whose_actions_are_the_policys(rule, expected):
     own = torch.full((2, 2, 25, 2, 2), diagonal)
     stored = torch.full((2, 2, 25, 2, 2), -0.25)
     value = trained._value_of_policy(
-        trained._critic_rows(episodes)[:, :, :-1], own, own, replace(episodes, action=stored)
+        trained.critic_rows(episodes)[:, :, :-1], own, own, replace(episodes, action=stored)
     )
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, -1))
 
@@ -71,7 +71,7 @@ def own_rewards(**choice):
 
 def test_agents_with_rewards_of_their_own_share_a_critic_that_sees_them_last():
     trained, episodes, done = own_rewards()
-    seen = trained._critic_rows(episodes)[:, :, :-1]
+    seen = trained.critic_rows(episodes)[:, :, :-1]
     value = trained.joint.value(trained.critic, seen, trained.head.encode(done))
     torch.testing.assert_close(value, torch.tensor([321.0, 132.0, 213.0]).expand(2, 2, 25, 3))
 
@@ -83,7 +83,7 @@ def test_each_agent_is_told_its_own_value_of_what_its_policy_does(gradient, rule
     trained, episodes, done = own_rewards(algo__actor_gradient=gradient, algo__actor_actions=rule)
     outputs = torch.full((2, 2, 25, 3, 5), -70.0)
     outputs[..., 4] = 0.0
-    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full(outputs.shape, 0.5)
+    seen, noise = trained.critic_rows(episodes)[:, :, :-1], torch.full(outputs.shape, 0.5)
     value = trained._value_of_policy(seen, outputs, noise, replace(episodes, action=done))
     torch.testing.assert_close(value, torch.tensor(expected).expand(2, 2, 25, 3))
 
@@ -91,12 +91,12 @@ def test_each_agent_is_told_its_own_value_of_what_its_policy_does(gradient, rule
 def test_what_the_shared_critic_sees_of_a_state():
     """Observations in a circle that ends with one's own, then the time; beside a state one's own observation alone."""
     trained, episodes, _ = own_rewards()
-    seen, first = trained._critic_rows(episodes), episodes.obs
+    seen, first = trained.critic_rows(episodes), episodes.obs
     assert seen.shape[-1] == trained.critic_width
     torch.testing.assert_close(seen[..., 1, :-1], first[..., [2, 0, 1], :].flatten(-2))
     torch.testing.assert_close(seen[0, 0, :, 0, -1], torch.arange(26.0) / 25)
     trained, episodes = prepared(task__convention="pettingzoo", algo__critic_input="state")
-    seen = trained._critic_rows(episodes)
+    seen = trained.critic_rows(episodes)
     assert seen.shape[-1] == trained.critic_width
     torch.testing.assert_close(seen[..., 2, :-1], torch.cat([episodes.state, episodes.obs[..., 2, :]], -1))
 
@@ -109,7 +109,7 @@ def test_the_expected_value_by_hand():
     linear_critic(trained, torch.cat([torch.arange(5.0), 10 * torch.arange(5.0)]))
     probabilities = torch.tensor([[0.0, 0.0, 0.5, 0.0, 0.5], [0.0, 1.0, 0.0, 0.0, 0.0]])
     outputs = probabilities.clamp_min(1e-30).log().expand(2, 2, 25, 2, 5).clone().requires_grad_()
-    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
+    seen, noise = trained.critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
     value = trained._value_of_policy(seen, outputs, noise, replace(episodes, action=torch.full((2, 2, 25, 2), 3)))
     torch.testing.assert_close(value, torch.tensor([30.0 + 3.0, 3.0 + 10.0]).expand(2, 2, 25, 2))
     (gradient,) = torch.autograd.grad(value.sum(), outputs)  # of exp(log p) Q: p Q
@@ -123,7 +123,7 @@ def test_with_all_actions_the_policys_the_partners_are_drawn_from_it():
     linear_critic(trained, torch.cat([torch.zeros(5), torch.arange(5.0)]))  # Q is agent 2's action
     outputs = torch.full((2, 2, 25, 2, 5), 1e-30)
     outputs[..., 1] = 1.0  # both always choose 1
-    seen, noise = trained._critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
+    seen, noise = trained.critic_rows(episodes)[:, :, :-1], torch.full((2, 2, 25, 2, 5), 0.5)
     value = trained._value_of_policy(seen, outputs.log(), noise, replace(episodes, action=torch.full((2, 2, 25, 2), 3)))
     torch.testing.assert_close(value, torch.ones(2, 2, 25, 2))
 
@@ -133,7 +133,7 @@ def test_the_actor_climbs_the_critic_and_leaves_it_alone(rule):
     trained, episodes = prepared(prior__kind="none", algo__output_penalty=0.0, algo__actor_gradient=rule)
     linear_critic(trained, torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0] * 3))  # every agent should move right
     before = [p.clone() for p in trained.critic.parameters()]
-    seen = trained._critic_rows(episodes)[:, :, :-1]
+    seen = trained.critic_rows(episodes)[:, :, :-1]
     for _ in range(150):
         trained._learn_actor(trained.prior.copies(episodes, []), seen)
     probability = trained.policy.unroll(episodes.obs[:, :, :-1], episodes.action).exp()[..., 2]
@@ -170,7 +170,7 @@ def test_the_actors_loss_is_in_units_of_one_steps_reward():
     trained, episodes = prepared(prior__kind="none")
     linear_critic(trained, torch.zeros(5))
     trained.critic.layers[0].bias.data.fill_(2.0)
-    metrics = trained._learn_actor(trained.prior.copies(episodes, []), trained._critic_rows(episodes)[:, :, :-1])
+    metrics = trained._learn_actor(trained.prior.copies(episodes, []), trained.critic_rows(episodes)[:, :, :-1])
     torch.testing.assert_close(metrics["policy_loss"].detach(), torch.full((2,), -10.0))
 
 

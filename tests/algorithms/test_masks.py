@@ -123,19 +123,19 @@ def test_a_masked_action_never_enters_a_targets_maximum(algorithm):
     if algorithm == "qmix":
         seen = []
         trained.target_mixer.forward = lambda chosen, state: seen.append(chosen) or chosen.sum(-1)
-        trained._targets(batch, trained._utilities(batch), trained._critic_rows(batch))
+        trained._targets(batch, trained._utilities(batch), trained.critic_rows(batch))
         assert set(seen[0].flatten().tolist()) == {3.0}
         batch.action_mask = torch.ones_like(batch.action_mask)
-        trained._targets(batch, trained._utilities(batch), trained._critic_rows(batch))
+        trained._targets(batch, trained._utilities(batch), trained.critic_rows(batch))
         assert set(seen[1].flatten().tolist()) == {5.0}, "the control: with all actions allowed"
         return
     trained.joint.value = lambda critic, seen, action: action[..., 0, :] @ values.unsqueeze(1)
     trained.reward_scale.normalise = torch.zeros_like
     trained.config = trained.config.model_copy(update={"td_lambda": 0.0, "gamma": 1.0})
-    targets = trained._targets(batch, trained._critic_rows(batch))
+    targets = trained._targets(batch, trained.critic_rows(batch))
     assert set(targets[:, :, :-1].flatten().tolist()) == {3.0}
     batch.action_mask = torch.ones_like(batch.action_mask)
-    targets = trained._targets(batch, trained._critic_rows(batch))
+    targets = trained._targets(batch, trained.critic_rows(batch))
     assert set(targets[:, :, :-1].flatten().tolist()) == {5.0}, "the control: with all actions allowed"
 
 

@@ -225,7 +225,7 @@ def test_a_reward_for_every_step_counts_where_episodes_end_early_alone(algorithm
     trained.reward_scale.update(ones)
     batch.terminated = torch.zeros_like(batch.terminated)
     following = torch.zeros(*batch.terminated.shape, 1)
-    targets = trained._td_targets(batch, ones, following)[..., 0]
+    targets = trained.td_targets(batch, ones, following)[..., 0]
     steps, gamma = trained.spec.horizon, trained.config.gamma * trained.config.td_lambda
     expected = share * steps**-0.5 * (1 - gamma**steps) / (1 - gamma)
     torch.testing.assert_close(targets[:, :, 0], torch.full_like(targets[:, :, 0], expected))
@@ -266,7 +266,7 @@ def test_the_td_loss_is_linear_beyond_the_chosen_error(algorithm, delta, loss):
     trained = learner(algorithm, algo__huber_delta=delta, prior__kind="none")
     episodes, _ = trained.collector.collect()
     values = torch.full((2, 2, 25, 1), 4.0)
-    metrics = trained._td_metrics(values, values - 3, episodes)
+    metrics = trained.td_metrics(values, values - 3, episodes)
     assert metrics["td_loss"].tolist() == [loss, loss]
 
 

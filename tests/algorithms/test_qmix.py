@@ -23,7 +23,7 @@ def prepared(**choice):
 def test_the_team_value_mixes_the_values_of_what_was_done():
     trained, episodes = prepared()
     utilities = torch.randn(2, 2, 26, 2, 5)
-    total = trained._total(utilities, episodes, trained._critic_rows(episodes))
+    total = trained._total(utilities, episodes, trained.critic_rows(episodes))
     assert total.shape == (2, 2, 25, 1)
     one, two = episodes.action[1, 0, 7].tolist()
     torch.testing.assert_close(total[1, 0, 7, 0], utilities[1, 0, 7, 0, one] + utilities[1, 0, 7, 1, two])
@@ -39,13 +39,13 @@ def test_double_q_targets_by_hand_on_the_last_two_transitions():
     target[:, :, 25] = 7.0
     trained.target_policy.unroll = lambda obs, action, mask: target
     reward = episodes.reward.mean(-1)
-    y = trained._targets(episodes, online, trained._critic_rows(episodes))[..., 0]
+    y = trained._targets(episodes, online, trained.critic_rows(episodes))[..., 0]
     torch.testing.assert_close(y[:, :, 23], reward[:, :, 23] + 0.5 * 30.0)
     torch.testing.assert_close(y[:, :, 24], reward[:, :, 24])
 
     single, _ = prepared(algo__double_q=False, algo__bootstrap_truncated=True)
     single.target_policy.unroll = lambda obs, action, mask: target
-    y = single._targets(episodes, online, single._critic_rows(episodes))[..., 0]
+    y = single._targets(episodes, online, single.critic_rows(episodes))[..., 0]
     torch.testing.assert_close(y[:, :, 23], reward[:, :, 23] + 0.5 * 119.0)
     torch.testing.assert_close(y[:, :, 24], reward[:, :, 24] + 0.5 * 14.0)
 
