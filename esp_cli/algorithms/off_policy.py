@@ -17,6 +17,7 @@ from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.joint_q import SharedCriticInput
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers, mean_per_seed
@@ -252,11 +253,15 @@ class ExploringLearner(OffPolicyLearner):
 
     def explore(self) -> None:
         """Set epsilon of the next round."""
-        self.policy.head.explore(self._epsilon())
+        self._schedule.explore(self._epsilon())
 
     def exploration(self) -> dict[str, Tensor]:
         """Return epsilon as it was last."""
-        return {"train/epsilon": self.policy.head.epsilon.clone()}
+        return {"train/epsilon": self._schedule.epsilon.clone()}
+
+    @property
+    def _schedule(self) -> ExploringHead:
+        return self.policy.head  # type: ignore[return-value]
 
     def _epsilon(self) -> float:
         """Return the exploration of the next round."""
