@@ -24,7 +24,7 @@ from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.heads import BoundedGaussian, Categorical
-from esp_cli.networks.joint_q import OneValueEach
+from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
 from esp_cli.prior import Answers, Copies, mean_per_seed
@@ -40,9 +40,9 @@ class MasacConfig(OffPolicyConfig):
     temperature_learning_rate: float = Field(4e-3, gt=0, description="of log alpha")
     td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; original: 0")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target critics go at each step")
-    initial_temperature: float = Field(0.1, gt=0, description="alpha at the start, in standardised rewards of a step")
+    initial_temperature: float = Field(0.5, gt=0, description="alpha at the start, in standardised rewards of a step")
     target_entropy: float | None = Field(
-        None, description="of one agent, in nats; none: 0.3 log A of A actions, or -1 for each number of an action"
+        None, description="of one agent, in nats; none: 0.5 log A of A actions, or -1 for each number of an action"
     )
 
 
@@ -91,7 +91,7 @@ class Masac(OffPolicyLearner):
         config, spec, generators = self.config, self.spec, self.generators["learner"]
         self.head: Categorical | SquashedGaussian = self.policy.head  # type: ignore[assignment]
         if not spec.shared_reward:
-            self.joint = OneValueEach(spec, config.critic_input)
+            self.joint = PerAgentCriticInput(spec, config.critic_input)
         width = self.critic_width + spec.num_agents * self.head.num_outputs
         shape = perceptron(network, "relu")
         critics = [MLP(generators, width, 1, shape, 1.0) for _ in range(2)]
@@ -211,5 +211,5 @@ class Masac(OffPolicyLearner):
 
 
 def default_target_entropy(space: ActionSpace) -> float:
-    """Return 0.3 log A of A discrete actions, or -1 for each number of a continuous action."""
-    return 0.3 * math.log(space.count) if isinstance(space, Discrete) else -float(space.width)
+    """Return 0.5 log A of A discrete actions, or -1 for each number of a continuous action."""
+    return 0.5 * math.log(space.count) if isinstance(space, Discrete) else -float(space.width)
