@@ -23,7 +23,8 @@ def named(accepted: Sequence[Element], tried: Sequence[Element], scene: str = ""
     Args:
         accepted: elements that hold.
         tried: all elements.
-        scene: a group that is no polygon's, as of legs, which is looked at too.
+        scene: a group that is no polygon's, as of legs, which is looked at too. Coupled generators, as
+            flip-x*agents-1-0, count one by one.
     """
     plane, text = _scene([e for e in accepted if not e.orders], [e for e in tried if not e.orders], scene)
     whole, single = _orders_of(accepted)
@@ -43,7 +44,7 @@ def _scene(accepted: Sequence[Element], tried: Sequence[Element], scene: str) ->
         name = "o2" if mirrors and held.issuperset(mirrors) else "so2"
         return name, name
     groups = _polygon_groups([e for e, plane in seen.items() if plane.turn.denominator <= _MOST_CORNERS])
-    if scene and not any(_is_planar(e) for e in _listed(scene)):
+    if scene and "*" not in scene and not any(_is_planar(e) for e in _listed(scene)):
         groups.append((scene, _listed(scene)))
     best, text, size = "c1", "", 1
     for name, group in groups:
@@ -76,8 +77,9 @@ def _polygon_groups(tried: Sequence[Element]) -> list[tuple[str, tuple[Element, 
 
 
 def _orders_of(accepted: Sequence[Element]) -> tuple[list[str], list[str]]:
-    """Return the groups of all orders of agents or items, and the accepted elements that make up none."""
-    found, whole, single = dict[tuple[str, int], list[Element]](), list[str](), list[str]()
+    """Return the groups of all orders of agents or items, and the accepted elements with orders that make up none."""
+    found, whole = dict[tuple[str, int], list[Element]](), list[str]()
+    single = [element.name for element in accepted if element.orders and not element.in_place.is_identity]
     for element in accepted:
         if len(element.orders) == 1 and element.in_place.is_identity:
             name, places = element.orders[0]

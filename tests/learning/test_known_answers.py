@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from operator import methodcaller
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from esp_cli.algorithms.mappo import Mappo, MappoConfig
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import transform_set
-from esp_cli.training.play import HeuristicController, PolicyController, RandomController
+from esp_cli.training.play import PolicyController, ScriptedController
 from esp_cli.training.streams import generators, stream_seeds
 from tests.learning.pointing import HORIZON, SEEDS, AlwaysRight, Pointing, iterations_to, score
 
@@ -41,8 +43,10 @@ def plain() -> list[Tensor]:
 
 
 def test_the_answer_is_known_and_far_from_chance():
-    assert score(Pointing, HeuristicController()).tolist() == [1.0, 1.0]
-    assert score(Pointing, RandomController()).tolist() == pytest.approx([0.25, 0.25], abs=0.03)
+    assert score(Pointing, ScriptedController(methodcaller("heuristic"))).tolist() == [1.0, 1.0]
+    assert score(Pointing, ScriptedController(methodcaller("random_action"))).tolist() == pytest.approx(
+        [0.25, 0.25], abs=0.03
+    )
 
 
 def test_the_best_action_turns_with_the_target_and_the_false_task_breaks_that():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from operator import methodcaller
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ from esp_cli.policies.evaluation import FinalEvaluation, evaluate, play_batches,
 from esp_cli.policies.loading import TrainedPolicy, _stopped
 from esp_cli.policies.statistics import SeedSummary
 from esp_cli.training.build import build_environment
-from esp_cli.training.play import HeuristicController, PolicyController, play
+from esp_cli.training.play import PolicyController, ScriptedController, play
 from esp_cli.training.streams import generators
 from tests.training.runs import tiny_config
 
@@ -121,7 +122,10 @@ def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypa
     result = evaluate(trained, 5)
     streams = [(0, 2), (2, 2), (4, 1)]  # first episode and number of worlds of each batch
     parts = [
-        play(build_environment(trained.config, worlds, "judgement", "heuristic", begin), HeuristicController())
+        play(
+            build_environment(trained.config, worlds, "judgement", "heuristic", begin),
+            ScriptedController(methodcaller("heuristic")),
+        )
         for begin, worlds in streams
     ]
     episodes = torch.cat([part.returns for part in parts], 1)

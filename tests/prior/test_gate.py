@@ -102,7 +102,9 @@ def test_a_row_that_is_not_moved_equals_its_original_and_costs_no_penalty() -> N
     assert made.rows.obs[0, 2:, 0, 0].tolist() == [[0, 0], [9, 0]], "the second is far off, so it stays"
     assert made.rows.action[0, 2:, 0, 0].tolist() == [UP, RIGHT]
     logits = torch.tensor([0.0, 0, 1, 0, 0]).expand(1, 4, 1, 1, 5)
-    assert float(made.penalty(policy=(Squared(), logits))) == pytest.approx(0.5 * 2 / 2), "the first row's gap alone"
+    assert float(made.penalty(policy=(Squared(), logits)).value) == pytest.approx(0.5 * 2 / 2), (
+        "the first row's gap alone"
+    )
     for size in (1, 2):
         parts = made.chunks(size)
         assert torch.equal(torch.cat([part.obs[:, part.originals.count :] for part in parts], 1), made.obs[:, 2:])
@@ -201,7 +203,7 @@ def test_a_seed_draws_the_same_alone_and_beside_others_whose_elements_are_certai
 
 def test_the_share_of_copies_is_that_of_the_rows_that_are_moved() -> None:
     """Of four states at (2, 1) and (0, 0), seed 0 turns by a half: two moved; the mirror of seed 1 is certain: all."""
-    config = PriorConfig(transforms="rot180,flip-x", trust="gate", weights={"rot180": 0.0, "flip-x": 1.0})
+    config = PriorConfig(transforms="rot180,flip-x", trust="gate", weights={"rot180": 0.01, "flip-x": 1.0})
     prior = SymmetryPrior(config, ONE)
     prior.gate = one_body(0.5, doubt=1000.0, certain=("flip-x",))
     obs = torch.tensor([[2.0, 1.0], [0, 0], [2, 1], [0, 0]]).view(1, 4, 1, 1, 2).expand(2, -1, -1, -1, -1)
