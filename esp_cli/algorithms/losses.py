@@ -43,10 +43,13 @@ def gae(
     return advantage
 
 
-def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, td_lambda: float) -> Tensor:
+def td_targets(
+    reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, td_lambda: float, cut: Tensor | None = None
+) -> Tensor:
     """Return targets for action values: one-step, or TD(lambda) along the stored episode.
 
-    y_t = r_t + gamma (1 - ended_t) ((1 - lambda) Q(s_{t+1}) + lambda y_{t+1}), and y_T = Q(s_T).
+    y_t = r_t + gamma (1 - ended_t) ((1 - lambda) Q(s_{t+1}) + lambda y_{t+1}), and y_{t+1} = Q(s_{t+1}) at the
+    last step of an episode.
 
     Args:
         reward: [S, B, T, C].
@@ -54,6 +57,7 @@ def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, 
         ended: [S, B, T, 1] bool, or [S, B, T, N] where agents end; no value lies beyond.
         gamma: discount factor.
         td_lambda: 0 is the one-step target, 1 the discounted return of what was done.
+        cut: [S, B, T, 1] bool, the last steps of episodes that were truncated before the end of the rows.
 
     Returns:
         [S, B, T, C].
@@ -63,6 +67,8 @@ def td_targets(reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, 
         return reward + ahead
     step, decay = reward + (1 - td_lambda) * ahead, td_lambda * gamma * (~ended).to(reward.dtype)
     target = reward + ahead
+    if cut is not None:
+        step, decay = torch.where(cut, target, step), decay.masked_fill(cut, 0)
     for t in reversed(range(reward.shape[2] - 1)):
         target[:, :, t] = step[:, :, t] + decay[:, :, t] * target[:, :, t + 1]
     return target

@@ -186,9 +186,8 @@ class OffPolicyLearner(Learner):
             bonus: [S, B, T, C], added to the value of what followed and to the lambda-return from there: an entropy.
         """
         config = self.config
-        ended = batch.terminated.clone()
-        if not config.bootstrap_truncated:
-            ended[:, :, -1] = True
+        last = batch.valid & ~nn.functional.pad(batch.valid[:, :, 1:], (0, 1))
+        ended = batch.terminated if config.bootstrap_truncated else batch.terminated | last
         ends_early = self.spec.terminates or self.spec.agents_end
         standardised = self.reward_scale.scaled if ends_early else self.reward_scale.normalise
         reward = standardised(reward) * self.spec.horizon**-0.5
@@ -197,7 +196,7 @@ class OffPolicyLearner(Learner):
             over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own
         if bonus is not None:
             reward = reward + torch.where(over, 0.0, config.gamma * bonus)
-        return td_targets(reward, next_value, over, config.gamma, config.td_lambda)
+        return td_targets(reward, next_value, over, config.gamma, config.td_lambda, last.unsqueeze(-1))
 
     @torch.no_grad()
     def td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:

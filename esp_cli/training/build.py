@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 from esp_cli.algorithms.learner import Learner
@@ -13,10 +15,13 @@ from esp_cli.training.memory import refuse_what_does_not_fit
 from esp_cli.training.streams import generators, stream_seeds
 from esp_envs.base import Environment
 from esp_envs.compass import Compass
+from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
-from esp_envs.registry import make
+from esp_envs.registry import TASKS, make
 from esp_envs.spec import TaskSpec
 
+_LOOK_SECONDS = 2.0
+"""How long a task of others is looked at before it is trained on."""
 _GATE_WORLDS = 256
 """In which the episodes are played that a gate's predictors are fitted to."""
 
@@ -31,6 +36,22 @@ def with_compass(env: Environment, prior: PriorConfig) -> Environment:
     """Return worlds as the policies of a prior see them."""
     prior = prior.effective()
     return Compass(env, prior.compass, labels="agents" in prior.transforms) if prior.compass else env
+
+
+def first_look(config: RunConfig) -> list[str]:
+    """Return what a short look finds broken in a task that is not built in; `esp check task` looks longer."""
+    if TASKS.ships(config.task):
+        return []
+
+    def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
+        return make(config.task, min(num_envs, 2), seeds, config.task_settings)
+
+    findings = check(Subject(make_worlds, deadline=time.monotonic() + _LOOK_SECONDS), QUICK)
+    return [
+        f"{config.task} breaks a promise: {finding.broken}; see 'esp check task'"
+        for finding in findings
+        if finding.broken
+    ]
 
 
 def spec_of(config: RunConfig) -> TaskSpec:

@@ -246,3 +246,12 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
         # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
         if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
             raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has truth values other than 0 and 1")
+
+
+def same(a: Tensor, b: Tensor) -> bool:
+    """Return whether two tensors are equal bit for bit, NaN included."""
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return False
+    # a part of a longer buffer has strides that no view as bytes can have
+    a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
+    return torch.equal(a, b)

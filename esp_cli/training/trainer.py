@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import build_environment, build_learner, first_look
+from esp_cli.training.checkpoint import same
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
 from esp_cli.training.play import PolicyController, play
@@ -268,6 +269,7 @@ class Trainer:
                 )
         elif self.config.init_from is not None:
             self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
+        self.notes += first_look(self.config) if found is None else []
         truncate_metrics(self.folder.metrics_path, self.step if found else -1)
 
     def _load(self, tensors: dict[str, Tensor]) -> None:
@@ -279,7 +281,7 @@ class Trainer:
         if not self.learner.collector.env.has("state_dict"):  # worlds that begin anew, whatever was saved of them
             names = {name for name in names if not name.startswith("collector.")}
         for name in sorted(names):
-            fits = name in now and name in tensors and _same(now[name], tensors[name])
+            fits = name in now and name in tensors and same(now[name], tensors[name])
             if fits and name in before:
                 a, b = before[name], now[name]
                 # a replay has grown, and checks its shapes itself
@@ -291,12 +293,3 @@ class Trainer:
         """Describe the policy file so that it can be used without the run folder."""
         returns = self.final_returns()["greedy"].tolist()
         return describe_policy(self.config, self.learner.spec, self.step, returns)
-
-
-def _same(a: Tensor, b: Tensor) -> bool:
-    """Return whether two tensors are equal bit for bit, NaN included."""
-    if a.dtype != b.dtype or a.shape != b.shape:
-        return False
-    # a part of a longer buffer has strides that no view as bytes can have
-    a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
-    return torch.equal(a, b)

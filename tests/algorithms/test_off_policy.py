@@ -223,7 +223,7 @@ def test_a_reward_for_every_step_counts_where_episodes_end_early_alone(algorithm
     ones = torch.ones_like(batch.reward[..., :1])
     trained.reward_scale = ValueNormaliser(2, 0.9)
     trained.reward_scale.update(ones)
-    batch.terminated = torch.zeros_like(batch.terminated)
+    batch.terminated, batch.valid = torch.zeros_like(batch.terminated), torch.ones_like(batch.valid)
     following = torch.zeros(*batch.terminated.shape, 1)
     targets = trained.td_targets(batch, ones, following)[..., 0]
     steps, gamma = trained.spec.horizon, trained.config.gamma * trained.config.td_lambda

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
+from esp_envs.adapters import foreign
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
+from esp_envs.errors import UserError
 
 _AGENT = "agent"
 SingleAgentSettings = ParallelSettings
@@ -24,13 +27,15 @@ class SingleAgentTask(ParallelTask):
 
     def make_one(self) -> Any:
         """Return one new copy as an environment of one agent."""
-        return _OneAgent(self.make_single())
+        single = self.make_single()
+        foreign.require_kind(single, foreign.SINGLE, "make_single")
+        return _OneAgent(single)
 
 
 class _OneAgent:
     """The parts of a PettingZoo `ParallelEnv` that the adapter needs, over a Gymnasium environment."""
 
-    possible_agents = (_AGENT,)
+    possible_agents = agents = (_AGENT,)
 
     def __init__(self, env: Any) -> None:
         self._env = env
@@ -45,11 +50,17 @@ class _OneAgent:
         return self._env.action_space
 
     def reset(self, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-        seen, info = self._env.reset(seed=seed)
-        return {_AGENT: seen}, {_AGENT: info}
+        given = self._env.reset(seed=seed)
+        if not (isinstance(given, tuple) and len(given) == 2 and isinstance(given[1], Mapping)):
+            raise UserError(f"'reset' returns a {type(given).__name__}; return (observation, info), as Gymnasium does")
+        return {_AGENT: given[0]}, {_AGENT: given[1]}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict[str, Any], ...]:
-        return tuple({_AGENT: part} for part in self._env.step(actions[_AGENT]))
+        given = self._env.step(actions[_AGENT])
+        if not (isinstance(given, tuple) and len(given) == 5):
+            shown = f"{len(given)} parts" if isinstance(given, tuple) else f"a {type(given).__name__}"
+            raise UserError(f"'step' returns {shown}; return (observation, reward, terminated, truncated, info)")
+        return tuple({_AGENT: part} for part in given)
 
     def close(self) -> None:
         self._env.close()

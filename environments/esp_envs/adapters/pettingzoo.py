@@ -15,11 +15,13 @@ from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
-from esp_envs.adapters.stepper import Array, Copy, CopyHooks, CopyStepper
+from esp_envs.adapters.hooks import Array, Copy, CopyHooks
+from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
+from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import Discrete, TaskSpec, joint_layout
+from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
 
 _FEW_COPIES = 8
 """Up to this number of copies, worker processes cost more time than they save."""
@@ -55,6 +57,12 @@ class ParallelTask(CopyHooks, Environment):
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         require_attributes(self, "observation", "action", "symmetry", "convention")
+        for name, kind in (("observation", Layout), ("action", ActionSpace), ("state", Layout | None)):
+            if not isinstance(given := getattr(self, name), kind):
+                kinds = "a layout(...)" if name != "action" else "Discrete(...) or Continuous(...)"
+                raise UserError(
+                    f"the {name} of {type(self).__name__} is a {type(given).__name__}; give {kinds} of esp_envs"
+                )
         one = Copy(self)
         agents = len(one.learners)
         self.spec = TaskSpec(

@@ -10,14 +10,16 @@ sentence where it does not, or `NotAsked` where the task does not offer what the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from esp_envs.conformance import repeating, stepping
 from esp_envs.conformance.subject import Broken, NotAsked, Subject
+from esp_envs.errors import UserError
 from esp_envs.installed import last_line, raised_in
 
-__all__ = ["PROMISES", "Broken", "Finding", "NotAsked", "Subject", "check"]
+__all__ = ["PROMISES", "QUICK", "Broken", "Finding", "NotAsked", "Subject", "check"]
 
 PROMISES: tuple[Callable[[Subject], None], ...] = (
     stepping.observations_rewards_and_metrics_fit_the_spec,
@@ -46,10 +48,14 @@ class Finding:
     not_asked: str | None = None
 
 
-def check(subject: Subject) -> Iterator[Finding]:
-    """Check every promise in turn; a task that raises breaks the promise, and only the first where all fail alike."""
+QUICK = (stepping.observations_rewards_and_metrics_fit_the_spec, repeating.the_same_seed_gives_the_same_run)
+"""Promises that a short look at a task can find broken."""
+
+
+def check(subject: Subject, promises: Sequence[Callable[[Subject], None]] = PROMISES) -> Iterator[Finding]:
+    """Check promises in turn; a task that raises breaks the promise, and only the first where all fail alike."""
     raised: set[str] = set()
-    for promise in PROMISES:
+    for promise in promises:
         name = promise.__name__.replace("_", " ")
         try:
             promise(subject)
@@ -59,9 +65,11 @@ def check(subject: Subject) -> Iterator[Finding]:
             yield Finding(name, broken=str(failure))
         except Exception as failure:
             place = raised_in(failure)
-            said = last_line(failure) + (f", in {place}" if place else "")
-            again = said in raised
-            raised.add(said)
+            said = str(failure) if isinstance(failure, UserError) else last_line(failure)
+            said += f", in {place}" if place else ""
+            kind = re.sub(r"\d+", "", said)  # whichever copy or agent it is
+            again = kind in raised
+            raised.add(kind)
             yield Finding(name, not_asked="it fails in the same way") if again else Finding(name, broken=said)
         else:
             yield Finding(name)

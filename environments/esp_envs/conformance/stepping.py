@@ -12,6 +12,7 @@ from esp_envs.conformance.subject import (
     WORLDS,
     Broken,
     Subject,
+    equal,
     require,
     require_equal,
     require_method,
@@ -29,7 +30,7 @@ def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
     env = subject.worlds()
     spec, lead = env.spec, (env.num_seeds, env.num_envs)
     observation = env.reset()
-    for _ in range(spec.horizon + 2):
+    for _ in subject.steps(spec.horizon + 2):
         require_equal("obs", tuple(observation.obs.shape), (*lead, spec.num_agents, spec.observation.width))
         require_equal("state", tuple(observation.state.shape), (*lead, spec.state.width))
         _require_mask(env, observation.action_mask)
@@ -46,7 +47,7 @@ def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
             require(value.is_contiguous(), "a result of 'step' is not contiguous")
             require(bool(torch.isfinite(value.float()).all()), "a result of 'step' is not finite")
         if spec.shared_reward:
-            same = torch.equal(step.reward, step.reward[..., :1].expand_as(step.reward))
+            same = equal(step.reward, step.reward[..., :1].expand_as(step.reward))
             require(same, "the spec says that agents share the reward, but they get different ones")
 
 
@@ -59,7 +60,7 @@ def _require_mask(env: Environment, mask: Tensor | None) -> None:
         raise Broken("the spec says 'masks', but an observation or 'action_mask()' gives none")
     require_equal("action mask", (tuple(mask.shape), mask.dtype), ((*env.action_shape, spec.action.count), torch.bool))
     require(bool(mask.any(-1).all()), "an action mask allows an agent nothing")
-    require(torch.equal(mask, now), "the observation's action mask differs from that of 'action_mask()'")
+    require(equal(mask, now), "the observation's action mask differs from that of 'action_mask()'")
 
 
 def _require_ends(env: Environment, alive: Tensor | None, step: Step) -> None:
@@ -95,12 +96,12 @@ def actions_of_heuristics_and_chance_lie_in_the_action_space(subject: Subject) -
                 require(allowed, "an action is not among those that the mask allows")
             env.step(joint)
     if env.heuristics:
-        first = torch.equal(env.heuristic(), env.heuristic(env.heuristics[0]))
+        first = equal(env.heuristic(), env.heuristic(env.heuristics[0]))
         require(first, "the default heuristic is not the first that the class names")
 
 
 def episodes_end_when_the_spec_says(subject: Subject) -> None:
-    """Truncated at the horizon, terminated only with `terminates`; `final` where a world may have ended."""
+    """Truncated at the horizon, and ended before only with `terminates`; `final` where a world may have ended."""
     env = subject.worlds()
     horizon, terminates = env.spec.horizon, env.spec.terminates
     if terminates:
@@ -116,13 +117,14 @@ def episodes_end_when_the_spec_says(subject: Subject) -> None:
         require(terminates or not bool(step.terminated.any()), "a world terminated; set 'terminates' in the spec")
         require(not bool((step.terminated & step.truncated).any()), "a world is terminated and truncated at once")
         due = (age == horizon) & ~step.terminated
-        require(torch.equal(step.truncated, due), "a world is truncated at another step than the horizon")
+        cut = step.truncated & due if terminates else step.truncated  # what terminates may be cut before, too
+        require(equal(cut, due), "a world is truncated at another step than the horizon")
         may_end = terminates or bool(due.any())
         require((step.final is not None) == may_end, "'final' belongs to the steps in which a world may have ended")
         if step.final is not None:
             same = same_observation(step.final, step.next, (~step.ended,))
             require(same, "'final' differs from 'next' in a world that goes on")
-            anew = not bool(step.ended.any()) or not torch.equal(step.final.state, step.next.state)
+            anew = not bool(step.ended.any()) or not equal(step.final.state, step.next.state)
             require(anew, "the next episode starts where the last ended")
         age[step.ended] = 0
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from esp_envs.base import Environment, Observation, Step
@@ -29,16 +31,22 @@ class Subject:
     Attributes:
         make: makes the worlds, given E and the seeds.
         rounding: how far a step from a restored state may differ, where the physics is finer than float32.
+        deadline: at which time, as `time.monotonic` gives it, promises about many steps stop looking.
         align: gives the second environment the chance that the first has drawn in advance, at a step of its episode.
     """
 
     make: MakeWorlds
     rounding: float = 0.0
     align: Callable[[Environment, Environment, int], None] | None = None
+    deadline: float = math.inf
 
     def worlds(self, num_envs: int = WORLDS, seeds: Sequence[int] = SEEDS) -> Environment:
         """Make E worlds for each seed."""
         return self.make(num_envs, seeds)
+
+    def steps(self, count: int) -> Iterator[int]:
+        """Count steps, up to the deadline."""
+        return itertools.takewhile(lambda _: time.monotonic() < self.deadline, range(count))
 
 
 def tensors_of(step: Step) -> list[Tensor]:
@@ -47,11 +55,16 @@ def tensors_of(step: Step) -> list[Tensor]:
     return [*parts_of(step.next), step.reward, *step.metrics.values(), *final, step.terminated, step.truncated]
 
 
+def equal(a: Tensor, b: Tensor) -> bool:
+    """Return whether two tensors are equal bit for bit; NaN equals NaN."""
+    return a.shape == b.shape and bool(((a == b) | ((a != a) & (b != b))).all())  # noqa: PLR0124
+
+
 def same_step(a: Step, b: Step, where: tuple[slice | Tensor, ...] = ()) -> bool:
     """Return whether two steps are equal bit for bit, in the worlds that `where` selects."""
     if (a.final is None) != (b.final is None) or a.metrics.keys() != b.metrics.keys():
         return False
-    return all(torch.equal(x[where], y[where]) for x, y in zip(tensors_of(a), tensors_of(b), strict=True))
+    return all(equal(x[where], y[where]) for x, y in zip(tensors_of(a), tensors_of(b), strict=True))
 
 
 def parts_of(observation: Observation) -> list[Tensor]:
@@ -62,13 +75,14 @@ def parts_of(observation: Observation) -> list[Tensor]:
 
 def same_observation(a: Observation, b: Observation, where: tuple[Tensor, ...] = ()) -> bool:
     """Return whether two observations are equal bit for bit, in the worlds that `where` selects."""
-    return all(torch.equal(x[where], y[where]) for x, y in zip(parts_of(a), parts_of(b), strict=True))
+    return all(equal(x[where], y[where]) for x, y in zip(parts_of(a), parts_of(b), strict=True))
 
 
 def nearly(a: Sequence[Tensor], b: Sequence[Tensor], bound: float) -> bool:
     """Return whether tensors agree within `bound`; bit for bit where it is 0."""
     return len(a) == len(b) and all(
-        bool(((x.float() - y.float()).abs() <= bound).all()) for x, y in zip(a, b, strict=True)
+        bool((((x.float() - y.float()).abs() <= bound) | (x == y) | (x.isnan() & y.isnan())).all())
+        for x, y in zip(a, b, strict=True)
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -20,6 +21,9 @@ _LIBRARIES = {
     "egl": ("EGL", ("libEGL.so.1", "libEGL.so")),
 }
 """MuJoCo's name of each library, preferred first: OSMesa draws on any processor, EGL asks for a working driver."""
+_OF_SYSTEM = {"linux": ("osmesa", "egl", "glx"), "win32": ("wgl",), "darwin": ("cgl",)}
+_ANYWHERE = ("glfw", "enable", "enabled", "on", "true", "1", "disable", "disabled", "off", "false", "0")
+"""What else MuJoCo takes as MUJOCO_GL."""
 _VARIABLE = "MUJOCO_GL"
 _MISSING = "not installed"
 _ADVICE = "to draw in software, install OSMesa: apt-get install libosmesa6 (Fedora: dnf install mesa-libOSMesa)"
@@ -43,10 +47,16 @@ def forget_missing_backend() -> None:
 
     `import mujoco` would otherwise fail with "'NoneType' object has no attribute 'glGetError'", even for training,
     which draws nothing. To be called before MuJoCo is imported.
+
+    Raises:
+        UserError: it names what MuJoCo refuses on this system.
     """
     named = os.environ.get(_VARIABLE, "").strip().lower()
+    known = _OF_SYSTEM.get(sys.platform, ())
     if named in _LIBRARIES and not is_installed(named):
         del os.environ[_VARIABLE]
+    elif named and named not in (*known, *_ANYWHERE):
+        raise UserError(f"{_VARIABLE} is {named!r}; set it to {', '.join(known)}, glfw or disable, or unset it")
 
 
 @contextmanager

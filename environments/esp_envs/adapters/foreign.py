@@ -1,0 +1,158 @@
+"""What an environment of others is and returns, read or refused in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from esp_envs.errors import UserError
+
+PARALLEL, SINGLE = "a PettingZoo ParallelEnv", "a Gymnasium environment"
+_AEC, _VECTOR = "a PettingZoo AEC environment, whose agents act in turn", "a vector of environments"
+_ADVICE = {
+    PARALLEL: "derive from esp_envs.adapters.pettingzoo.ParallelTask",
+    SINGLE: "derive from esp_envs.adapters.gymnasium.SingleAgentTask",
+    _AEC: "wrap it in pettingzoo.utils.aec_to_parallel",
+    _VECTOR: "return one environment; the copies are made here",
+}
+_PARTS = {
+    "reset": ("observations", "infos"),
+    "step": ("observations", "rewards", "terminated", "truncated", "infos"),
+}
+EVERYONE = "__all__"
+"""The entry of a mapping of flags that speaks of all agents."""
+
+
+def require_kind(env: Any, wanted: str, maker: str) -> None:
+    """Refuse what is not `PARALLEL` or `SINGLE`, whichever is `wanted` of the method `maker`."""
+    kind = _kind(env, wanted)
+    if kind != wanted:
+        raise UserError(f"'{maker}' returns {kind}; {_ADVICE.get(kind, f'return {wanted}')}")
+
+
+def _kind(env: Any, wanted: str) -> str:
+    if env is None or isinstance(env, type):
+        return "nothing" if env is None else f"the class {env.__name__} instead of an object of it"
+    for kind, sign in ((_VECTOR, "single_action_space"), (_AEC, "agent_iter"), (PARALLEL, "possible_agents")):
+        if hasattr(env, sign):
+            return kind
+    methods = all(callable(getattr(env, name, None)) for name in ("reset", "step"))
+    space = getattr(env, "action_space", None)
+    if methods and not (space is None or callable(space) or (wanted == PARALLEL and isinstance(space, Mapping))):
+        return SINGLE
+    missing = "possible_agents" if wanted == PARALLEL else "action_space"
+    return f"a {type(env).__name__}, which has no '{missing if methods else 'reset and step'}'"
+
+
+def space_of(env: Any, agent: Any) -> Any:
+    """Return an agent's action space, from the method `action_space` or from a mapping."""
+    spaces = getattr(env, "action_space", None)
+    if callable(spaces):
+        return spaces(agent)
+    spaces = spaces if isinstance(spaces, Mapping) else getattr(env, "action_spaces", {})
+    if agent not in spaces:
+        raise UserError(f"{agent} has no action space, neither in 'action_space' nor in 'action_spaces'")
+    return spaces[agent]
+
+
+def reset(env: Any, seed: int) -> Any:
+    """Reset a copy by its seed.
+
+    Raises:
+        UserError: `reset` takes no seed.
+    """
+    try:
+        return env.reset(seed=seed)
+    except TypeError as error:
+        if "unexpected keyword argument 'seed'" not in str(error):
+            raise
+        raise UserError("'reset' takes no seed; define reset(self, seed=None, options=None)") from error
+
+
+def parts(given: Any, method: str) -> tuple[Mapping[Any, Any], ...]:
+    """Return the mappings by agent that `reset` or `step` has returned.
+
+    Raises:
+        UserError: it returned something else.
+    """
+    names = _PARTS[method]
+    if isinstance(given, tuple) and len(given) == len(names) and all(map(_is_mapping, given)):
+        return given
+    shown = f"{len(given)} parts" if isinstance(given, tuple) else f"a {type(given).__name__}"
+    if isinstance(given, tuple) and len(given) == len(names):
+        shown = next(f"{n} as a {type(p).__name__}" for n, p in zip(names, given, strict=True) if not _is_mapping(p))
+    raise UserError(f"'{method}' returns {shown}; return ({', '.join(names)}), each a mapping by agent")
+
+
+def _is_mapping(part: Any) -> bool:
+    return isinstance(part, Mapping)
+
+
+def numbers(given: Any, what: str, width: int | None = None) -> NDArray[np.float32]:
+    """Return what an environment or a hook gives as a row of numbers.
+
+    Args:
+        given: an array, a tensor, a number, or a list of numbers.
+        what: how the sentence of an error begins.
+        width: how many numbers there have to be.
+
+    Raises:
+        UserError: it holds something else, or another number of them.
+    """
+    if isinstance(given, torch.Tensor):
+        given = given.detach().cpu()
+    try:
+        row = np.asarray(given)
+    except (TypeError, ValueError):  # rows of unequal length
+        row = np.empty(0, object)
+    if row.dtype.kind not in "biuf":
+        raise UserError(f"{what} is a {type(given).__name__}, not an array of real numbers")
+    if width is not None and row.size != width:
+        raise UserError(f"{what} has {row.size} numbers, expected {width}")
+    return row.reshape(-1).astype(np.float32, copy=False)
+
+
+def ends(
+    env: Any, agents: Sequence[Any], terminated: Mapping[Any, Any], truncated: Mapping[Any, Any]
+) -> tuple[set[Any], set[Any]]:
+    """Return who has terminated in or before this step, and who was truncated.
+
+    An agent's own flag goes before the one of `EVERYONE`. An agent that is not in `env.agents` has left: without a flag
+    it has terminated.
+    """
+    over = {name for name in agents if _is_set(terminated, name)}
+    cut = {name for name in agents if _is_set(truncated, name)} - over
+    if _is_set(terminated, EVERYONE):
+        over = set(agents) - cut
+    elif _is_set(truncated, EVERYONE):
+        cut = set(agents) - over
+    present = getattr(env, "agents", None)
+    if present is None:
+        return over, cut
+    if strange := set(present) - set(agents):
+        raise UserError(f"{min(map(str, strange))} is in 'env.agents', but not in 'possible_agents'; list it there")
+    return over | (set(agents) - set(present) - cut), cut
+
+
+def _is_set(flags: Mapping[Any, Any], name: Any) -> bool:
+    flag = flags.get(name, False)
+    if isinstance(flag, str) or flag not in (False, True):
+        raise UserError(f"the flag of {name} is {flag!r}; give True or False")
+    return bool(flag)
+
+
+@contextmanager
+def naming(place: str, what: str) -> Iterator[None]:
+    """Say which copy fails, and where, if one does."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        line = (str(error).strip().splitlines() or [""])[-1]
+        raise UserError(f"{place} raises in '{what}': {type(error).__name__}: {line}") from error

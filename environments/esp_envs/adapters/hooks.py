@@ -1,0 +1,199 @@
+"""One copy of a `ParallelTask`'s environment: what a task says about it, and how its numbers go in and out."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from esp_envs.adapters import foreign
+from esp_envs.errors import UserError
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
+
+Array = NDArray[Any]
+_TURNS, _MIRRORS, _HALF = r"(o2|so2|[cd](?!1\b)\d+)", r"(o2|d\d|flip)", ("c2", "d2")
+"""Symmetries of the scene that turn a vector, that mirror it, and that turn it by a half at most."""
+
+
+class CopyHooks(ABC):
+    """What a task says about one copy of its environment. The hooks run in worker processes; they use settings alone.
+
+    All learning agents of a copy must end together, unless `agents_end` says otherwise. Where an episode may be over
+    before the horizon, by an end of its own or by truncation, set `terminates`.
+    """
+
+    observation: Layout
+    """What each learning agent sees, after `reading`."""
+    action: ActionSpace
+    """What each learning agent does; numbers in [-1, 1] are stretched to the bounds of a Box."""
+    symmetry: str
+    convention: str
+    state: Layout | None = None
+    """What `env.state()` returns; by default the global state is all agents' observations, one after the other."""
+    learners: str = ""
+    """What the names of the agents that learn begin with; the others act by `opponent`."""
+    terminates: bool = False
+    agents_end: bool = False
+    """Whether agents may end one by one, by leaving `env.agents`, while the episode goes on for the others."""
+    masks: bool = False
+    """Whether the environment says which discrete actions are allowed; see `allowed`."""
+    shared_reward: bool = False
+    metrics: tuple[str, ...] = ()
+    """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
+
+    @abstractmethod
+    def make_one(self) -> Any:
+        """Return one new copy, a PettingZoo `ParallelEnv`."""
+
+    def reading(self, agent: str, observation: Any) -> Array:
+        """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
+        return np.asarray(observation["observation"] if _has(observation, "action_mask") else observation)
+
+    def allowed(self, agent: str, observation: Any, info: Mapping[str, Any]) -> Array:
+        """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info.
+
+        Raises:
+            UserError: neither has one.
+        """
+        for place in (observation, info):
+            if _has(place, "action_mask"):
+                return np.asarray(place["action_mask"])
+        raise UserError(f"{agent} gets no 'action_mask', neither in its observation nor in its info")
+
+    def opponent(self, agent: str, observation: Any, generator: np.random.Generator) -> Any:
+        """Return the action of an agent that does not learn, as its environment takes it.
+
+        Args:
+            agent: its name.
+            observation: what the environment gave it.
+            generator: of this copy, seeded with each episode.
+        """
+        raise UserError(f"{type(self).__name__} does not say how {agent} acts; define 'opponent' or set 'learners'")
+
+    def measure(self, env: Any, infos: Mapping[str, Mapping[str, Any]]) -> Mapping[str, float]:
+        """Return the metrics of the step just made: the mean over the agents whose infos hold them."""
+        return {
+            name: float(np.mean([info[name] for info in infos.values() if name in info] or [0]))
+            for name in self.metrics
+        }
+
+
+class Copy:
+    """One copy, its learning agents and how their numbers go in and out."""
+
+    def __init__(self, task: CopyHooks) -> None:
+        self._task = task
+        self.env = task.make_one()
+        foreign.require_kind(self.env, foreign.PARALLEL, "make_one")
+        self.agents = list(self.env.possible_agents)
+        self.learners = [name for name in self.agents if str(name).startswith(task.learners)]
+        if not self.learners:
+            listed = ", ".join(map(str, self.agents)) or "none"
+            raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {listed}")
+        self.rest = [name for name in self.agents if name not in self.learners]
+        spaces = [foreign.space_of(self.env, name) for name in self.learners]
+        self._boxes = [_bounds(space) for space in spaces]
+        starts = [getattr(space, "start", 0) for space in spaces]
+        self._starts = [int(start) if np.ndim(start) == 0 else 0 for start in starts]
+
+    def naming(self, what: str, k: int = 0) -> AbstractContextManager[None]:
+        """Say that this is copy k, and what it was about, if something fails."""
+        return foreign.naming(f"copy {k} of {type(self._task).__name__}", what)
+
+    def start(self, seed: int) -> tuple[Mapping[Any, Any], ...]:
+        """Reset the copy; return what its agents see, and their infos.
+
+        Raises:
+            UserError: it returns something else, or a learning agent sees nothing.
+        """
+        seen, infos = foreign.parts(foreign.reset(self.env, seed), "reset")
+        for name in self.learners:
+            if name not in seen:
+                raise UserError(f"{name} gets no observation from 'reset', and agents that join later cannot learn")
+        return seen, infos
+
+    def see(self, name: Any, observation: Any) -> Array:
+        """Return the numbers of the layout that a learning agent sees."""
+        row = foreign.numbers(self._task.reading(name, observation), f"what {name} sees")
+        if (width := row.size) != self._task.observation.width:
+            raise UserError(f"{name} sees {width} numbers, but the layout has {self._task.observation.width}")
+        return row
+
+    def require_spaces(self) -> None:
+        """Refuse spaces that differ from the layouts, by looking at the first observation.
+
+        Raises:
+            UserError: names the agent, its numbers and those of the layout.
+        """
+        task = self._task
+        with self.naming("reset"):
+            first, infos = self.start(0)
+        for name in self.learners:
+            with self.naming("reading"):
+                self.see(name, first[name])
+            if task.masks and isinstance(task.action, Discrete):
+                size = np.size(task.allowed(name, first[name], infos.get(name, {})))
+                if size != task.action.count:
+                    raise UserError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
+            space = foreign.space_of(self.env, name)
+            if isinstance(task.action, Discrete):
+                if getattr(space, "n", None) != task.action.count or space.shape != ():
+                    raise UserError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
+            elif (box := _bounds(space)) is None or space.shape != (task.action.width,):
+                raise UserError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
+            else:
+                _require_round(task, name, box)
+        if task.state is not None and not hasattr(self.env, "state"):
+            raise UserError("the task says what the state is, but its environment has no 'state' method")
+        if task.state is not None and np.size(self.env.state()) != task.state.width:
+            got = np.size(self.env.state())
+            raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
+
+    def native(self, i: int, action: Array) -> Any:
+        """Return an action of learning agent i as the environment takes it."""
+        if (box := self._boxes[i]) is None:
+            return self._starts[i] + int(action)
+        low, high = box
+        return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)
+
+    def close(self) -> None:
+        """Let go of the copy; what it raises then concerns nobody."""
+        with suppress(Exception):
+            self.env.close()
+
+
+def _require_round(task: CopyHooks, name: Any, box: tuple[Array, Array]) -> None:
+    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0.
+
+    Raises:
+        UserError: names the field.
+    """
+    assert isinstance(task.action, Continuous)
+    turns, mirrors = (re.match(pattern, task.symmetry) for pattern in (_TURNS, _MIRRORS))
+    low, high = box
+    for field, where in zip(task.action.layout.fields, task.action.layout.slices().values(), strict=True):
+        centred = np.allclose(low[where], -high[where])
+        equal = centred and (np.ptp(high[where]) == 0 or (turns is not None and turns[0] in _HALF))
+        bent = field.kind.is_vector and turns and not equal
+        if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
+            raise UserError(
+                f"{name} acts between {low[where].tolist()} and {high[where].tolist()} in '{field.name}', a "
+                f"{field.kind.name}, which '{task.symmetry}' does not leave alone; declare a smaller symmetry, or give "
+                "the environment bounds that are equal on all sides"
+            )
+
+
+def _has(place: Any, name: str) -> bool:
+    return isinstance(place, Mapping) and name in place
+
+
+def _bounds(space: Any) -> tuple[Array, Array] | None:
+    """Return the bounds of a finite Box of real numbers, None for any other space."""
+    if not hasattr(space, "low") or space.dtype.kind != "f" or not np.isfinite([space.low, space.high]).all():
+        return None
+    return np.asarray(space.low), np.asarray(space.high)
