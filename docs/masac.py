@@ -37,7 +37,7 @@ class MasacConfig(OffPolicyConfig):
 
     learning_rate: float = Field(4e-3, gt=0, description="of the critics")
     actor_learning_rate: float = Field(4e-3, gt=0, description="of the actor")
-    temperature_learning_rate: float = Field(4e-3, gt=0, description="of log alpha")
+    temperature_learning_rate: float = Field(0.02, gt=0, description="of log alpha")
     td_lambda: float = Field(0.6, ge=0, le=1, description="TD(lambda) along the episode; original: 0")
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target critics go at each step")
     initial_temperature: float = Field(0.5, gt=0, description="alpha at the start, in standardised rewards of a step")
@@ -135,7 +135,7 @@ class Masac(OffPolicyLearner):
         target = self.targets(batch, copies.original(seen))
         values = [self.joint.value(critic, here, done) for critic in self.critics]
         first, second = (
-            value_loss(v, target, copies, self.config.huber_delta) + copies.penalty(value=v) for v in values
+            value_loss(value, target, copies, self.config.huber_delta) + copies.penalty(value=value) for value in values
         )
         (norm,) = self.optimisers["critic"].step(first + second)
         return self.td_metrics(copies.original(values[0]), target, batch) | {"critic_grad_norm": norm}

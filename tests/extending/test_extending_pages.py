@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -32,13 +34,22 @@ def registries_as_before(monkeypatch):
 
 @pytest.fixture
 def saved(tmp_path, monkeypatch):
-    """Save the file of each page where the page says, in the working directory."""
+    """Save the files of both pages in the working directory."""
     monkeypatch.chdir(tmp_path)
-    for page in ("add-an-algorithm.md", "add-a-network.md"):
-        text = (PAGES / page).read_text(encoding="utf-8")
-        name = re.search(r"Save this as `([\w.]+)`", text)[1]
-        (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
-        (tmp_path / name).write_text(code, encoding="utf-8")
+    shutil.copy(PAGES / "reinforce.py", tmp_path)
+    text = (PAGES / "add-a-network.md").read_text(encoding="utf-8")
+    name = re.search(r"Save this as `([\w.]+)`", text)[1]
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    (tmp_path / name).write_text(code, encoding="utf-8")
+
+
+def test_the_page_on_algorithms_shows_what_stands_in_its_files():
+    files = "".join((PAGES / name).read_text(encoding="utf-8") for name in ("reinforce.py", "masac.py"))
+    page = (PAGES / "add-an-algorithm.md").read_text(encoding="utf-8")
+    excerpts = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert len(excerpts) == 2
+    for excerpt in excerpts:
+        assert textwrap.indent(excerpt, " " * 8) in files
 
 
 ALGO, NETWORK = ["--algo", "reinforce:Reinforce"], ["--network", "skip:SkipConfig"]
