@@ -68,6 +68,8 @@ def test_lambda_targets_by_hand_on_two_transitions():
     never, first = flags(False, False), flags(True, False)
     assert td_targets(reward, following, never, 0.9, 0.5).flatten().tolist() == pytest.approx([14.5, 20.0])
     assert td_targets(reward, following, first, 0.9, 0.5).flatten().tolist() == pytest.approx([1.0, 20.0])
+    cut = td_targets(reward, following, never, 0.9, 0.5, cut=first)
+    assert cut.flatten().tolist() == pytest.approx([10.0, 20.0]), "after a cut the value counts, and no later step"
 
 
 def test_lambda_one_is_the_discounted_return_and_lambda_zero_the_one_step_target():

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -258,6 +259,16 @@ def test_a_variable_is_forgotten_only_where_its_library_is_missing(monkeypatch: 
         assert ("MUJOCO_GL" in os.environ) is kept, value
     monkeypatch.delenv("MUJOCO_GL")
     gl.forget_missing_backend()
+
+
+@pytest.mark.parametrize(("value", "refused"), [("nonsense", True), ("gl", True), ("egl,osmesa", True), ("'egl'", True),
+                                                ("disable", False), (" GLFW ", False), ("0", False)])  # fmt: skip
+def test_a_variable_that_names_nothing_is_one_sentence(
+    value: str, refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_GL", value)
+    with pytest.raises(ValueError, match=r"MUJOCO_GL is .*; set it to .* or unset it") if refused else nullcontext():
+        gl.forget_missing_backend()
 
 
 def test_the_library_that_the_user_names_is_tried_first(monkeypatch: pytest.MonkeyPatch) -> None:

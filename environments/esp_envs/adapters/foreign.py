@@ -111,7 +111,8 @@ def numbers(given: Any, what: str, width: int | None = None) -> NDArray[np.float
     except (TypeError, ValueError):  # rows of unequal length
         row = np.empty(0, object)
     if row.dtype.kind not in "biuf":
-        raise UserError(f"{what} is a {type(given).__name__}, not an array of real numbers")
+        what_kind = type(row.item() if row.ndim == 0 else given).__name__
+        raise UserError(f"{what} is a {what_kind}, not an array of real numbers")
     if width is not None and row.size != width:
         raise UserError(f"{what} has {row.size} numbers, expected {width}")
     return row.reshape(-1).astype(np.float32, copy=False)

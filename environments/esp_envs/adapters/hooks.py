@@ -159,6 +159,7 @@ class Copy:
         if (box := self._boxes[i]) is None:
             return self._starts[i] + int(action)
         low, high = box
+        action = np.nan_to_num(action)  # of a seed that is about to stop: its environment should not stop the others
         return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)
 
     def close(self) -> None:
@@ -182,9 +183,9 @@ def _require_round(task: CopyHooks, name: Any, box: tuple[Array, Array]) -> None
         bent = field.kind.is_vector and turns and not equal
         if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
             raise UserError(
-                f"{name} acts between {low[where].tolist()} and {high[where].tolist()} in '{field.name}', a "
-                f"{field.kind.name}, which '{task.symmetry}' does not leave alone; declare a smaller symmetry, or give "
-                "the environment bounds that are equal on all sides"
+                f"{name} acts by '{field.name}', a {field.kind.name}, between {low[where].tolist()} and "
+                f"{high[where].tolist()}, which '{task.symmetry}' does not leave alone; declare a smaller symmetry, or "
+                "give bounds that are equal on all sides"
             )
 
 
