@@ -1,7 +1,7 @@
 """Linear maps, one per seed, on rows of numbers: a matrix, or a signed permutation that costs one gather.
 
-All are orthogonal: `pull` undoes `push`. A stack of one map acts on any rows; results are new tensors, and gradients
-flow through.
+All are orthogonal: `pull` undoes `push`. A stack of one map acts on any rows; results are new tensors of the rows' own
+type, inside autocast too, and gradients flow through. An inf or NaN reaches only the numbers that it is mixed into.
 
 Shape:
     rows [S, B, width] to the same.
@@ -20,7 +20,7 @@ from esp_cli.symmetry.operators import Operator
 from esp_envs.errors import UserError
 
 _GATHERED_WIDTH = 128
-"""Numbers in a row from which a gather is faster than a matrix product, on a CPU."""
+"""Numbers in a row from which a gather is faster than a matrix product on a CPU; elsewhere it always is."""
 _LARGEST_MATRIX = 4096
 """Numbers in a row beyond which no matrix is built."""
 
@@ -42,11 +42,11 @@ class Dense:
 
     def push(self, rows: Tensor) -> Tensor:
         """Return M x."""
-        return torch.bmm(rows, self.matrix.to(rows.dtype).transpose(1, 2))
+        return _product(rows, self.matrix.transpose(1, 2))
 
     def pull(self, rows: Tensor) -> Tensor:
         """Return M^-1 x."""
-        return torch.bmm(rows, self.matrix.to(rows.dtype))
+        return _product(rows, self.matrix)
 
     @property
     def is_identity(self) -> bool:
@@ -61,6 +61,21 @@ class Dense:
     def apply(self, function: Callable[[Tensor], Tensor]) -> Dense:
         """Return the map whose tensors went through a function, which selects some of the stack or moves all."""
         return Dense(function(self.matrix))
+
+
+def _product(rows: Tensor, matrix: Tensor) -> Tensor:
+    """Return rows [S, B, width] times matrices, where 0 times inf or NaN is 0, in the type of the rows."""
+    with torch.autocast(rows.device.type, enabled=False):
+        matrix = matrix.to(rows.dtype)
+        if rows.is_cpu and not torch.compiler.is_compiling():  # a GPU would be waited for
+            product = torch.bmm(rows, matrix)
+            if product.detach().sum().isfinite():
+                return product
+        product = torch.bmm(rows.where(rows.isfinite(), 0.0), matrix)
+        high, low = (~(rows < torch.inf)).to(matrix), (~(rows > -torch.inf)).to(matrix)  # NaN, as inf - inf, is both
+        plus, minus = matrix.clamp_min(0.0), (-matrix).clamp_min(0.0)
+        above, below = high @ plus + low @ minus, high @ minus + low @ plus
+        return product + above.masked_fill(above > 0, torch.inf) - below.masked_fill(below > 0, torch.inf)
 
 
 @dataclass(frozen=True)
@@ -112,12 +127,12 @@ Map = Dense | Gather
 
 
 def map_of(operator: Operator, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Map:
-    """Return what computes an operator: a gather where one is possible and faster, else a matrix product.
+    """Return what computes an operator: a gather where one is possible, and faster on a CPU, else a matrix product.
 
     Raises:
         UserError: it is no signed permutation, and its matrix would be too large.
     """
-    if operator.terms == 1 and operator.width >= _GATHERED_WIDTH:
+    if operator.terms == 1 and (operator.width >= _GATHERED_WIDTH or torch.device(device).type != "cpu"):
         return gather_of(operator, device)
     if operator.width > _LARGEST_MATRIX:
         raise UserError(
