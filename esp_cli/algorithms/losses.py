@@ -85,7 +85,7 @@ def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = 
     if valid is not None:
         centred = _centred(x, valid)
         deviation = mean_per_seed(centred.square(), valid).sqrt()
-        return centred / (_beside(deviation, x) + epsilon)
+        return centred / (beside(deviation, x) + epsilon)
     axes = tuple(range(1, x.dim()))
     deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)
     return (x - mean) / (deviation + epsilon)
@@ -93,10 +93,10 @@ def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = 
 
 def _centred(x: Tensor, valid: Tensor) -> Tensor:
     """Return x less the mean of each seed over what counts; 0 where nothing counts."""
-    return torch.where(valid, x - _beside(mean_per_seed(x, valid), x), 0.0)
+    return torch.where(valid, x - beside(mean_per_seed(x, valid), x), 0.0)
 
 
-def _beside(per_seed: Tensor, x: Tensor) -> Tensor:
+def beside(per_seed: Tensor, x: Tensor) -> Tensor:
     """Return numbers per seed [S] shaped to stand beside x [S, ...]."""
     return per_seed.view(-1, *[1] * (x.dim() - 1))
 

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
+from esp_cli.algorithms.losses import beside
 from esp_cli.prior import mean_per_seed
+
+_SMALLEST = 1e-6
+"""The least standard deviation: of rewards that are all 0, say."""
+_RESOLUTION = 1e-7
+"""The least standard deviation in means."""
 
 
 class ValueNormaliser(nn.Module):
     """Keeps value targets near mean 0, variance 1 per seed, so that one learning rate fits every reward scale.
 
     An exponential moving average with bias correction (as for Adam's moments), after the MAPPO paper's code, which
-    uses decay 0.99999 per update: nearly an average over all of training.
+    uses decay 0.99999 per update: nearly an average over all of training. It moves mean and variance themselves, in
+    float64 (West, 1979): a variance as a difference of large squares is lost beside a large mean. A seed in which
+    nothing counts keeps its statistics.
 
     Shape:
         Every argument is [S, ...]; statistics are over all other axes.
@@ -22,37 +32,51 @@ class ValueNormaliser(nn.Module):
         super().__init__()
         self.decay = decay
         self.mean: Tensor
-        self.square: Tensor
+        self.variance: Tensor
         self.weight: Tensor
-        self.register_buffer("mean", torch.zeros(num_seeds))
-        self.register_buffer("square", torch.zeros(num_seeds))
-        self.register_buffer("weight", torch.zeros(num_seeds))
+        for name in ("mean", "variance", "weight"):
+            self.register_buffer(name, torch.zeros(num_seeds, dtype=torch.float64))
 
     def update(self, target: Tensor, valid: Tensor | None = None) -> None:
         """Take in a batch of targets, those alone that are `valid` (of the same shape) where that is given."""
-        mean, square = mean_per_seed(target, valid), mean_per_seed(target.square(), valid)
-        for buffer, value in ((self.mean, mean), (self.square, square)):
-            buffer.mul_(self.decay).add_(value, alpha=1 - self.decay)
-        self.weight.mul_(self.decay).add_(1 - self.decay)
-
-    def _statistics(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        weight = self.weight.clamp_min(1e-8)
-        mean = self.mean / weight
-        variance = torch.where(self.weight > 0, self.square / weight - mean.square(), 1.0)
-        shape = (-1, *[1] * (like.dim() - 1))
-        return mean.view(shape), variance.clamp_min(1e-4).sqrt().view(shape)
+        target = target.double()
+        mean = mean_per_seed(target, valid)
+        variance = mean_per_seed((target - beside(mean, target)).square(), valid)
+        counts = torch.ones_like(mean) if valid is None else valid.flatten(1).any(1).double()
+        share = (1 - self.decay) * counts
+        self.weight.mul_(self.decay).add_(share)
+        share, step = share / self.weight.clamp_min(1e-30), mean - self.mean
+        self.variance.add_(share * step.square()).mul_(1 - share).add_(share * variance)
+        self.mean.add_(share * step)
 
     def normalise(self, x: Tensor) -> Tensor:
         """Return (x - mean) / deviation."""
-        mean, deviation = self._statistics(x)
-        return (x - mean) / deviation
+        return ((x - beside(self.mean, x)) / self._deviation(x)).to(x.dtype)
 
     def scaled(self, x: Tensor) -> Tensor:
         """Return x / root mean square: a sum of such numbers ranks as the sum of x does, however many there are."""
-        square = torch.where(self.weight > 0, self.square / self.weight.clamp_min(1e-8), 1.0)
-        return x / square.clamp_min(1e-4).sqrt().view(-1, *[1] * (x.dim() - 1))
+        return (x / torch.hypot(beside(self.mean, x), self._deviation(x))).to(x.dtype)
 
     def denormalise(self, x: Tensor) -> Tensor:
         """Return x * deviation + mean."""
-        mean, deviation = self._statistics(x)
-        return x * deviation + mean
+        return (x * self._deviation(x) + beside(self.mean, x)).to(x.dtype)
+
+    def _deviation(self, like: Tensor) -> Tensor:
+        """Return the standard deviation; of numbers that are all alike, what float32 can tell apart."""
+        deviation = torch.where(self.weight > 0, self.variance.sqrt(), 1.0)
+        return beside(deviation.maximum(_RESOLUTION * self.mean.abs()).clamp_min(_SMALLEST), like)
+
+
+def with_variances(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the state of a learner with means and variances, where 0.1 kept decayed sums of means and mean squares."""
+    out = dict(tensors)
+    for name in ("normaliser", "reward_scale"):
+        kept = [out[key] for part in ("mean", "square", "weight") if (key := f"{name}.{part}") in out]
+        if len(kept) < 3 or len({x.shape for x in kept}) > 1:
+            continue
+        mean, square, weight = (x.double() for x in kept)
+        mean, square = mean / weight.clamp_min(1e-8), square / weight.clamp_min(1e-8)
+        del out[f"{name}.square"]
+        variance = (square - mean.square()).clamp_min(0.0)
+        out |= {f"{name}.mean": mean, f"{name}.variance": variance, f"{name}.weight": weight}
+    return out

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from esp_cli.algorithms.normalisation import with_variances
 from esp_cli.training.build import build_environment, build_learner, first_look
 from esp_cli.training.checkpoint import same
 from esp_cli.training.config import RunConfig
@@ -274,7 +275,7 @@ class Trainer:
 
     def _load(self, tensors: dict[str, Tensor]) -> None:
         """Load the state of the learner; refuse a checkpoint whose names, shapes or types are not the learner's."""
-        before = self.learner.state_dict()
+        before, tensors = self.learner.state_dict(), with_variances(tensors)
         self.learner.load_state_dict(tensors)
         now, needed = self.learner.state_dict(), self.learner.state_dict(complete=True)
         names = {*tensors, *needed}

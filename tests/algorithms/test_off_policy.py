@@ -295,7 +295,8 @@ def test_the_reward_statistics_forget_by_the_episode(algorithm):
     for worlds, kept in ((4, 0.99600), (8, 0.99203)):
         trained = learner(algorithm, algo__num_envs=worlds, algo__replay_episodes=20)
         trained.reward_scale.mean.fill_(1.0)
+        trained.reward_scale.weight.fill_(1.0)
         episodes, _ = trained.collector.collect()
         episodes.reward.zero_()
         trained._store(episodes)
-        torch.testing.assert_close(trained.reward_scale.mean, torch.full((2,), kept), atol=1e-5, rtol=0)
+        torch.testing.assert_close(trained.reward_scale.mean, torch.full((2,), kept).double(), atol=1e-5, rtol=0)
