@@ -147,7 +147,10 @@ class Symmetry:
         return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
 
     def augment_tensordict(self, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
-        """Return a TensorDict [B, ...] with its copies behind it, along the first axis.
+        """Return a TensorDict [B, ...] with its copies behind it, along the first axis that is not named "time".
+
+        Where all axes are time, as of a collector of one environment, copies have a new first axis: [1 + copies, T]. So
+        nothing that reads along time (advantages, returns of n steps) goes from one copy to the next.
 
         Keys are known by their last part: observation, state, action. Others hold numbers that go with their agents, or
         one for each row. What networks said (logits, loc, scale) and "info" are left out.
@@ -159,7 +162,9 @@ class Symmetry:
         Raises:
             UserError: the numbers under a key do not fit, or have no role.
         """
-        return torch.cat(with_copies(self.spaces, data, self.transforms, roles)[0], 0)
+        parts, _ = with_copies(self.spaces, data, self.transforms, roles)
+        axes = [axis for axis, name in enumerate(data.names) if name != "time"]
+        return torch.cat(parts, axes[0]) if axes else torch.stack(parts)
 
     def policy_loss(
         self,

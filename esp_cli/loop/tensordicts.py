@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import count
 from typing import Any, Literal
 
 import torch
@@ -13,8 +14,10 @@ from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
-Role = Literal["observation", "state", "action", "same", "drop"]
-"""What the numbers under a key are: rows of a layout, actions (or one number per action), unchanged, left out."""
+Role = Literal["observation", "state", "action", "trajectory", "same", "drop"]
+"""What the numbers under a key are: rows of a layout, actions (or one number per action), ids of trajectories, of which
+each copy has its own, unchanged, left out."""
+_COPY_NUMBERS = count(1)
 Key = str | tuple[str, ...]
 
 ROLES: Mapping[str, Role] = {
@@ -29,6 +32,7 @@ ROLES: Mapping[str, Role] = {
     "scale": "drop",
     "info": "drop",
     "index": "same",
+    "traj_ids": "trajectory",
 }
 """The role of a key by its last part; "drop" applies to whatever lies below it too.
 
@@ -63,9 +67,14 @@ def with_copies(
         raise UserError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
     transforms, copies = choose(seen[0]), []
     for transform in transforms:
-        copy = data.clone(False)
+        copy, first_id = data.clone(False), -(next(_COPY_NUMBERS) << 32)
         for path, value in kept.items():
-            copy.set(path, _moved(spaces, transform, value, named.get(path[-1]), data.batch_size, ".".join(path)))
+            role = named.get(path[-1])
+            if role == "trajectory":
+                moved = value + first_id  # below 0, where no trajectory of a collector is
+            else:
+                moved = _moved(spaces, transform, value, role, data.batch_size, ".".join(path))
+            copy.set(path, moved)
         copies.append(copy)
     return [data, *copies], transforms
 

@@ -26,6 +26,8 @@ from esp_envs.errors import UserError
 class SymmetricCopies(TorchRLTransform):
     """Adds transformed copies to what a replay buffer samples, or a collector delivers (as its `postproc`).
 
+    A collector of one environment delivers time alone, [T]; with copies it is [1 + copies, T], for `GAE` as it is, for
+    a replay buffer as `data.reshape(-1)`. In a batch of your own, name the axis that is time: `names=["time"]`.
     `TensorDictReplayBuffer` refuses samples that grow; take `ReplayBuffer`, or extend with `augment_tensordict`.
 
     Args:
@@ -38,7 +40,7 @@ class SymmetricCopies(TorchRLTransform):
         self.symmetry, self.roles = symmetry, roles
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the data with its copies behind it, along the first axis."""
+        """Return the data with its copies behind it; see `Symmetry.augment_tensordict`."""
         return self.symmetry.augment_tensordict(tensordict, self.roles)
 
 
@@ -124,10 +126,16 @@ class SymmetricLoss(nn.Module):
         return losses
 
     def _needed(self, data: TensorDictBase) -> TensorDictBase:
-        """Return what the loss reads: with advantages at hand, PPO needs nothing of the next step."""
+        """Return what the loss reads: with advantages at hand, PPO needs nothing of the next step.
+
+        Missing advantages are those of the originals (Prop. 1), estimated before there are copies along the batch.
+        """
         keys = self.loss.tensor_keys
-        if self.mixes or keys.advantage not in data.keys(True):
+        if self.mixes:
             return data
+        if keys.advantage not in data.keys(True):
+            data, params = data.clone(False), self.loss._cached_critic_network_params_detached
+            self.loss.value_estimator(data, params=params, target_params=self.loss.target_critic_network_params)
         read = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
         read += [keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value]
         return data.select(*read, strict=False)
