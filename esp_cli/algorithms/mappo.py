@@ -15,7 +15,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner
-from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed
+from esp_cli.algorithms.losses import beside, explained_variance, gae, normalise_per_seed
 from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_loss
@@ -131,6 +131,9 @@ class Mappo(Learner):
         """Value every state, estimate advantages, and shape the rollout into sequences."""
         config = self.config
         reward = rollout.reward.mean(-1, keepdim=True) if self.num_values == 1 else rollout.reward
+        steps = 1 / max(1 - config.gamma * config.gae_lambda, 1 / self.spec.horizon)
+        self.normaliser.begin(reward, steps, centres=not (self.spec.terminates or self.spec.agents_end))
+        reward = (reward - beside(self.normaliser.offset, reward)).to(reward.dtype)
         with torch.no_grad():
             episode = self.spec.horizon if self.recurrent else None
             raw_value, raw_next = values_along(self.critic, rollout, episode, self.spec.terminates)

@@ -14,6 +14,12 @@ _SMALLEST = 1e-6
 """The least standard deviation: of rewards that are all 0, say."""
 _RESOLUTION = 1e-7
 """The least standard deviation in means."""
+_FAR = 8.0
+"""Deviations that the mean of rewards may be away from 0: more than in any built-in task (4 to 6 in navigation)."""
+_SHARE = 0.01
+"""Of small sums of rewards: the deviation of values before any is learned."""
+_UNKNOWN = {"mean": 0.0, "variance": 1.0, "weight": 0.0, "offset": 0.0}
+"""Statistics before the first update."""
 
 
 class ValueNormaliser(nn.Module):
@@ -23,6 +29,9 @@ class ValueNormaliser(nn.Module):
     uses decay 0.99999 per update: nearly an average over all of training. It moves mean and variance themselves, in
     float64 (West, 1979): a variance as a difference of large squares is lost beside a large mean. A seed in which
     nothing counts keeps its statistics.
+
+    Attributes:
+        offset: [S] what a learner takes off its rewards; 0 until `begin` fixes another.
 
     Shape:
         Every argument is [S, ...]; statistics are over all other axes.
@@ -34,8 +43,27 @@ class ValueNormaliser(nn.Module):
         self.mean: Tensor
         self.variance: Tensor
         self.weight: Tensor
-        for name in ("mean", "variance", "weight"):
-            self.register_buffer(name, torch.zeros(num_seeds, dtype=torch.float64))
+        self.offset: Tensor
+        for name, value in _UNKNOWN.items():
+            self.register_buffer(name, torch.full((num_seeds,), value, dtype=torch.float64))
+
+    def begin(self, reward: Tensor, steps: float, centres: bool) -> None:
+        """Before the first update, fix from the first rewards what statistics cannot tell yet; later do nothing.
+
+        Values before any is learned are what the critic outputs, or a hundredth of the sums of rewards, if these are
+        smaller than 1.
+
+        Args:
+            reward: the first ones.
+            steps: over which a target adds up rewards.
+            centres: whether a mean that is many deviations away from 0 becomes the `offset`.
+        """
+        deviation, mean = torch.std_mean(reward.double().flatten(1), 1, correction=0)
+        first, offset = self.weight == 0, torch.where(mean.abs() > _FAR * deviation, mean, 0.0)
+        self.offset.copy_(torch.where(first & centres, offset, self.offset))
+        square = (deviation.square() + (mean - self.offset).square()) * steps**2
+        small = first & (square > 0) & (square < 1)
+        self.variance.copy_(torch.where(small, _SHARE**2 * square, self.variance))
 
     def update(self, target: Tensor, valid: Tensor | None = None) -> None:
         """Take in a batch of targets, those alone that are `valid` (of the same shape) where that is given."""
@@ -63,8 +91,7 @@ class ValueNormaliser(nn.Module):
 
     def _deviation(self, like: Tensor) -> Tensor:
         """Return the standard deviation; of numbers that are all alike, what float32 can tell apart."""
-        deviation = torch.where(self.weight > 0, self.variance.sqrt(), 1.0)
-        return beside(deviation.maximum(_RESOLUTION * self.mean.abs()).clamp_min(_SMALLEST), like)
+        return beside(self.variance.sqrt().maximum(_RESOLUTION * self.mean.abs()).clamp_min(_SMALLEST), like)
 
 
 def with_variances(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -77,6 +104,7 @@ def with_variances(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         mean, square, weight = (x.double() for x in kept)
         mean, square = mean / weight.clamp_min(1e-8), square / weight.clamp_min(1e-8)
         del out[f"{name}.square"]
-        variance = (square - mean.square()).clamp_min(0.0)
-        out |= {f"{name}.mean": mean, f"{name}.variance": variance, f"{name}.weight": weight}
+        variance = torch.where(weight > 0, (square - mean.square()).clamp_min(0.0), 1.0)
+        state = {"mean": mean, "variance": variance, "weight": weight, "offset": torch.zeros_like(mean)}
+        out |= {f"{name}.{part}": value for part, value in state.items()}
     return out
