@@ -81,7 +81,7 @@ def test_targets_of_replays_see_neither(algorithm, offset, scale):
         episodes, _ = trained.collector.collect()
         episodes.reward.mul_(scale).add_(offset)
         trained._store(episodes)
-        return trained._td_targets(episodes, episodes.reward, torch.zeros_like(episodes.reward))
+        return trained.td_targets(episodes, episodes.reward, torch.zeros_like(episodes.reward))
 
     plain = targets(0.0, 1.0)
     torch.testing.assert_close(targets(offset, scale), plain, atol=2e-2 if offset < 0 else 1e-3, rtol=0)

@@ -125,6 +125,7 @@ def test_a_run_whose_task_raised_goes_on_from_its_checkpoint(folder, monkeypatch
     """The task raises after 130 steps of all worlds; then, put right, it is trained to the end."""
     for name in ("CHECKPOINT_SECONDS", "CHECKPOINT_SPACING"):
         monkeypatch.setattr(f"esp_cli.training.trainer.{name}", 0.0)
+    monkeypatch.setattr("esp_cli.training.trainer.first_look", lambda config: [])  # it takes steps, too
     options = ["--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2", "--set", "evaluation.every_steps=100"]
     told = esp("train", "--task", "wrong:Raises", "--steps", 400, *options, "--out", "run", code=2).stderr
     assert "'lost'" in told.splitlines()[-1]
