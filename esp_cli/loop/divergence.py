@@ -59,7 +59,7 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
         check_alike("policy", [inner.loc], own.loc)
         if _commutes(transform, own.loc, here.transforms):
             return _normals_apart(transform, inner, own)
-        return _samples_apart(transform, there, here, samples)
+        return policy_consistency_loss(lambda p, q: _samples_apart(transform, p, q, samples), there, here)
     if isinstance(there, Tensor) != isinstance(here, Tensor):
         raise UserError(
             f"the policy says {type(there).__name__} of the moved data, but of the originals (here) there is "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,6 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli import Continuous, Field, Items, Kind, Symmetry, Transitions, discrete_moves, layout
+from esp_cli.networks.heads import Categorical
+from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
 from esp_envs import make
 
 SEEN = layout(Field("velocity", Kind.VECTOR), Field("load", Kind.SCALAR))
@@ -456,6 +459,23 @@ def test_a_task_is_checked_with_the_layout_that_is_given() -> None:
     assert outcomes(right, env) == {"holds"}
     other = discrete_moves(["stay", "left", "down", "right", "up"])
     assert "broken" in outcomes(Symmetry(observation=spec.observation, action=other, num_agents=3), env)
+
+
+@pytest.mark.parametrize("group", ["rot90", "agents-1-0", "flip-x*agents-1-0"])
+def test_the_loss_and_its_gradient_are_those_of_the_learners(group: str) -> None:
+    """S_pi of a learner's minibatch [S, B, T, N, D] and of the same rows in a loop of one's own."""
+    symmetry = Symmetry(observation=SEEN, action=MOVES, group=group, num_agents=2, copies="all")
+    weight, obs = nn.Parameter(random(3, 4)), random(1, 6, 2, 2, 3)
+    (by_loop,) = torch.autograd.grad(symmetry.policy_loss(lambda x: x @ weight, obs), [weight])
+    spaces = replace(symmetry.spaces, symmetry="d4*agents")
+    prior = SymmetryPrior(PriorConfig(transforms=group, consistency_coef=1.0), spaces)
+    copies = prior.copies(SeedBatch(obs, random(1, 6, 2, 6), torch.zeros(1, 6, 2, 2, dtype=torch.int64)), [])
+    head, outputs = Categorical(MOVES), copies.obs @ weight
+    loss = copies.penalty(policy=(head, outputs))
+    ((_, (by_learner,)),) = loss.gradients([weight])
+    torch.testing.assert_close(by_learner.view(3, 4), by_loop)
+    assert loss.value.item() == pytest.approx(symmetry.policy_loss(lambda x: x @ weight, obs).item(), rel=1e-5)
+    assert (loss.value.item() > 0.1) == (group != "agents-1-0"), "the control: one network keeps the order"
 
 
 def test_matrices_do_what_the_copies_do() -> None:
