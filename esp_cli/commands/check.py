@@ -32,8 +32,7 @@ EPILOG = """Examples:\n
     esp check symmetry rendezvous:Rendezvous --transforms d8*agents --json symmetry.json"""
 
 _SYMMETRY = "actions and layouts can carry the declared symmetry"
-_ROUNDING = 1e-4
-"""How far a step from a restored state may differ: physics may be finer than the float32 of states."""
+_ROUNDING = 1e-4  # how far a step from a restored state may differ: physics may be finer than the float32 of states
 
 
 def check(

@@ -16,11 +16,7 @@ _SEED_LIST = re.compile(r"\d+(\s*,\s*\d+)*\s*,?")
 
 
 def parse_count(value: str | int) -> int:
-    """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6.
-
-    Raises:
-        UserError: no number, not positive, not a whole number of steps, or more than `MAX_STEPS`.
-    """
+    """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6."""
     text = str(value).strip()
     match = _COUNT.fullmatch(text)
     if match is None:
@@ -34,11 +30,7 @@ def parse_count(value: str | int) -> int:
 
 
 def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
-    """Read how many seeds a run has: "10" means the ten seeds 0..9; a list, as 3,7, is taken too, with a note.
-
-    Raises:
-        UserError: not a number of seeds, or too many.
-    """
+    """Read how many seeds a run has: "10" means the ten seeds 0..9; a list, as 3,7, is taken too, with a note."""
     if not isinstance(value, str | int):
         return tuple(value)
     text = str(value).strip()
@@ -57,11 +49,7 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
 
 
 def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
-    """Read the seeds of a run by their numbers: "3,7" means the seeds 3 and 7, "7" the seed 7 alone.
-
-    Raises:
-        UserError: not a list of seeds, a seed twice or beyond `MAX_SEED`, or too many seeds.
-    """
+    """Read the seeds of a run by their numbers: "3,7" means the seeds 3 and 7, "7" the seed 7 alone."""
     text = str(value).strip() if isinstance(value, str) else ",".join(map(str, value))
     if not _SEED_LIST.fullmatch(text):
         raise UserError(f"'{text}' is not a list of seeds; write their numbers, as 3,7")
@@ -78,11 +66,7 @@ def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
 def chosen_seeds(
     counted: tuple[int, ...] | None, named: tuple[int, ...] | None, default: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Return the seeds that `--seeds` and `--seed-list` ask for.
-
-    Raises:
-        UserError: both are given.
-    """
+    """Return the seeds that `--seeds` and `--seed-list` ask for."""
     if named is not None and counted is not None:
         raise UserError("--seeds and --seed-list both say which seeds to train; leave one of them out")
     return counted or named or default

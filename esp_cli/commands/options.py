@@ -27,9 +27,6 @@ def parse_assignments(items: Iterable[str]) -> dict[str, object]:
     """Read settings written as "name=value"; a value that is not JSON is text.
 
     "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; "prey=random" -> {"prey": "random"}.
-
-    Raises:
-        UserError: an item without "=" or without a name, or a name twice.
     """
     from esp_cli.files.documents import parse_value  # pydantic comes with it, which no help needs
 
@@ -62,9 +59,6 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
     """Read settings of the task alone, written as "task.name=value", and the shorthand `--physics`.
 
     ["task.sensor_noise_m=0.005"], "pymunk" -> {"sensor_noise_m": 0.005, "physics": "pymunk"}; a setting goes before it.
-
-    Raises:
-        UserError: as `parse_assignments`, or a setting that is not the task's.
     """
     settings = parse_assignments(items)
     for name in settings:
@@ -75,11 +69,7 @@ def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dic
 
 
 def check_finite(option: str, *values: float) -> None:
-    """Refuse numbers of an option that are not finite, which typer lets through.
-
-    Raises:
-        UserError: one of them is NaN or infinite.
-    """
+    """Refuse numbers of an option that are not finite, which typer lets through."""
     for value in values:
         if not math.isfinite(value):
             raise UserError(f"{option} {value} is not a finite number; write for example {option} -125")
@@ -98,11 +88,7 @@ def installed_tasks() -> list[str]:
 def register_named(
     tasks: Iterable[object] | None, algorithms: Iterable[object] | None = None, networks: Iterable[object] | None = None
 ) -> None:
-    """Admit what this command line names as module:Class; a name of any other form needs nothing.
-
-    Raises:
-        UserError: a module cannot be imported, or holds no such class.
-    """
+    """Admit what this command line names as module:Class; a name of any other form needs nothing."""
     from esp_envs.installed import load
 
     homes = {
@@ -142,9 +128,6 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     """Return the path of an option that writes a table or results, unless it is what a run or a study needs.
 
     Only `esp eval` may write the final evaluation of a run.
-
-    Raises:
-        UserError: the path is that of a document or weights in the folder of a run, a study or a tuning.
     """
     from esp_cli.training import folder_names as of
 

@@ -35,11 +35,7 @@ EPILOG = """Examples:\n
 
 
 def parse_speed(value: str | float) -> float:
-    """Read a speed: 4, 0.5 or 4x.
-
-    Raises:
-        typer.BadParameter: no number, or not between 0.01 and 100.
-    """
+    """Read a speed: 4, 0.5 or 4x."""
     try:
         speed = float(str(value).strip().lower().removesuffix("x"))
     except ValueError:

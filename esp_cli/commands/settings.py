@@ -40,11 +40,7 @@ def settings(
 
 
 def _sections(of: str | None) -> Sequence[Section]:
-    """Return the sections that a name asks for.
-
-    Raises:
-        UserError: there is nothing of that name.
-    """
+    """Return the sections that a name asks for."""
     from esp_cli.training.settings import own_section, sections, task_section
 
     if of is not None and ":" in of:

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from esp_cli.studies.forecast import Forecast, SearchForecast
     from esp_cli.studies.tuning import Tuning
 
-BUSY = 0.5
-"""Load per core from which a forecast is called unreliable."""
+BUSY = 0.5  # load per core from which a forecast is called unreliable
 _MEBIBYTE = 2**20
 
 
@@ -32,9 +31,6 @@ def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
         kind: of `studies.kinds`.
         request: what the user asks for.
         choices: how it would be run.
-
-    Raises:
-        UserError: what the study itself would refuse before its first run.
     """
     from esp_cli.studies import forecast
     from esp_cli.studies.catalogue import plan, without_effect

@@ -124,11 +124,7 @@ def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tup
 
 
 def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, int], ...] | None:
-    """Read numbers of steps: ["500k", "formation=1M"] -> ((None, 500000), ("formation", 1000000)).
-
-    Raises:
-        UserError: no number of steps.
-    """
+    """Read numbers of steps: ["500k", "formation=1M"] -> ((None, 500000), ("formation", 1000000))."""
     found: list[tuple[str | None, int]] = []
     for item in parse_names(items) or ():
         task, equals, text = item.rpartition("=")
@@ -160,11 +156,7 @@ class StudyChoices:
 
     @property
     def all_seeds(self) -> tuple[int, ...]:
-        """The seeds of every run.
-
-        Raises:
-            UserError: they are both counted and listed.
-        """
+        """The seeds of every run."""
         return chosen_seeds(self.seeds, self.seed_list, STUDY_SEEDS)
 
     def folder(self, kind: str) -> Path:
@@ -181,11 +173,7 @@ class StudyChoices:
         return "".join(f" {word}" for word in map(shlex.quote, words))
 
     def device_of_runs(self) -> str:
-        """Return the device on which the runs train; that of a cluster need not be here.
-
-        Raises:
-            UserError: a GPU is asked for, and this machine, which is to use it, has none.
-        """
+        """Return the device on which the runs train; that of a cluster need not be here."""
         from esp_cli.machine import resolve_device
 
         return "cuda" if (self.engine, self.device) == ("ray", "cuda") else resolve_device(self.device)
@@ -196,9 +184,6 @@ class StudyChoices:
         Args:
             kind: of the study.
             words: the command without these options, such as "reproduce", "table1".
-
-        Raises:
-            UserError: a name, number or setting that cannot be read.
         """
         from esp_cli.studies.catalogue import Request
 

@@ -15,8 +15,7 @@ from esp_cli.files.formatting import format_rate
 if TYPE_CHECKING:
     from esp_cli.studies.scheduler import Run, Snapshot
 
-LINE_INTERVAL_S = 60.0
-"""Seconds between two plain lines where standard error is no terminal."""
+LINE_INTERVAL_S = 60.0  # seconds between two plain lines where standard error is no terminal
 _SAID = {"training": "training", "evaluating": "evaluating", "elsewhere": "waiting for", "finished": "finished"}
 
 

@@ -31,17 +31,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Resources:
-    """What a study is run with.
+    """What a study is run with."""
 
-    Attributes:
-        engine: starts its runs.
-        jobs: at once.
-        reused: studies whose finished runs are taken over.
-    """
-
-    engine: Engine
-    jobs: int
-    reused: Sequence[StudyFolder]
+    engine: Engine  # starts its runs
+    jobs: int  # at once
+    reused: Sequence[StudyFolder]  # studies whose finished runs are taken over
 
 
 @contextmanager
@@ -52,9 +46,6 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
         choices: how the study is run.
         out: its folder.
         device: of its runs.
-
-    Raises:
-        UserError: a study to reuse is missing, Ray is not installed, or its cluster cannot be used.
     """
     from esp_cli.studies.study import StudyFolder
 
@@ -93,9 +84,6 @@ def run_study(
         choices: how it is run.
         mode: which evaluations the tables state; by default those of this kind of study.
         thresholds: returns whose first passing the tables state, likewise.
-
-    Raises:
-        UserError: what cannot be planned; a folder that holds something else or is in use; runs that failed.
     """
     from esp_cli.studies.catalogue import plan, refuse_untrainable, without_effect
     from esp_cli.studies.study import StudyFolder
@@ -165,11 +153,7 @@ def stopped(command: str, choices: StudyChoices) -> typer.Exit:
 
 
 def refuse_failed(names: Sequence[str], out: Path) -> None:
-    """End the command where runs of the study in a folder failed.
-
-    Raises:
-        UserError: some did.
-    """
+    """End the command where runs of the study in a folder failed."""
     if not names:
         return
     with_log = {path.parent.name for path in out.rglob(LOG)}  # a run that no machine could take has none

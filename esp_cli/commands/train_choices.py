@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from esp_cli.policies.initial import Start
     from esp_cli.training.config import RunConfig
 
-_PARAMETERS = {"algorithm": "algo"}
-"""Names of parameters that differ from those in a file."""
+_PARAMETERS = {"algorithm": "algo"}  # names of parameters that differ from those in a file
 
 
 def plan_run(
@@ -35,9 +34,6 @@ def plan_run(
 
     Returns:
         The configuration, the weights that the run starts from, and the chosen settings that have no effect.
-
-    Raises:
-        UserError: what was asked for is unknown, out of range, or does not go together.
     """
     from esp_cli.machine import resolve_device
     from esp_cli.run import plan
@@ -56,20 +52,7 @@ def plan_run(
 def _with_file(
     context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
 ) -> tuple[dict[str, Any], dict[str, object], set[str]]:
-    """Let a file fill in what the command line leaves open.
-
-    Args:
-        context: of the command, which knows what was given.
-        path: of the file.
-        given: choices by their name in a file, defaults included.
-        settings: of the command line.
-
-    Returns:
-        The choices, the settings, and the names of settings that somebody chose: not those of a whole configuration.
-
-    Raises:
-        UserError: the file cannot be read, or does not go with what was given.
-    """
+    """Let a file fill in what the command line leaves open."""
     from esp_cli.prior.config import SAID_BY_AUTO
     from esp_cli.training.config_file import read_config_file
 
@@ -117,11 +100,7 @@ def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict
 
 
 def _start_of(path: Path, config: RunConfig, source: str) -> Start:
-    """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same.
-
-    Raises:
-        UserError: there is neither.
-    """
+    """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same."""
     from esp_cli.policies.initial import Start
 
     if path.is_dir() and (own := Start.find_copy(path, config)) is not None:

@@ -29,8 +29,7 @@ EPILOG = """Examples:\n
     esp tune --task mine:Task --algo mappo --space space.toml --for steps --reach -120\n
     esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
 
-FIRST_TRIAL_SEED = 1000
-"""Seed of the first trial; the best settings are evaluated on other seeds."""
+FIRST_TRIAL_SEED = 1000  # seed of the first trial; the best settings are evaluated on other seeds
 
 
 @study_command(
@@ -87,11 +86,7 @@ def _tuning(
     reach: float | None,
     trial_seeds: int,
 ) -> Tuning:
-    """Return what is asked for.
-
-    Raises:
-        UserError: it is not about one task and one algorithm, or a name, a value or the space does not fit.
-    """
+    """Return what is asked for."""
     from esp_cli.algorithms.registry import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
@@ -129,11 +124,7 @@ def _tuning(
 
 
 def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    """Search, then judge the best settings; report both.
-
-    Raises:
-        UserError: the folder holds something else or is in use, Optuna is not installed, or runs failed.
-    """
+    """Search, then judge the best settings; report both."""
     try:
         from esp_cli.studies.search import Search
     except ImportError:

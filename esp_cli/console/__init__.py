@@ -35,8 +35,7 @@ from esp_cli.files.formatting import format_mean as format_mean  # also console'
 from esp_cli.files.formatting import format_span as format_span  # also console's
 from esp_cli.files.writing import write_file
 
-PIPE_WIDTH = 200
-"""Columns of a table written to a file or a pipe, which has no width of its own."""
+PIPE_WIDTH = 200  # columns of a table written to a file or a pipe, which has no width of its own
 
 
 def table(

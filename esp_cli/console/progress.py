@@ -13,10 +13,8 @@ from rich.text import Text
 from esp_cli.console.streams import err, note
 from esp_cli.files.formatting import format_count, format_duration, format_rate
 
-LINE_INTERVAL_S = 10.0
-"""Seconds between two plain progress lines where standard error is no terminal."""
-RATE_WINDOW_S = 30.0
-"""Seconds over which the shown rate is averaged."""
+LINE_INTERVAL_S = 10.0  # seconds between two plain progress lines where standard error is no terminal
+RATE_WINDOW_S = 30.0  # seconds over which the shown rate is averaged
 _WIDEST_BAR = 40
 
 

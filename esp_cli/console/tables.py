@@ -11,8 +11,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-_LEAST_TEXT = 14
-"""Columns that a longer text gets at least; narrower ones are hard to read."""
+_LEAST_TEXT = 14  # columns that a longer text gets at least; narrower ones are hard to read
 
 
 @dataclass(frozen=True)

@@ -28,39 +28,27 @@ from esp_envs.scene import Painter
 View = Literal["auto", "top", "3d"]
 
 FILMS, PICTURE = (".gif", ".mp4"), ".png"
-FRAMES_PER_SECOND = 25
-"""Most frames per second of a film, unless more are asked for."""
-_SAMPLED_FRAMES = 8
-"""Frames that the palette of a GIF is made for."""
+FRAMES_PER_SECOND = 25  # most frames per second of a film, unless more are asked for
+_SAMPLED_FRAMES = 8  # frames that the palette of a GIF is made for
 
 
 @dataclass(frozen=True)
 class Request:
     """How a policy is drawn, and into what.
 
-    Attributes:
-        out: a .gif or .mp4 for a film, a .png for a picture of one episode.
-        seed: whose policy acts; by default the first.
-        episodes: of a film; by default as many as last about 8 s.
-        view: see `open_painter`.
-        size: of the longer side of a scene, pixels; caption, axes and legend come on top.
-        speed: times real time, 0.01 or more.
-        fps: most frames per second; by default 25.
-        greedy: whether the policy takes its most probable actions, or draws them.
-
     Raises:
         UserError: another ending, no such view, no episodes, no speed, or what a picture does not have.
         OSError: the file is a folder.
     """
 
-    out: Path
-    seed: int | None = None
-    episodes: int | None = None
-    view: View = "auto"
-    size: int = 480
-    speed: float = 1.0
-    fps: float | None = None
-    greedy: bool = True
+    out: Path  # a .gif or .mp4 for a film, a .png for a picture of one episode
+    seed: int | None = None  # whose policy acts; by default the first
+    episodes: int | None = None  # of a film; by default as many as last about 8 s
+    view: View = "auto"  # see `open_painter`
+    size: int = 480  # of the longer side of a scene, pixels; caption, axes and legend come on top
+    speed: float = 1.0  # times real time, 0.01 or more
+    fps: float | None = None  # most frames per second; by default 25
+    greedy: bool = True  # whether the policy takes its most probable actions, or draws them
 
     def __post_init__(self) -> None:
         if self.kind not in (*FILMS, PICTURE):
@@ -92,19 +80,12 @@ class Request:
 
 @dataclass(frozen=True)
 class Drawing:
-    """What was drawn.
+    """What was drawn."""
 
-    Attributes:
-        path: the file.
-        frames: of a film; of a picture, 1.
-        steps: of all episodes.
-        note: a sentence for the user about how it was drawn, or None.
-    """
-
-    path: Path
-    frames: int
-    steps: int
-    note: str | None
+    path: Path  # the file
+    frames: int  # of a film; of a picture, 1
+    steps: int  # of all episodes
+    note: str | None  # a sentence for the user about how it was drawn, or None
 
 
 def draw(
@@ -197,19 +178,12 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame to draw.
+    """One frame to draw."""
 
-    Attributes:
-        moments: what is side by side.
-        caption: what stands before the time.
-        time_s: since the episode began, s.
-        steps: how many it stays in view.
-    """
-
-    moments: tuple[Moment, ...]
-    caption: str
-    time_s: float
-    steps: int
+    moments: tuple[Moment, ...]  # what is side by side
+    caption: str  # what stands before the time
+    time_s: float  # since the episode began, s
+    steps: int  # how many it stays in view
 
     def draw(self, painter: Painter) -> Frame:
         """Draw the moments with caption, axes and legend."""

@@ -21,10 +21,8 @@ from esp_envs.drawing import GRID, trails
 from esp_envs.scene import Body, Scene
 
 _INCHES = 4.8
-_OPACITY = (0.15, 1.0)
-"""Opacity of a path at its beginning and at its end."""
-_PANELS, _COLUMNS = 6, 3
-"""Steps that a strip shows, and how many of them in a row."""
+_OPACITY = (0.15, 1.0)  # opacity of a path at its beginning and at its end
+_PANELS, _COLUMNS = 6, 3  # steps that a strip shows, and how many of them in a row
 _NUMBER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 _MARKERS = {"disc": "o", "ring": "o", "square": "s", "cross": "x"}
 

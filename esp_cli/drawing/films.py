@@ -23,11 +23,9 @@ from esp_cli.files.writing import write_file
 
 Frame = NDArray[np.uint8]
 
-GIF_FRAMES_PER_SECOND = 50
-"""Players slow down a GIF that is faster."""
+GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
 _GIF_TICK_S = 0.01
-_COLORS = 255
-"""Colours of a GIF; one more marks what has not changed since the frame before."""
+_COLORS = 255  # colours of a GIF; one more marks what has not changed since the frame before
 _EXACT_COLORS = 64
 
 

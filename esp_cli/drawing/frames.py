@@ -14,16 +14,13 @@ from esp_cli.drawing.recording import Moment
 from esp_envs.drawing import TopPainter
 from esp_envs.scene import Painter, Scene
 
-LEAST_WIDTH = 200
-"""Pixels; narrower pictures have no room for text."""
+LEAST_WIDTH = 200  # pixels; narrower pictures have no room for text
 _PAPER, _TEXT, _FAINT = "#ffffff", "#202020", "#606060"
-_FONT_SHARE, _LEAST_FONT = 1 / 37, 10
-"""Height of letters against the width of a picture, and the smallest, pixels."""
+_FONT_SHARE, _LEAST_FONT = 1 / 37, 10  # height of letters against the width of a picture, and the smallest, pixels
 _BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6
 """Height of a bar of text, height of the numbers below and width of those beside a picture, in letters."""
 _OVERSAMPLING = 3
-_GAP = 8
-"""Pixels between two pictures."""
+_GAP = 8  # pixels between two pictures
 
 
 @dataclass(frozen=True)

@@ -15,27 +15,18 @@ from esp_envs.base import Environment, put_back
 from esp_envs.errors import UserError
 from esp_envs.scene import Scene
 
-FILM_SECONDS = 8.0
-"""Short episodes follow each other until a film lasts about this long."""
-HOLD_SECONDS = 0.6
-"""For which a film shows how an episode ended."""
-_MARGIN = 0.02
-"""Share of a window by which bodies may leave it before it grows."""
+FILM_SECONDS = 8.0  # short episodes follow each other until a film lasts about this long
+HOLD_SECONDS = 0.6  # for which a film shows how an episode ended
+_MARGIN = 0.02  # share of a window by which bodies may leave it before it grows
 
 
 @dataclass(frozen=True)
 class Moment:
-    """One world at one time: a scene after those that its trails come from.
+    """One world at one time: a scene after those that its trails come from."""
 
-    Attributes:
-        scenes: of the episode until now.
-        total: return until now.
-        name: of the policy where two are compared, else None.
-    """
-
-    scenes: Sequence[Scene]
-    total: float
-    name: str | None = None
+    scenes: Sequence[Scene]  # of the episode until now
+    total: float  # return until now
+    name: str | None = None  # of the policy where two are compared, else None
 
     @property
     def scene(self) -> Scene:
@@ -45,15 +36,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode to draw.
+    """An episode to draw."""
 
-    Attributes:
-        scenes: its start and every step, up to the one that ends it.
-        returns: mean return of the agents until each scene.
-    """
-
-    scenes: Sequence[Scene]
-    returns: Sequence[float]
+    scenes: Sequence[Scene]  # its start and every step, up to the one that ends it
+    returns: Sequence[float]  # mean return of the agents until each scene
 
     @property
     def steps(self) -> int:

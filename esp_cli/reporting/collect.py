@@ -27,41 +27,27 @@ from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import NoMetricError, read_metrics
 from esp_envs.errors import UserError
 
-_DIGITS = 4
-"""Decimals that are kept of a return; the bootstrap and the tables need two."""
+_DIGITS = 4  # decimals that are kept of a return; the bootstrap and the tables need two
 
 
 @dataclass(frozen=True)
 class Material:
-    """All that a report is made from.
+    """All that a report is made from."""
 
-    Attributes:
-        study: what was planned.
-        results: what came out, with its statistics.
-        curves: by name of the cell, those that have begun.
-        runs: run folders by name of the cell.
-    """
-
-    study: Study
-    results: Results
-    curves: Mapping[str, RunCurve]
-    runs: Mapping[str, Path]
+    study: Study  # what was planned
+    results: Results  # what came out, with its statistics
+    curves: Mapping[str, RunCurve]  # by name of the cell, those that have begun
+    runs: Mapping[str, Path]  # run folders by name of the cell
 
 
 @dataclass(frozen=True)
 class RunState:
-    """Where the run of a cell stands.
+    """Where the run of a cell stands."""
 
-    Attributes:
-        step: environment steps per seed.
-        curve: its evaluations, if there are any yet.
-        final: the final evaluation of its policy, if there is one.
-        at: step at which a run put together with others by hand is compared; None for its final evaluation.
-    """
-
-    step: int
-    curve: RunCurve | None = None
-    final: FinalEvaluation | None = None
+    step: int  # environment steps per seed
+    curve: RunCurve | None = None  # its evaluations, if there are any yet
+    final: FinalEvaluation | None = None  # the final evaluation of its policy, if there is one
+    # step at which a run put together with others by hand is compared; None for its final evaluation
     at: int | None = None
 
 

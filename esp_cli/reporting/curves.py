@@ -24,26 +24,16 @@ from esp_envs.spec import TaskSpec
 
 @dataclass(frozen=True)
 class RunCurve:
-    """The evaluations of one run.
+    """The evaluations of one run."""
 
-    Attributes:
-        label: its name in tables and pictures.
-        config: what was run.
-        steps: [K] environment steps per seed.
-        values: [K, S] returns; NaN where a seed stopped.
-        seconds: training time so far.
-        path: the run folder.
-        trained: environment steps per seed so far, where they are more than those of the last evaluation.
-        task_version: of the task that it was trained on; None where it is not known, which is that of today.
-    """
-
-    label: str
-    config: RunConfig
-    steps: NDArray[np.int64]
-    values: NDArray[np.float64]
-    seconds: float
-    path: Path
-    trained: int = 0
+    label: str  # its name in tables and pictures
+    config: RunConfig  # what was run
+    steps: NDArray[np.int64]  # [K] environment steps per seed
+    values: NDArray[np.float64]  # [K, S] returns; NaN where a seed stopped
+    seconds: float  # training time so far
+    path: Path  # the run folder
+    trained: int = 0  # environment steps per seed so far, where they are more than those of the last evaluation
+    # of the task that it was trained on; None where it is not known, which is that of today
     task_version: int | None = None
 
     @cached_property

@@ -26,10 +26,8 @@ from esp_cli.training.run_folder import RunFolder
 from esp_envs.registry import task_class
 
 _KEYS = ("run", "seed", "step")
-SeedRun = dict[str, dict[str, int | list[float]]]
-"""Step, or "absolute_metrics" -> metric -> numbers."""
-MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]
-"""Environment -> task -> algorithm -> seed."""
+SeedRun = dict[str, dict[str, int | list[float]]]  # step, or "absolute_metrics" -> metric -> numbers
+MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment -> task -> algorithm -> seed
 
 
 def write_csv(path: Path, material: Material) -> int:

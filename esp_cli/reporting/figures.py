@@ -49,27 +49,18 @@ _STYLE: dict[Any, Any] = {
     # identifiers in SVG files are drawn at random unless salted
     "svg.hashsalt": "esp",
 }
-_JITTER = 0.08
-"""Horizontal distance of the lines of `over_setting`, so that intervals do not lie upon each other."""
-_WIDEST = 0.4
-"""All lines together, at one value."""
-POINTS_PER_INCH = 72
-"""Of an SVG by matplotlib."""
+_JITTER = 0.08  # horizontal distance of the lines of `over_setting`, so that intervals do not lie upon each other
+_WIDEST = 0.4  # all lines together, at one value
+POINTS_PER_INCH = 72  # of an SVG by matplotlib
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that was written.
+    """A figure that was written."""
 
-    Attributes:
-        png: its file as PNG.
-        svg: its file as SVG.
-        size: width and height of the SVG, points.
-    """
-
-    png: Path
-    svg: Path
-    size: tuple[float, float]
+    png: Path  # its file as PNG
+    svg: Path  # its file as SVG
+    size: tuple[float, float]  # width and height of the SVG, points
 
 
 def dots(

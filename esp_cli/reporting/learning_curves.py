@@ -19,62 +19,41 @@ from esp_cli.policies.statistics import Floats
 from esp_cli.reporting.figures import POINTS_PER_INCH, Picture, appearance, caption, written_figure
 from esp_envs.errors import UserError
 
-_ONE_PANEL, _PANEL = (7.2, 4.2), (4.0, 3.2)
-"""Width and height of a panel, inches."""
+_ONE_PANEL, _PANEL = (7.2, 4.2), (4.0, 3.2)  # width and height of a panel, inches
 _LEGEND_INCHES = 0.8
 _MAX_COLUMNS = 3
-_LABEL_CHARACTERS = 44
-"""Of one line beside the vertical axis."""
-_BELOW_RANDOM = 0.15
-"""How far below the random policy a panel of curves goes, as a share of what is above it."""
-_NAME_HEIGHT = 0.05
-"""Height of a level's name as a share of a panel."""
-_MAX_HOVERED = 200
-"""Evaluations of a curve whose values a page shows; those of longer curves are thinned out."""
+_LABEL_CHARACTERS = 44  # of one line beside the vertical axis
+_BELOW_RANDOM = 0.15  # how far below the random policy a panel of curves goes, as a share of what is above it
+_NAME_HEIGHT = 0.05  # height of a level's name as a share of a panel
+_MAX_HOVERED = 200  # evaluations of a curve whose values a page shows; those of longer curves are thinned out
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One learning curve.
+    """One learning curve."""
 
-    Attributes:
-        label: its name in the legend.
-        steps: env steps per seed [K].
-        values: [K, S].
-    """
-
-    label: str
-    steps: ArrayLike
-    values: ArrayLike
+    label: str  # its name in the legend
+    steps: ArrayLike  # env steps per seed [K]
+    values: ArrayLike  # [K, S]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes of learning curves.
+    """One pair of axes of learning curves."""
 
-    Attributes:
-        title: heading, such as "navigation, 500k".
-        curves: in the order of their colours; the same label has the same colour in every panel.
-        anchors: dotted lines where they are in view: name -> value.
-        references: dashed lines that are always in view, as of a paper: name -> value.
-    """
-
-    title: str
-    curves: Sequence[Curve]
-    anchors: Mapping[str, float] = field(default_factory=dict)
+    title: str  # heading, such as "navigation, 500k"
+    curves: Sequence[Curve]  # in the order of their colours; the same label has the same colour in every panel
+    anchors: Mapping[str, float] = field(default_factory=dict)  # dotted lines where they are in view: name -> value
+    # dashed lines that are always in view, as of a paper: name -> value
     references: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Hover:
-    """What a page shows where the pointer is over a panel; lengths are points of the SVG from its upper left corner.
+    """What a page shows where the pointer is over a panel; lengths are points of the SVG from its upper left corner."""
 
-    Attributes:
-        box: left, top, right and bottom of the axes.
-        curves: label, colour, and [x, y, step, mean, low, high] of each evaluation.
-    """
-
-    box: tuple[float, float, float, float]
+    box: tuple[float, float, float, float]  # left, top, right and bottom of the axes
+    # label, colour, and [x, y, step, mean, low, high] of each evaluation
     curves: tuple[tuple[str, str, list[list[float]]], ...]
 
 

@@ -34,8 +34,7 @@ PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.
 CURVES = "curves"
 _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
-_FILM_SECONDS = 15.0
-"""A film is sped up to last no longer."""
+_FILM_SECONDS = 15.0  # A film is sped up to last no longer
 _MAX_FILM_BYTES = 2**26
 
 

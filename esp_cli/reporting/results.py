@@ -18,148 +18,98 @@ from esp_cli.policies.curve_statistics import Passing
 from esp_cli.policies.statistics import Estimate, SeedSummary
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
-Numbers = tuple[float | None, ...]
-"""One number per seed; None where the seed stopped."""
+Numbers = tuple[float | None, ...]  # one number per seed; None where the seed stopped
 Side = Literal["ahead", "behind", "level"]
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A run beside its reference.
+    """A run beside its reference."""
 
-    Attributes:
-        difference: of the means.
-        paired: whether both have the same seeds, which are compared one by one.
-        probability: of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds.
-        over_all_pairs: the same with every seed against every seed, as Agarwal et al. define it.
-        ahead: by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval.
-    """
-
-    difference: Estimate
-    paired: bool
+    difference: Estimate  # of the means
+    paired: bool  # whether both have the same seeds, which are compared one by one
+    # of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds
     probability: Estimate | None
-    over_all_pairs: Estimate | None
+    over_all_pairs: Estimate | None  # the same with every seed against every seed, as Agarwal et al. define it
+    # by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval
     ahead: Side | None
 
 
 @dataclass(frozen=True)
 class CellSummary:
-    """Statistics of one cell; None where its seeds do not allow one.
+    """Statistics of one cell; None where its seeds do not allow one."""
 
-    Attributes:
-        returns: over seeds.
-        iqm: interquartile mean.
-        normalised: 0 is the random policy, 1 the best of the task's heuristics.
-        area: mean height of the learning curve.
-        gap: to the cell's reference.
-        leader: "first" where our mean is higher than the paper's, "second" where the paper's is.
-    """
-
-    returns: SeedSummary
-    iqm: Estimate | None = None
-    normalised: SeedSummary | None = None
-    area: SeedSummary | None = None
-    gap: Gap | None = None
+    returns: SeedSummary  # over seeds
+    iqm: Estimate | None = None  # interquartile mean
+    normalised: SeedSummary | None = None  # 0 is the random policy, 1 the best of the task's heuristics
+    area: SeedSummary | None = None  # mean height of the learning curve
+    gap: Gap | None = None  # to the cell's reference
+    # "first" where our mean is higher than the paper's, "second" where the paper's is
     leader: Literal["first", "second", "neither"] | None = None
 
 
 @dataclass(frozen=True)
 class Aggregate:
-    """Numbers of one variant over all panels, of normalised returns.
+    """Numbers of one variant over all panels, of normalised returns."""
 
-    Attributes:
-        iqm: interquartile mean.
-        mean: of all seeds of all panels.
-        improvement: mean probability of improvement over the panel's reference, where every panel has one.
-    """
-
-    iqm: Estimate
-    mean: Estimate
+    iqm: Estimate  # interquartile mean
+    mean: Estimate  # of all seeds of all panels
+    # mean probability of improvement over the panel's reference, where every panel has one
     improvement: Estimate | None
 
 
 class CellResult(BaseModel):
-    """What came out of one run of a study; fields at their default are left out of the document.
-
-    Attributes:
-        name: of the cell, as are panel and variant.
-        reference: name of the cell that it is compared with; None for such a cell itself.
-        paper: mean and standard error of the paper; the latter is None where it was read off a figure.
-        status: "unfinished" also says that a run put together by hand did not reach the step in question.
-        step: environment steps per seed at which the run stands.
-        at: step at which runs put together by hand are compared; None for the final evaluation.
-        steps: that the run is to take.
-        seeds: of the run.
-        config: settings by dotted name, those that not all cells share.
-        seconds: of training.
-        esp_version: of the program that evaluated.
-        episodes: per seed, where they are not those of all cells.
-        returns: by mode, of the final evaluation, or of the evaluation at `at`.
-        anchors: mean returns of the reference policies.
-        metrics: the task's measures of the greedy policy.
-        evaluations: on the way.
-        early: returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry.
-        area_under_curve: mean height of the learning curve, by seed.
-        steps_to: first steps at thresholds.
-        parameters: weights by network, of one seed.
-        flops_per_action: of the policy.
-        summary: statistics of these numbers; None before `summary.summarised`, or where there are no returns yet.
-    """
+    """What came out of one run of a study; fields at their default are left out of the document."""
 
     model_config = ConfigDict(frozen=True)
 
-    name: str
+    name: str  # of the cell, as are panel and variant
     panel: str
     variant: str
-    reference: str | None
+    reference: str | None  # name of the cell that it is compared with; None for such a cell itself
+    # mean and standard error of the paper; the latter is None where it was read off a figure
     paper: tuple[float, float | None] | None
+    # "unfinished" also says that a run put together by hand did not reach the step in question
     status: Literal["finished", "unfinished", "not run"]
-    step: int
-    at: int | None = None
-    steps: int
-    seeds: tuple[int, ...]
-    config: dict[str, JsonValue]
-    seconds: float | None = None
-    esp_version: str | None = None
+    step: int  # environment steps per seed at which the run stands
+    at: int | None = None  # step at which runs put together by hand are compared; None for the final evaluation
+    steps: int  # that the run is to take
+    seeds: tuple[int, ...]  # of the run
+    config: dict[str, JsonValue]  # settings by dotted name, those that not all cells share
+    seconds: float | None = None  # of training
+    esp_version: str | None = None  # of the program that evaluated
     task_version: int | None = None
     convention: str | None = None
-    episodes: int | None = None
-    returns: dict[Mode, Numbers] = {}
-    anchors: dict[str, float] = {}
-    metrics: dict[str, float | None] = {}
-    evaluations: int | None = None
+    episodes: int | None = None  # per seed, where they are not those of all cells
+    returns: dict[Mode, Numbers] = {}  # by mode, of the final evaluation, or of the evaluation at `at`
+    anchors: dict[str, float] = {}  # mean returns of the reference policies
+    metrics: dict[str, float | None] = {}  # the task's measures of the greedy policy
+    evaluations: int | None = None  # on the way
+    # returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry
     early: Numbers | None = None
-    area_under_curve: Numbers | None = None
-    steps_to: tuple[Passing, ...] = ()
-    parameters: dict[str, int] = {}
-    flops_per_action: float | None = None
+    area_under_curve: Numbers | None = None  # mean height of the learning curve, by seed
+    steps_to: tuple[Passing, ...] = ()  # first steps at thresholds
+    parameters: dict[str, int] = {}  # weights by network, of one seed
+    flops_per_action: float | None = None  # of the policy
+    # statistics of these numbers; None before `summary.summarised`, or where there are no returns yet
     summary: CellSummary | None = None
 
 
 class Results(BaseModel):
-    """The results of a study, finished or not.
-
-    Attributes:
-        kind: of the study, as are title, command, rows and episodes.
-        esp_version: of the program that planned the study.
-        mode: which evaluations tables state.
-        config: settings by dotted name that all cells share.
-        cells: in the study's order.
-        aggregates: statistics over all panels by variant, where there are several panels.
-    """
+    """The results of a study, finished or not."""
 
     model_config = ConfigDict(frozen=True)
 
-    kind: str
+    kind: str  # of the study, as are title, command, rows and episodes
     title: str
     command: str
-    esp_version: str
-    mode: Mode
+    esp_version: str  # of the program that planned the study
+    mode: Mode  # which evaluations tables state
     rows: Literal["panels", "variants"]
     episodes: int
-    config: dict[str, JsonValue]
-    cells: tuple[CellResult, ...] = Field(min_length=1)
-    aggregates: dict[str, Aggregate] = {}
+    config: dict[str, JsonValue]  # settings by dotted name that all cells share
+    cells: tuple[CellResult, ...] = Field(min_length=1)  # in the study's order
+    aggregates: dict[str, Aggregate] = {}  # statistics over all panels by variant, where there are several panels
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
         """Return the cell that one is compared with."""

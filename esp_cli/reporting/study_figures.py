@@ -16,17 +16,11 @@ from esp_cli.studies.kinds import UNBROKEN, kind_of
 
 @dataclass(frozen=True)
 class Series:
-    """The cells of one task and algorithm, by strength of breaking (smallest first) and method.
+    """The cells of one task and algorithm, by strength of breaking (smallest first) and method."""
 
-    Attributes:
-        name: "navigation, MAPPO, 1M".
-        setting: what breaks the symmetry.
-        cells: by strength, then by method.
-    """
-
-    name: str
-    setting: str
-    cells: Mapping[float, Mapping[str, CellResult]]
+    name: str  # "navigation, MAPPO, 1M"
+    setting: str  # what breaks the symmetry
+    cells: Mapping[float, Mapping[str, CellResult]]  # by strength, then by method
 
 
 def series_of(results: Results) -> list[Series]:

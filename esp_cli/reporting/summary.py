@@ -22,8 +22,7 @@ from esp_cli.policies.statistics import (
 from esp_cli.reporting.results import Aggregate, CellResult, CellSummary, Gap, Results, Side
 from esp_cli.studies.paper import NUM_SEEDS
 
-MIN_SEEDS_TO_RANK = 3
-"""Of either side; a probability of improvement of fewer seeds says nothing."""
+MIN_SEEDS_TO_RANK = 3  # of either side; a probability of improvement of fewer seeds says nothing
 
 
 def summarised(results: Results) -> Results:

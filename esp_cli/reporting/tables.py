@@ -23,26 +23,18 @@ _LEADER = {"first": "ours", "second": "paper", "neither": "not told apart", None
 _MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
 _SHARES = ("share of reference run>", "ratio of median steps>")
 Row = TypeVar("Row")
-Columns = dict[str, Callable[[Row], str]]
-"""Heading -> text of a row."""
+Columns = dict[str, Callable[[Row], str]]  # heading -> text of a row
 _NAMES: Columns[CellResult] = {"panel": lambda cell: cell.panel, "run": lambda cell: cell.variant}
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table before it is drawn.
+    """A table before it is drawn."""
 
-    Attributes:
-        title: one line above.
-        headings: of the columns; one that ends in ">" is aligned to the right.
-        rows: texts.
-        caption: one line below.
-    """
-
-    title: str
-    headings: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
+    title: str  # one line above
+    headings: tuple[str, ...]  # of the columns; one that ends in ">" is aligned to the right
+    rows: tuple[tuple[str, ...], ...]  # texts
+    caption: str = ""  # one line below
 
     def markdown(self) -> str:
         """Return the table as Markdown, without its title."""

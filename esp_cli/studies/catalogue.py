@@ -21,35 +21,23 @@ from esp_envs.registry import task_names
 
 @dataclass(frozen=True)
 class Request:
-    """What a user asked for; None takes the study's own.
+    """What a user asked for; None takes the study's own."""
 
-    Attributes:
-        tasks: names of tasks.
-        algorithms: names of algorithms.
-        steps: environment steps per seed, each with the task that it is for (None for all).
-        seeds: of every run.
-        preset: of every run.
-        overrides: dotted names to values; those of an algorithm or a task concern its runs alone.
-        device: "cpu" or "cuda".
-        episodes: per seed, of the final evaluation of a trained policy.
-        variants: names of the variants, in order; the others are compared with the first.
-        group: whose symmetry a study of networks is about.
-        breakings: names of the settings that break symmetry in a study of that; all by default.
-        command: the command line behind it.
-    """
-
-    tasks: Sequence[str] | None = None
-    algorithms: Sequence[str] | None = None
+    tasks: Sequence[str] | None = None  # names of tasks
+    algorithms: Sequence[str] | None = None  # names of algorithms
+    # environment steps per seed, each with the task that it is for (None for all)
     steps: Sequence[tuple[str | None, int]] | None = None
-    seeds: Sequence[int] = STUDY_SEEDS
-    preset: str = "default"
+    seeds: Sequence[int] = STUDY_SEEDS  # of every run
+    preset: str = "default"  # of every run
+    # dotted names to values; those of an algorithm or a task concern its runs alone
     overrides: Settings = field(default_factory=dict)
-    device: str = "cpu"
-    episodes: int = EPISODES
-    variants: Sequence[str] | None = None
-    group: str = "c4"
+    device: str = "cpu"  # "cpu" or "cuda"
+    episodes: int = EPISODES  # per seed, of the final evaluation of a trained policy
+    variants: Sequence[str] | None = None  # names of the variants, in order; the others are compared with the first
+    group: str = "c4"  # whose symmetry a study of networks is about
+    # names of the settings that break symmetry in a study of that; all by default
     breakings: Sequence[str] | None = None
-    command: str = ""
+    command: str = ""  # the command line behind it
 
 
 def plan(name: str, request: Request) -> Study:

@@ -15,8 +15,7 @@ import esp_envs
 from esp_cli.files.opening import open_own
 from esp_envs.installed import available_cores
 
-_SET_PARENT_DEATH_SIGNAL = 1
-"""PR_SET_PDEATHSIG of Linux's prctl."""
+_SET_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of Linux's prctl
 _PARENT = "ESP_PARENT_PROCESS"
 _TAIL_BYTES = 8192
 _BOOT = (

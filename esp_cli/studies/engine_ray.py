@@ -36,12 +36,9 @@ from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
 
-MAX_RETRIES = 3
-"""Times that Ray starts a job again whose node or worker is lost."""
-POLL_S = 0.5
-"""Seconds between two looks at the process of a job."""
-CONNECT_S = 10.0
-"""Seconds in which a cluster has to answer."""
+MAX_RETRIES = 3  # times that Ray starts a job again whose node or worker is lost
+POLL_S = 0.5  # seconds between two looks at the process of a job
+CONNECT_S = 10.0  # seconds in which a cluster has to answer
 _OBJECT_STORE_BYTES = 256 * 2**20
 _LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
 _RAY_ENVIRONMENT = {
@@ -50,8 +47,7 @@ _RAY_ENVIRONMENT = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
 }
 """Of Ray, unless the user sets it."""
-_JOB_ENVIRONMENT = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")
-"""Handed on from the driver to the jobs."""
+_JOB_ENVIRONMENT = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")  # handed on from the driver to the jobs
 
 
 class ClusterError(UserError):
@@ -249,11 +245,7 @@ def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, s
 
 
 def _connect(address: str | None) -> None:
-    """Connect to a cluster, or start one of this machine alone that no other machine reaches.
-
-    Raises:
-        ClusterError: none answers, or it is of another version of Ray or Python.
-    """
+    """Connect to a cluster, or start one of this machine alone that no other machine reaches."""
     for name, text in _RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, text)
     ray._private.worker._worker_logs_enabled = False  # Ray prints the loss of a node to standard output

@@ -22,83 +22,48 @@ LIKELY_SHARE = 0.5
 
 @dataclass(frozen=True)
 class RunForecast:
-    """What is left of one run.
+    """What is left of one run."""
 
-    Attributes:
-        name: of its cell.
-        status: of its cell; "finished" also where another study has it, or another run of this one trains the same.
-        step: environment steps per seed that are done.
-        seconds_left: alone on one thread.
-        seconds: of the whole run; None where nothing is left of it, which is not measured.
-        disk_bytes: of what stays when it is done.
-        peak_bytes: of what lies on the disk at most while it trains.
-        config: what is run.
-    """
-
-    name: str
+    name: str  # of its cell
+    # of its cell; "finished" also where another study has it, or another run of this one trains the same
     status: Status
-    step: int
-    seconds_left: float
-    seconds: float | None
-    disk_bytes: int
-    peak_bytes: int
-    config: RunConfig
+    step: int  # environment steps per seed that are done
+    seconds_left: float  # alone on one thread
+    seconds: float | None  # of the whole run; None where nothing is left of it, which is not measured
+    disk_bytes: int  # of what stays when it is done
+    peak_bytes: int  # of what lies on the disk at most while it trains
+    config: RunConfig  # what is run
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is left of a study.
+    """What is left of a study."""
 
-    Attributes:
-        kind: of the study.
-        title: of the study.
-        out: its folder.
-        jobs: runs side by side.
-        seconds: until the last run ends, where `jobs` run side by side and nothing else does.
-        core_seconds: of all runs added up.
-        disk_bytes: of the folder when all is done.
-        disk_peak_bytes: of the folder at most, where the `jobs` runs that need most on the way end together.
-        runs: in the order in which they are begun.
-    """
-
-    kind: str
-    title: str
-    out: Path
-    jobs: int
-    seconds: float
-    core_seconds: float
-    disk_bytes: int
-    disk_peak_bytes: int
-    runs: tuple[RunForecast, ...]
+    kind: str  # of the study
+    title: str  # of the study
+    out: Path  # its folder
+    jobs: int  # runs side by side
+    seconds: float  # until the last run ends, where `jobs` run side by side and nothing else does
+    core_seconds: float  # of all runs added up
+    disk_bytes: int  # of the folder when all is done
+    disk_peak_bytes: int  # of the folder at most, where the `jobs` runs that need most on the way end together
+    runs: tuple[RunForecast, ...]  # in the order in which they are begun
 
 
 @dataclass(frozen=True)
 class SearchForecast:
-    """What the search with one kind of prior costs, on one core.
+    """What the search with one kind of prior costs, on one core."""
 
-    Attributes:
-        prior: its kind.
-        trials: of the search.
-        settings: names of what is searched.
-        default_s: seconds of a whole trial with the default settings.
-        mean_s: of one as the space has them on average, where what each setting costs multiplies.
-        longest_s: of one with the values that take longest.
-        likely_s: of the search with pruning, and of the runs on fresh seeds.
-        at_most_s: of both, where every trial takes longest and none is pruned.
-        disk_bytes: of the trials and the runs on fresh seeds when all is done, at most.
-        peak_bytes: of what one run has on the disk on the way beyond that, at most.
-    """
-
-    prior: str
-    trials: int
-    settings: tuple[str, ...]
-    default_s: float
-    mean_s: float
-    longest_s: float
-    likely_s: float
-    at_most_s: float
-    disk_bytes: int
-    peak_bytes: int
+    prior: str  # its kind
+    trials: int  # of the search
+    settings: tuple[str, ...]  # names of what is searched
+    default_s: float  # seconds of a whole trial with the default settings
+    mean_s: float  # of one as the space has them on average, where what each setting costs multiplies
+    longest_s: float  # of one with the values that take longest
+    likely_s: float  # of the search with pruning, and of the runs on fresh seeds
+    at_most_s: float  # of both, where every trial takes longest and none is pruned
+    disk_bytes: int  # of the trials and the runs on fresh seeds when all is done, at most
+    peak_bytes: int  # of what one run has on the disk on the way beyond that, at most
 
 
 def forecast_study(

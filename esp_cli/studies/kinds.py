@@ -9,12 +9,9 @@ from typing import Literal
 from esp_cli.defaults import Mode
 from esp_cli.studies import paper
 
-Settings = Mapping[str, object]
-"""Dotted names of settings -> values."""
-GROUP = "<group>"
-"""Stands for the group that the user chooses."""
-ALGORITHMS = ("maddpg", "qmix", "mappo")
-"""In the order of the paper's table."""
+Settings = Mapping[str, object]  # dotted names of settings -> values
+GROUP = "<group>"  # stands for the group that the user chooses
+ALGORITHMS = ("maddpg", "qmix", "mappo")  # in the order of the paper's table
 PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
 """What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
 PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
@@ -40,65 +37,43 @@ COEFFICIENTS = (0.0, 0.01, 0.05, 0.1, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Team:
-    """One row of a table of teams.
+    """One row of a table of teams."""
 
-    Attributes:
-        label: name of the row.
-        settings: of the task.
-        place: of the row in the paper's numbers.
-    """
-
-    label: str
-    settings: Settings
-    place: tuple[str, ...]
+    label: str  # name of the row
+    settings: Settings  # of the task
+    place: tuple[str, ...]  # of the row in the paper's numbers
 
 
 @dataclass(frozen=True)
 class StudyKind:
-    """A kind of study: all that tells it from the others.
+    """A kind of study: all that tells it from the others."""
 
-    Attributes:
-        title: one line for people.
-        rows: what the rows of its table are. With "panels" each algorithm stands beside itself with the prior, as in
-            the paper's tables; with "variants" each panel is one algorithm, whose variants are compared with the first.
-        varies: settings that the study sets itself and a user cannot.
-        variants: name -> the settings that make it.
-        common: settings of all runs, under those of the user.
-        tasks: unless the user names others.
-        algorithms: unless the user names others.
-        steps: per seed, unless the user names others; empty for the rows of the paper's table.
-        all_rows: take every row of the paper's table, not only the first.
-        only: the one task that the study is about.
-        teams: rows beside the task itself.
-        breakings: by task the settings that break its symmetry, and their strengths; empty for other studies.
-        without: by task the variants that its networks do not take, and that are left out unless the user names them.
-        place: of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none.
-        mode: evaluations that are reported, unless the user asks for others.
-        thresholds: returns whose first passing is reported; by default that which the reference ended with.
-        network_cost: whether to state the sizes of the networks, and to draw the paper's numbers as lines.
-        reference: what a run is compared with, in words, where the plain learner is among the runs.
-        otherwise: the same where it is not.
-    """
-
-    title: str
+    title: str  # one line for people
+    # what the rows of its table are. With "panels" each algorithm stands beside itself with the prior, as in the
+    # paper's tables; with "variants" each panel is one algorithm, whose variants are compared with the first
     rows: Literal["panels", "variants"]
-    varies: frozenset[str]
-    variants: Mapping[str, Settings]
-    common: Settings = field(default_factory=dict)
-    tasks: tuple[str, ...] = ("navigation",)
-    algorithms: tuple[str, ...] = ("maddpg",)
-    steps: tuple[int, ...] = ()
-    all_rows: bool = False
-    only: str | None = None
-    teams: tuple[Team, ...] = ()
+    varies: frozenset[str]  # settings that the study sets itself and a user cannot
+    variants: Mapping[str, Settings]  # name -> the settings that make it
+    common: Settings = field(default_factory=dict)  # settings of all runs, under those of the user
+    tasks: tuple[str, ...] = ("navigation",)  # unless the user names others
+    algorithms: tuple[str, ...] = ("maddpg",)  # unless the user names others
+    steps: tuple[int, ...] = ()  # per seed, unless the user names others; empty for the rows of the paper's table
+    all_rows: bool = False  # take every row of the paper's table, not only the first
+    only: str | None = None  # the one task that the study is about
+    teams: tuple[Team, ...] = ()  # rows beside the task itself
+    # by task the settings that break its symmetry, and their strengths; empty for other studies
     breakings: Breakings = field(default_factory=dict)
+    # by task the variants that its networks do not take, and that are left out unless the user names them
     without: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    # of a variant in the paper's numbers, with the fields task, steps, algorithm and value; empty for none
     place: tuple[str, ...] = ()
-    mode: Mode = "greedy"
+    mode: Mode = "greedy"  # evaluations that are reported, unless the user asks for others
+    # returns whose first passing is reported; by default that which the reference ended with
     thresholds: tuple[float, ...] = ()
-    network_cost: bool = False
+    network_cost: bool = False  # whether to state the sizes of the networks, and to draw the paper's numbers as lines
+    # what a run is compared with, in words, where the plain learner is among the runs
     reference: str = "the plain learner (the first run) of the same panel"
-    otherwise: str = "the first run of the same panel"
+    otherwise: str = "the first run of the same panel"  # the same where it is not
 
 
 def _team(agents: int, landmarks: int | None) -> Team:

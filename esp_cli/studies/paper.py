@@ -8,22 +8,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-NUM_SEEDS = 10
-"""Seeds behind every number of the paper."""
+NUM_SEEDS = 10  # seeds behind every number of the paper
 _FILE = Path(__file__).with_name("paper.json")
 
 
 @dataclass(frozen=True)
 class Reported:
-    """A number of the paper.
+    """A number of the paper."""
 
-    Attributes:
-        mean: episode reward, mean over ten seeds.
-        sem: standard error of the mean; None where it was read off a figure.
-    """
-
-    mean: float
-    sem: float | None
+    mean: float  # episode reward, mean over ten seeds
+    sem: float | None  # standard error of the mean; None where it was read off a figure
 
 
 def reported(key: tuple[str, ...] | None) -> Reported | None:

@@ -18,33 +18,21 @@ from esp_cli.training.streams import generators
 from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
-PROBE_SECONDS = 1.0
-"""How long iterations of a run are timed, after a first that is not."""
-_LONG_SECONDS = 3.0
-"""An iteration that takes as long is measured once."""
-_PROBED_EPISODES = 8
-"""Of an evaluation, at most; longer ones take their share more."""
-_CHECKPOINTS = 3
-"""Two are kept while a third is written."""
-_POLICIES = 3
-"""A final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task."""
+PROBE_SECONDS = 1.0  # how long iterations of a run are timed, after a first that is not
+_LONG_SECONDS = 3.0  # an iteration that takes as long is measured once
+_PROBED_EPISODES = 8  # of an evaluation, at most; longer ones take their share more
+_CHECKPOINTS = 3  # two are kept while a third is written
+_POLICIES = 3  # A final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What one run takes on this machine, alone on one thread.
+    """What one run takes on this machine, alone on one thread."""
 
-    Attributes:
-        training_s: for all of its steps, evaluations included.
-        evaluation_s: for its final evaluation.
-        disk_bytes: of what stays when it is done.
-        peak_bytes: of what lies on the disk at most while it trains.
-    """
-
-    training_s: float
-    evaluation_s: float
-    disk_bytes: int
-    peak_bytes: int
+    training_s: float  # for all of its steps, evaluations included
+    evaluation_s: float  # for its final evaluation
+    disk_bytes: int  # of what stays when it is done
+    peak_bytes: int  # of what lies on the disk at most while it trains
 
 
 class Probes:

@@ -32,22 +32,14 @@ class StudyError(UserError):
 
 
 class Cell(Strict):
-    """One run of a study, and where it stands in tables and pictures.
+    """One run of a study, and where it stands in tables and pictures."""
 
-    Attributes:
-        name: of its folder.
-        panel: the picture that its curve is in, and one axis of the table.
-        variant: its name in that picture, and the other axis.
-        config: what is run.
-        reference: name of the cell that it is compared with; None for such a cell itself.
-        paper: place of the paper's number, see `paper.reported`; None where there is none that compares.
-    """
-
-    name: str
-    panel: str
-    variant: str
-    config: RunConfig
-    reference: str | None = None
+    name: str  # of its folder
+    panel: str  # the picture that its curve is in, and one axis of the table
+    variant: str  # its name in that picture, and the other axis
+    config: RunConfig  # what is run
+    reference: str | None = None  # name of the cell that it is compared with; None for such a cell itself
+    # place of the paper's number, see `paper.reported`; None where there is none that compares
     paper: tuple[str, ...] | None = None
 
 
@@ -57,16 +49,11 @@ class RunSet(ABC):
     Args:
         path: the folder.
         title: one line for people.
-
-    Attributes:
-        document: name of the file that makes a folder one.
-        runs: name of the folder of its run folders.
-        noun: what messages call it.
     """
 
-    document: ClassVar[str]
-    runs: ClassVar[str]
-    noun: ClassVar[str]
+    document: ClassVar[str]  # name of the file that makes a folder one
+    runs: ClassVar[str]  # name of the folder of its run folders
+    noun: ClassVar[str]  # what messages call it
 
     def __init__(self, path: Path, title: str) -> None:
         self.path, self.title = path, title

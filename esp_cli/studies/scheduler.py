@@ -14,31 +14,21 @@ from esp_cli.studies.run_set import Cell, RefusedError, RunSet
 from esp_envs.errors import UserError
 
 Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
-POLL_S = 0.5
-"""Seconds between two looks at the running processes."""
+POLL_S = 0.5  # seconds between two looks at the running processes
 
 
 @dataclass
 class Run:
-    """Where one cell stands.
+    """Where one cell stands."""
 
-    Attributes:
-        cell: of the study or search.
-        status: "elsewhere" is in use by a process that an earlier, killed scheduler left; it is waited for.
-        step: environment steps per seed so far.
-        trained_s: seconds of training behind these steps, summed over interruptions.
-        message: why it failed, or why there was nothing to run.
-        job: its process, if this scheduler started it.
-        asked: whether the process was asked to stop.
-    """
-
-    cell: Cell
+    cell: Cell  # of the study or search
+    # "elsewhere" is in use by a process that an earlier, killed scheduler left; it is waited for
     status: Status = "waiting"
-    step: int = 0
-    trained_s: float = 0.0
-    message: str = ""
-    job: Job | None = field(default=None, repr=False)
-    asked: bool = field(default=False, repr=False)
+    step: int = 0  # environment steps per seed so far
+    trained_s: float = 0.0  # seconds of training behind these steps, summed over interruptions
+    message: str = ""  # why it failed, or why there was nothing to run
+    job: Job | None = field(default=None, repr=False)  # its process, if this scheduler started it
+    asked: bool = field(default=False, repr=False)  # whether the process was asked to stop
 
     def ask_to_stop(self) -> None:
         """Ask its process, once, to end after its iteration: a second request would interrupt it."""
@@ -59,15 +49,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a listener is told at every look.
+    """What a listener is told at every look."""
 
-    Attributes:
-        runs: all cells, in order.
-        left_s: seconds until all are trained, or None where nothing can be said yet.
-    """
-
-    runs: Sequence[Run]
-    left_s: float | None
+    runs: Sequence[Run]  # all cells, in order
+    left_s: float | None  # seconds until all are trained, or None where nothing can be said yet
 
     def count(self, *statuses: Status) -> int:
         """Return how many runs have one of these states."""

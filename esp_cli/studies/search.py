@@ -35,33 +35,20 @@ from esp_envs.errors import UserError
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out for one prior.
+    """What came out for one prior."""
 
-    Attributes:
-        prior: its kind.
-        trials: that were begun.
-        completed: trials with a score.
-        pruned: trials that were ended early, broke, or did not reach the return.
-        refused: why settings did not go together, one text for each such trial; they count as pruned.
-        env_steps: environment steps of all seeds of all trials.
-        seconds: of training, all trials added up.
-        best: number of the best trial; None where no trial has a score.
-        best_score: of its curve, on the seeds of the trials.
-        default_score: of the default settings, where trial 0 had them; None where the space does not hold them all.
-        settings: of the best trial.
-    """
-
-    prior: str
-    trials: int
-    completed: int
-    pruned: int
-    refused: tuple[str, ...]
-    env_steps: int
-    seconds: float
-    best: int | None
-    best_score: float | None
+    prior: str  # its kind
+    trials: int  # that were begun
+    completed: int  # trials with a score
+    pruned: int  # trials that were ended early, broke, or did not reach the return
+    refused: tuple[str, ...]  # why settings did not go together, one text for each such trial; they count as pruned
+    env_steps: int  # environment steps of all seeds of all trials
+    seconds: float  # of training, all trials added up
+    best: int | None  # number of the best trial; None where no trial has a score
+    best_score: float | None  # of its curve, on the seeds of the trials
+    # of the default settings, where trial 0 had them; None where the space does not hold them all
     default_score: float | None
-    settings: Mapping[str, object]
+    settings: Mapping[str, object]  # of the best trial
 
 
 class Search(RunSet):

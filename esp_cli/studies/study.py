@@ -45,24 +45,15 @@ STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
 
 
 class Study(Strict):
-    """A named list of runs.
+    """A named list of runs."""
 
-    Attributes:
-        kind: what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand.
-        title: one line for people.
-        command: the command that plans it again; one a line where several added to it.
-        episodes: per seed, of the final evaluation of a trained policy.
-        esp_version: of the program that planned it.
-        cells: in the order in which they are run and shown.
-    """
-
-    kind: str
-    title: str
-    command: str
-    episodes: int = Field(ge=1)
-    esp_version: str = __version__
+    kind: str  # what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand
+    title: str  # one line for people
+    command: str  # the command that plans it again; one a line where several added to it
+    episodes: int = Field(ge=1)  # per seed, of the final evaluation of a trained policy
+    esp_version: str = __version__  # of the program that planned it
     rows: Literal["panels", "variants"] = Field(description="what the rows of the table are; the other are columns")
-    cells: tuple[Cell, ...]
+    cells: tuple[Cell, ...]  # in the order in which they are run and shown
 
     @property
     def panels(self) -> list[str]:

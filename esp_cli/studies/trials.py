@@ -70,11 +70,7 @@ class Trials:
         return study
 
     def _refuse_forged(self, prior: str) -> None:
-        """Refuse trials that no search with this space leaves behind, before anything is computed from them.
-
-        Raises:
-            StudyError: there is one.
-        """
+        """Refuse trials that no search with this space leaves behind, before anything is computed from them."""
         space = {name: _distribution(d) for name, d in space_of(self.tuning.space, prior).items()}
         if [direction.name for direction in self.studies[prior].directions] != ["MAXIMIZE"]:
             raise StudyError(f"{self.path} is damaged: it maximises something else; choose another --out")

@@ -23,49 +23,30 @@ from esp_cli.training.metrics import column, elapsed_s, read_metrics
 from esp_envs.errors import UserError
 
 Goal = Literal["return", "steps", "seconds"]
-SMOOTHED = 3
-"""Evaluations, up to the newest, whose mean is the score of a curve."""
-RUNGS = 2
-"""Times that successive halving looks at a trial before its end."""
-REDUCTION = 3
-"""One of so many trials goes on at each rung, and trains so many times as long."""
+SMOOTHED = 3  # evaluations, up to the newest, whose mean is the score of a curve
+RUNGS = 2  # times that successive halving looks at a trial before its end
+REDUCTION = 3  # one of so many trials goes on at each rung, and trains so many times as long
 _GIVEN = ("task", "evaluation")
 """Sections that no search varies: it would choose the easiest task, or the evaluation that scores highest."""
 NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
 
 
 class Tuning(Strict):
-    """What is asked for.
+    """What is asked for."""
 
-    Attributes:
-        task: its name.
-        algorithm: its name.
-        preset: of every run.
-        priors: kinds of prior; each has a search of its own with the same budget.
-        budget: trials for each prior.
-        goal: "return" at the end, or the fewest steps or seconds to the return `reach`.
-        reach: that return.
-        steps: environment steps per seed of a trial that is not pruned.
-        trial_seeds: of every trial.
-        overrides: settings of all runs, as `--set` takes them.
-        space: what is tried.
-        device: of every run.
-        command: the command line behind it.
-    """
-
-    task: str
-    algorithm: str
-    preset: str = "default"
-    priors: tuple[str, ...]
-    budget: int = Field(ge=1)
-    goal: Goal = "return"
-    reach: float | None = None
-    steps: int = Field(ge=1)
-    trial_seeds: tuple[int, ...]
-    overrides: dict[str, JsonValue] = Field({})
-    space: dict[str, Dimension]
-    device: str = "cpu"
-    command: str = ""
+    task: str  # its name
+    algorithm: str  # its name
+    preset: str = "default"  # of every run
+    priors: tuple[str, ...]  # kinds of prior; each has a search of its own with the same budget
+    budget: int = Field(ge=1)  # trials for each prior
+    goal: Goal = "return"  # "return" at the end, or the fewest steps or seconds to the return `reach`
+    reach: float | None = None  # that return
+    steps: int = Field(ge=1)  # environment steps per seed of a trial that is not pruned
+    trial_seeds: tuple[int, ...]  # of every trial
+    overrides: dict[str, JsonValue] = Field({})  # settings of all runs, as `--set` takes them
+    space: dict[str, Dimension]  # what is tried
+    device: str = "cpu"  # of every run
+    command: str = ""  # the command line behind it
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int] | None = None) -> RunConfig:
         """Resolve the run of a prior with these settings over those of all runs.
@@ -124,11 +105,7 @@ class Tuning(Strict):
             self._check_choices(prior)
 
     def _check_effects(self) -> None:
-        """Refuse a setting that changes nothing with any prior that it is searched for, and a search of no setting.
-
-        Raises:
-            UserError: there is one.
-        """
+        """Refuse a setting that changes nothing with any prior that it is searched for, and a search of no setting."""
         spaces = {prior: space_of(self.space, prior) for prior in self.priors}
         for prior, space in spaces.items():
             if not space:
@@ -149,9 +126,6 @@ class Tuning(Strict):
 
         All else is at its default. A choice may need another value of one other setting of the space, such as 64
         minibatches with 64 worlds; then it is left to the search.
-
-        Raises:
-            UserError: there is such a choice.
         """
         space = space_of(self.space, prior)
         for name, dimension in space.items():
@@ -179,19 +153,12 @@ TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyErr
 
 @dataclass(frozen=True)
 class Point:
-    """An evaluation of a trial.
+    """An evaluation of a trial."""
 
-    Attributes:
-        step: environment steps per seed.
-        seconds: of training.
-        mean: greedy return, mean over the seeds; NaN where a seed stopped.
-        value: mean of the newest evaluations up to this one.
-    """
-
-    step: int
-    seconds: float
-    mean: float
-    value: float
+    step: int  # environment steps per seed
+    seconds: float  # of training
+    mean: float  # greedy return, mean over the seeds; NaN where a seed stopped
+    value: float  # mean of the newest evaluations up to this one
 
 
 def curve_of(metrics: Path) -> list[Point]:

@@ -18,19 +18,12 @@ from esp_envs.errors import UserError
 
 
 class Dimension(Strict):
-    """What is tried of one setting: a range from `low` to `high`, or `choices`.
+    """What is tried of one setting: a range from `low` to `high`, or `choices`."""
 
-    Attributes:
-        low: smallest value; whole numbers where both ends are whole.
-        high: largest value.
-        log: whether to draw orders of magnitude evenly.
-        choices: the values, where it is no range.
-    """
-
-    low: int | float | None = None
-    high: int | float | None = None
-    log: bool = False
-    choices: tuple[JsonValue, ...] | None = None
+    low: int | float | None = None  # smallest value; whole numbers where both ends are whole
+    high: int | float | None = None  # largest value
+    log: bool = False  # whether to draw orders of magnitude evenly
+    choices: tuple[JsonValue, ...] | None = None  # the values, where it is no range
 
     @field_validator("low", "high", mode="before")
     @classmethod
@@ -85,8 +78,7 @@ class Dimension(Strict):
         return value if fits and self.low <= value <= self.high else None
 
 
-Space = Mapping[str, Dimension]
-"""Dotted names of settings -> what is tried of each."""
+Space = Mapping[str, Dimension]  # dotted names of settings -> what is tried of each
 
 
 def _range(low: float, high: float, log: bool = True) -> Dimension:
