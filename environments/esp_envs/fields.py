@@ -12,10 +12,11 @@ Axes and signs: x points right, y points up, angles are counter-clockwise in rad
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from esp_envs.errors import UserError
 
@@ -83,6 +84,12 @@ class Field:
 
     Only a picture has `pixels`, its rows and columns; its items are its channels. Only a ring has `rays`, and only a
     record has `parts`, the fields of one item in their order.
+
+    Attributes:
+        family: what its items are, as "landmarks": a set of like things, in whose order nothing lies. Fields of one
+            family are joined item by item. Items that count over agents are the family "others" or "agents".
+        is_point: whether its vectors are places in the scene, which move when the scene is shifted, and not ways
+            between places, velocities or directions.
     """
 
     name: str
@@ -93,6 +100,8 @@ class Field:
     pixels: tuple[int, int] | None = None
     rays: int = 0
     parts: tuple[Field, ...] = ()
+    family: str = ""
+    is_point: bool = False
 
     def __post_init__(self) -> None:
         for name, kind, example in _FIELD_TYPES:
@@ -110,6 +119,15 @@ class Field:
             raise UserError(f"field '{self.name}': a record, and nothing else, says what parts it has")
         if any(part.items is not Items.FIXED or part.pixels is not None for part in self.parts):
             raise UserError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
+        if self.family and self.kind == Kind.PICTURE:
+            raise UserError(f"field '{self.name}': the channels of a picture are no like things; leave family out")
+        if self.is_point and self.kind != Kind.VECTOR:
+            raise UserError(f"field '{self.name}': a {self.kind.name} is no place; leave is_point out")
+
+    @property
+    def family_name(self) -> str:
+        """Name of the family of its items, where they are one."""
+        return self.family or ("" if self.items is Items.FIXED else self.items.value)
 
     @property
     def item_width(self) -> int:
@@ -140,8 +158,35 @@ _FIELD_TYPES = (
     ("count", int, "a number of items"),
     ("unit", str, "a text, as unit='m'"),
     ("items", Items, "what items count over, as items=Items.OTHERS"),
+    ("family", str, "a text, as family='landmarks'"),
 )
 """What attributes of a field have to be; the fourth and fifth are easily confused."""
+
+
+class Placed(NamedTuple):
+    """A field and where it lies in a row."""
+
+    field: Field
+    where: slice
+
+
+@dataclass(frozen=True)
+class Family:
+    """A set of like things in a row: `count` items, each the numbers of several fields side by side.
+
+    Example:
+        Family("others", 2, (Placed(position, slice(10, 14)), Placed(velocity, slice(14, 18)))) has two items of
+        four numbers: 10, 11, 14, 15 and 12, 13, 16, 17 of the row.
+    """
+
+    name: str
+    count: int
+    parts: tuple[Placed, ...]
+
+    @property
+    def width(self) -> int:
+        """Numbers of one item."""
+        return sum(part.field.item_width for part in self.parts)
 
 
 @dataclass(frozen=True)
@@ -171,6 +216,35 @@ class Layout:
         return out
 
     @property
+    def own(self) -> tuple[Placed, ...]:
+        """The fields that belong to no family."""
+        return tuple(Placed(f, s) for f, s in self._placed if f.width and not f.family_name)
+
+    @cached_property
+    def families(self) -> tuple[Family, ...]:
+        """The sets of like things, in the order of their first fields.
+
+        Raises:
+            UserError: fields of one family have different numbers of items.
+        """
+        joined: dict[str, list[Placed]] = {}
+        for field, where in self._placed:
+            if field.width and field.family_name:
+                joined.setdefault(field.family_name, []).append(Placed(field, where))
+        for name, parts in joined.items():
+            if other := next((p.field for p in parts if p.field.count != parts[0].field.count), None):
+                first = parts[0].field
+                raise UserError(
+                    f"the {name} of a family are joined item by item, but '{first.name}' has {first.count} items and "
+                    f"'{other.name}' {other.count}; give them one number, or another family"
+                )
+        return tuple(Family(name, parts[0].field.count, tuple(parts)) for name, parts in joined.items())
+
+    @property
+    def _placed(self) -> Iterator[tuple[Field, slice]]:
+        return zip(self.fields, self.slices().values(), strict=True)
+
+    @property
     def summary(self) -> str:
         """The fields in a few words: "heading 2, goal 2 (m)"."""
         return ", ".join(f"{f.name} {f.width}" + (f" ({f.unit})" if f.unit else "") for f in self.fields)
@@ -178,7 +252,7 @@ class Layout:
     def table(self) -> list[tuple[str, str, str, str]]:
         """Rows (index range, name, kind x count, unit) for environment cards and export manifests."""
         rows = []
-        for f, s in zip(self.fields, self.slices().values(), strict=True):
+        for f, s in self._placed:
             span = str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}"
             rows.append((span, f.name, f.described, f.unit))
         return rows

@@ -121,6 +121,7 @@ class Spaces:
             ("d4*agents*landmarks-3"), or coupled with such orders ("flip-x*agents-3-2-1-0").
         nearly: a larger symmetry that holds nearly, which a prior may use all the same; empty where there is none.
         masks: whether each observation says which of the discrete actions each agent may take.
+        shifts: whether dynamics and reward stay as they are when every place (`Field.is_point`) is shifted alike.
     """
 
     num_agents: int
@@ -130,6 +131,7 @@ class Spaces:
     symmetry: str
     nearly: str = ""
     masks: bool = False
+    shifts: bool = False
 
     @property
     def is_joint(self) -> bool:

@@ -16,7 +16,7 @@ from esp_envs.adapters.vmas import VmasSettings, VmasTask
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import Field, Kind, Layout, layout
 
-_OWN = (Field("position", Kind.VECTOR, unit="length"), Field("velocity", Kind.VECTOR, unit="length/s"))
+_OWN = (Field("position", Kind.VECTOR, unit="length", is_point=True), Field("velocity", Kind.VECTOR, unit="length/s"))
 
 
 class NavigationSettings(VmasSettings):
@@ -77,7 +77,7 @@ class Transport(VmasTask):
             Field("speed", Kind.VECTOR, unit="length/s"),
             Field("on_goal", Kind.SCALAR, unit="0 or 1"),
         )
-        return layout(*_OWN, Field("packages", Kind.RECORD, self.settings.n_packages, parts=package))
+        return layout(*_OWN, Field("packages", Kind.RECORD, self.settings.n_packages, parts=package, family="packages"))
 
 
 class BalanceSettings(VmasSettings):
@@ -144,4 +144,4 @@ class Dispersion(VmasTask):
     def seen(self) -> Layout:
         """Return the layout of one agent's observation."""
         piece = (Field("offset", Kind.VECTOR, unit="length"), Field("eaten", Kind.SCALAR, unit="0 or 1"))
-        return layout(*_OWN, Field("food", Kind.RECORD, self.settings.food, parts=piece))
+        return layout(*_OWN, Field("food", Kind.RECORD, self.settings.food, parts=piece, family="food"))

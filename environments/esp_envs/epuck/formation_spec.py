@@ -157,18 +157,18 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         horizon=settings.horizon,
         observation=filled_layout(
             Field("heading", Kind.VECTOR, 1, "direction"),
-            Field("obstacle", Kind.VECTOR, min(pillars, 1), unit),
+            Field("obstacle", Kind.VECTOR, min(pillars, 1), unit, family="obstacles"),
             Field("goal", Kind.VECTOR, 1, settings.goal_unit),
             # Sorted by distance, so that no permutation of the robots moves them.
-            Field("robots", Kind.VECTOR, settings.seen_robots, unit),
+            Field("robots", Kind.VECTOR, settings.seen_robots, unit, family="robots"),
         ),
         state=filled_layout(
             Field("heading", Kind.VECTOR, robots, "direction", Items.AGENTS),
-            Field("position", Kind.VECTOR, robots, "m", Items.AGENTS),
+            Field("position", Kind.VECTOR, robots, "m", Items.AGENTS, is_point=True),
             Field("velocity", Kind.VECTOR, robots, "m/s", Items.AGENTS),
             Field("spin", Kind.PSEUDOSCALAR, robots, "rad/s", Items.AGENTS),
-            Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS),
-            Field("obstacles", Kind.VECTOR, pillars, "m"),
+            Field("goals", Kind.VECTOR, robots, "m", Items.AGENTS, is_point=True),
+            Field("obstacles", Kind.VECTOR, pillars, "m", family="obstacles", is_point=True),
         ),
         action=WHEEL_PAIRS if settings.actions == "discrete" else WHEELS,
         symmetry=settings.left_of("d4*agents"),

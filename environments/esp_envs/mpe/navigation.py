@@ -144,18 +144,19 @@ class Navigation(ParticleTask):
             horizon=settings.horizon,
             observation=filled_layout(
                 Field("velocity", Kind.VECTOR, 1, "length/s"),
-                Field("position", Kind.VECTOR, 1, "length"),
-                Field("landmarks", Kind.VECTOR, landmarks, "length"),
+                Field("position", Kind.VECTOR, 1, "length", is_point=True),
+                Field("landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
                 Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS),
             ),
             state=layout(
                 Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
-                Field("position", Kind.VECTOR, agents, "length", Items.AGENTS),
-                Field("landmarks", Kind.VECTOR, landmarks, "length"),
+                Field("position", Kind.VECTOR, agents, "length", Items.AGENTS, is_point=True),
+                Field("landmarks", Kind.VECTOR, landmarks, "length", family="landmarks", is_point=True),
             ),
             action=MOVES if discrete else FORCE,
             symmetry=settings.left_of(whole),
             nearly=whole,
+            shifts=not settings.mud,
             shared_reward=esp,
             settings=settings.model_dump() | {"num_landmarks": landmarks, "landmark_extent": settings.extent},
         )

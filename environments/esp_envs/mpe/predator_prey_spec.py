@@ -87,11 +87,11 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
 def _predator_layout(settings: PredatorPreySettings) -> Layout:
     return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
-        Field("position", Kind.VECTOR, 1, "length"),
-        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("position", Kind.VECTOR, 1, "length", is_point=True),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length", family="obstacles"),
         Field("predators", Kind.VECTOR, settings.num_predators - 1, "length", Items.OTHERS),
-        Field("prey", Kind.VECTOR, 1, "length"),
-        Field("prey_velocity", Kind.VECTOR, 1, "length/s"),
+        Field("prey", Kind.VECTOR, 1, "length", family="prey"),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s", family="prey"),
     )
 
 
@@ -99,9 +99,9 @@ def prey_layout(settings: PredatorPreySettings) -> Layout:
     """Return what a prey observes."""
     return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
-        Field("position", Kind.VECTOR, 1, "length"),
-        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
-        Field("predators", Kind.VECTOR, settings.num_predators, "length"),
+        Field("position", Kind.VECTOR, 1, "length", is_point=True),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length", family="obstacles"),
+        Field("predators", Kind.VECTOR, settings.num_predators, "length", family="predators"),
     )
 
 
@@ -109,9 +109,9 @@ def _state_layout(settings: PredatorPreySettings) -> Layout:
     predators = settings.num_predators
     hunters, hunted = (Items.FIXED, Items.AGENTS) if settings.control == "prey" else (Items.AGENTS, Items.FIXED)
     return filled_layout(
-        Field("velocity", Kind.VECTOR, predators, "length/s", hunters),
-        Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted),
-        Field("position", Kind.VECTOR, predators, "length", hunters),
-        Field("prey_position", Kind.VECTOR, 1, "length", hunted),
-        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length"),
+        Field("velocity", Kind.VECTOR, predators, "length/s", hunters, family="predators"),
+        Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted, family="prey"),
+        Field("position", Kind.VECTOR, predators, "length", hunters, family="predators", is_point=True),
+        Field("prey_position", Kind.VECTOR, 1, "length", hunted, family="prey", is_point=True),
+        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length", family="obstacles", is_point=True),
     )

@@ -64,8 +64,8 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
             Field("others", Kind.VECTOR, agents - 1, "cell", Items.OTHERS),
         ),
         state=layout(
-            Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS),
-            Field("poacher", Kind.VECTOR, 1, "cell"),
+            Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS, is_point=True),
+            Field("poacher", Kind.VECTOR, 1, "cell", is_point=True),
         ),
         action=MOVES,
         symmetry=settings.left_of(whole),
