@@ -1,11 +1,12 @@
-"""Versioned JSON documents: strict parsing with bounds, one format and version, validation, atomic writing."""
+"""JSON documents of a known format and version, and tables of settings: parsed within bounds, validated."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,15 +19,19 @@ from esp_cli.files.suggesting import nearest
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
 
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
 Model = TypeVar("Model", bound=BaseModel)
 
-MAX_DOCUMENT_BYTES = 16 * 2**20
-"""Parsed JSON takes some 20 times the space of its text."""
+MAX_DOCUMENT_BYTES = 16 * 2**20  # parsed JSON takes some 20 times the space of its text
+MAX_TABLE_BYTES = 2**20
 MAX_NESTING = 64
-_LARGEST = 1e30
-"""Largest number that a setting takes; float32, in which most of them are used, ends at 3.4e38."""
-_TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
+_LARGEST = 1e30  # of the numbers that a setting takes; float32, in which most of them are used, ends at 3.4e38
 _MAX_INTEGER = 2**63
+_TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 
 
 class Strict(BaseModel):
@@ -36,7 +41,7 @@ class Strict(BaseModel):
 
 
 class DocumentError(UserError):
-    """A JSON document cannot be read or written; the text is one sentence for the user."""
+    """A document cannot be read or written; the text is one sentence for the user."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +61,7 @@ class DocumentFormat:
     error: type[UserError] = DocumentError
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Read a document.
-
-        Returns:
-            Its content, without ``format`` and ``version``.
+        """Return the content of a document, without ``format`` and ``version``.
 
         Raises:
             UserError: of the kind `error`; it is missing, too large, damaged, foreign or of a newer version.
@@ -85,12 +87,7 @@ class DocumentFormat:
         return begins_with(path, f'"format": "{self.name}"')
 
     def parse(self, path: str | os.PathLike[str], model: type[Model]) -> Model:
-        """Read a document and validate its content.
-
-        Raises:
-            UserError: as `read`, or the content is not what the model asks for.
-            OSError: the machine failed.
-        """
+        """Read a document and validate its content; errors as of `read`."""
         content = self.read(path)
         try:
             return validate(model, content)
@@ -122,19 +119,15 @@ def begins_with(path: Path, text: str) -> bool:
 
 
 def validate(model: type[Model], content: object) -> Model:
-    """Validate content of a document; a value of another type is refused, not converted (true is not 1).
-
-    Raises:
-        ValidationError: it is not what the model asks for.
-    """
+    """Return the validated content of a document; a value of another type is refused, not converted (true is not 1)."""
     return model.model_validate_json(json.dumps(content), strict=True)
 
 
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
-    """Build `model`, turning pydantic's report into one sentence.
+    """Build a model from settings that a user chose.
 
     Raises:
-        UserError: an unknown name, or a value of another kind, out of range or not finite.
+        UserError: an unknown name, or a value of another kind, out of range or not finite, in one sentence.
     """
     try:
         built = model(**values)
@@ -143,7 +136,7 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
     for name, value in values.items():
         given, taken = _numbers(value), _numbers(getattr(built, name))
         problem = ""
-        if any(type(number) is int and abs(number) >= 2**63 for number in taken):
+        if any(type(number) is int and abs(number) >= _MAX_INTEGER for number in taken):
             problem = "it has more than 64 bits"
         elif not all(abs(number) <= _LARGEST for number in taken):  # false for NaN
             problem = f"it has to be a finite number of at most {_LARGEST:g}"
@@ -161,11 +154,7 @@ def _numbers(value: object) -> list[bool | int | float]:
 
 
 def encode(value: object, path: str | os.PathLike[str], error: type[UserError] = DocumentError) -> bytes:
-    """Return a value as indented JSON.
-
-    Raises:
-        UserError: of the kind `error`; it is not JSON (NaN and infinity are not).
-    """
+    """Return a value as indented JSON; what is not JSON, as NaN and infinity, raises an error of this kind."""
     try:
         return (json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode()
     except (TypeError, ValueError, RecursionError) as failure:
@@ -173,14 +162,10 @@ def encode(value: object, path: str | os.PathLike[str], error: type[UserError] =
 
 
 def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
-    """Parse strict JSON that is an object.
-
-    Args:
-        text: UTF-8 bytes or text; the caller bounds its length.
-        noun: what the text is, for the message.
+    """Parse strict JSON that is an object; the caller bounds its length.
 
     Raises:
-        DocumentError: it is not; the message goes on where the name of the file ends.
+        DocumentError: the text, called by a noun, is none; the message goes on where the name of its file ends.
     """
     try:
         value = parse_value(text.decode("utf-8") if isinstance(text, bytes) else text)
@@ -195,7 +180,7 @@ def parse_value(text: str) -> Any:
     """Parse strict JSON: no NaN, no infinity, no key twice, integers of 64 bits, nesting of at most `MAX_NESTING`.
 
     Raises:
-        UserError: it is not.
+        ValueError: it is not.
     """
     try:
         value = json.loads(
@@ -203,26 +188,47 @@ def parse_value(text: str) -> Any:
         )
     except RecursionError:
         raise UserError(_TOO_DEEP) from None
-    check_nesting(value)
+    _refuse_nesting(value)
     return value
 
 
-def check_nesting(value: object) -> None:
-    """Refuse lists and tables that are nested more than `MAX_NESTING` deep.
-
-    Raises:
-        UserError: they are.
-    """
+def _refuse_nesting(value: object) -> None:
     level = [value]
     for _ in range(MAX_NESTING):
-        level = [item for outer in level for item in _inside(outer)]
+        level = [item for outer in level for item in _inside(outer) if isinstance(item, dict | list)]
         if not level:
             return
     raise UserError(_TOO_DEEP)
 
 
+def _inside(value: object) -> Collection[Any]:
+    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise UserError("a key stands twice")
+    return result
+
+
+def _finite(number: str) -> float:
+    # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
+    value = float(number)
+    if not math.isfinite(value):
+        raise UserError(f"{shortened(number)} is no finite number")
+    return value
+
+
+def _bounded(number: str) -> int:
+    value = int(number) if len(number) <= 20 else _MAX_INTEGER
+    if abs(value) >= _MAX_INTEGER:
+        raise UserError("an integer has more than 64 bits")
+    return value
+
+
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
-    """Say what is wrong with the first bad setting, and what could stand there.
+    """Say what is wrong with the first bad setting of a model, and what could stand there.
 
     Args:
         error: of the validation.
@@ -252,29 +258,42 @@ def shortened(text: str) -> str:
     return line if len(line) <= 80 else f"{line[:77]}..."
 
 
-def _inside(value: object) -> list[Any]:
-    """Return the lists and objects directly inside one."""
-    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return [item for item in items if isinstance(item, dict | list)]
+def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file that a person wrote: one JSON object, or TOML where its name ends in .toml.
+
+    Raises:
+        DocumentError: it is missing, too large, or neither.
+    """
+    with attempting("read", path, DocumentError):
+        text = read_regular(path, MAX_TABLE_BYTES)
+    if text is None:
+        raise DocumentError(f"{path} is larger than a file of settings can be")
+    if Path(path).suffix.lower() != ".toml":
+        try:
+            return parse_object(text, "text")
+        except DocumentError as error:
+            raise DocumentError(f"{path} {error}; write TOML into a file whose name ends in .toml") from None
+    try:
+        table = tomllib.loads(text.decode("utf-8"))
+        _refuse_nesting(table)
+    except (ValueError, RecursionError) as error:
+        raise DocumentError(f"{path} is not valid TOML: {shortened(str(error))}") from None
+    for name, value in flat(table):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise DocumentError(f"{path} sets '{name}' to {value}; write a finite number")
+        if not isinstance(value, bool | int | float | str | list):
+            raise DocumentError(f"{path} sets '{name}' to a date or time; write a number, a text or a list")
+    return table
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) != len(pairs):
-        raise UserError("a key stands twice")
-    return result
+def flat(table: Mapping[str, Any], whole: Collection[str] = (), prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of everything in nested tables: {"a": {"b": 1}} -> ("a.b", 1).
 
-
-def _finite(number: str) -> float:
-    # also called for NaN and Infinity, which are no JSON; 1e999 is, and would be read as infinity
-    value = float(number)
-    if not math.isfinite(value):
-        raise UserError(f"{shortened(number)} is no finite number")
-    return value
-
-
-def _bounded(number: str) -> int:
-    value = int(number) if len(number) <= 20 else _MAX_INTEGER
-    if abs(value) >= _MAX_INTEGER:
-        raise UserError("an integer has more than 64 bits")
-    return value
+    Tables whose dotted names are among `whole` are values themselves.
+    """
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and name not in whole:
+            yield from flat(value, whole, f"{name}.")
+        else:
+            yield name, value

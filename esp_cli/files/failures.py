@@ -10,18 +10,8 @@ from collections.abc import Iterator
 from esp_envs.errors import UserError
 
 _CORRECTABLE = {
-    errno.ENOENT,
-    errno.EEXIST,
-    errno.EACCES,
-    errno.EPERM,
-    errno.EISDIR,
-    errno.ENOTDIR,
-    errno.ENOTEMPTY,
-    errno.ELOOP,
-    errno.ENAMETOOLONG,
-    errno.EINVAL,
-    errno.ENXIO,
-    errno.EXDEV,
+    *(errno.ENOENT, errno.EEXIST, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENOTEMPTY),
+    *(errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO, errno.EXDEV),
 }
 _ADVICE = {
     errno.ENOSPC: "free some space and run the command again",
@@ -51,12 +41,7 @@ def own_words(message: str) -> str:
 
 @contextlib.contextmanager
 def attempting(verb: str, path: str | os.PathLike[str], kind: type[UserError]) -> Iterator[None]:
-    """Turn a failure of the file system into one sentence.
-
-    Args:
-        verb: what is attempted, such as "write" or "make the run folder".
-        path: with what.
-        kind: of the exception for a failure that the user can correct.
+    """Turn a failure to do something ("write", "make the run folder") with a path into one sentence.
 
     Raises:
         kind: the user can correct it.

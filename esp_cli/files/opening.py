@@ -1,23 +1,33 @@
 """Opening of files in folders where something else may be by now: a link, a pipe, or the folder of another run.
 
-A process that holds a folder (see `esp_cli.files.locking`) reaches what is in it through a descriptor of that folder.
-So it never writes to, or removes from, another folder that was moved to the same path meanwhile.
+A process that holds a folder reaches what is in it through a descriptor of that folder. So it never writes to, or
+removes from, another folder that was moved to the same path meanwhile.
 """
 
 from __future__ import annotations
 
 import errno
+import fcntl
+import json
 import os
+import socket
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from esp_cli.files.failures import attempting
 from esp_envs.errors import UserError
 
 
 class FolderLostError(UserError):
     """A held folder was moved, replaced or deleted; the text is one sentence for the user."""
+
+
+class LockError(UserError):
+    """Another process holds the folder, or it cannot be locked; the text is one sentence for the user."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +53,7 @@ class HeldFolder:
         return self.process == os.getpid() and os.path.commonpath((self.path, path)) == self.path
 
     def require(self) -> None:
-        """Check that the folder at the path is the held one, and that its lock file is the locked one.
-
-        Raises:
-            FolderLostError: another one is there, or none.
-        """
+        """Raise a FolderLostError unless its path leads to the held folder, and to the locked file in it."""
         folder = Path(self.path)
         pairs = ((folder, self.folder_fd), (folder / self.lock, self.lock_fd))
         try:
@@ -61,29 +67,113 @@ class HeldFolder:
             )
 
 
-held_folders: dict[int, HeldFolder] = {}
-"""What this process holds, by the descriptor of the lock; `esp_cli.files.locking` keeps it."""
+_held: dict[int, HeldFolder] = {}  # by the descriptor of the lock
 
 
-def absolute_path(path: str | os.PathLike[str]) -> str:
+def acquire(file: Path) -> int:
+    """Hold the folder of a lock file, and write into the file who holds it.
+
+    The kernel lets go when the process ends, however it ends. The file stays: removing it would let two processes hold
+    two files of one name. While the folder is held, whatever `esp_cli.files` writes or removes in it is written or
+    removed in this very folder.
+
+    Returns:
+        The descriptor of the file; `release` of it lets go of the folder.
+
+    Raises:
+        LockError: another process, or this one, holds it already, or something else than a regular file is there.
+        FolderLostError: the folder was moved, replaced or deleted meanwhile.
+        OSError: the file system cannot lock.
+    """
+    with attempting("lock", file, LockError):
+        descriptor = open_own(file, os.O_RDWR)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+            # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
+            os.pwrite(descriptor, owner.encode(), 0)
+            os.ftruncate(descriptor, len(owner.encode()))
+            folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except BlockingIOError:
+            holder = _holder(os.pread(descriptor, 4096, 0))
+            os.close(descriptor)
+            raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
+        except OSError:
+            os.close(descriptor)
+            raise
+    _held[descriptor] = HeldFolder(_absolute(file.parent), file.name, folder, descriptor, os.getpid())
+    try:
+        require_held(file)
+    except BaseException:
+        release(descriptor)
+        raise
+    return descriptor
+
+
+def release(descriptor: int) -> None:
+    """Let go of a folder that `acquire` holds, also for processes that were forked meanwhile."""
+    os.close(_held.pop(descriptor).folder_fd)
+    fcntl.flock(descriptor, fcntl.LOCK_UN)
+    os.close(descriptor)
+
+
+def is_held(file: Path) -> bool:
+    """Return whether a process holds a lock; only for a caller that alone starts the processes that take it."""
+    try:
+        descriptor = os.open(file, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:  # without locks nothing holds one, and `acquire` says so
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(descriptor)
+    return False
+
+
+@contextmanager
+def taking_turns(folder: Path) -> Iterator[None]:
+    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none.
+
+    Raises:
+        LockError: the folder was moved, replaced or deleted while this process waited.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if not (folder.exists() and os.path.samestat(folder.stat(), os.fstat(descriptor))):
+            raise LockError(f"{folder} was moved, replaced or deleted meanwhile; run the command again")
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _holder(content: bytes) -> str:
+    """Name the process that a lock file names."""
+    try:
+        owner = json.loads(content)
+        return f"process {int(owner['pid'])} on {str(owner['host'])[:64]!r}"
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return "another process"
+
+
+def _absolute(path: str | os.PathLike[str]) -> str:
     """Return a path from the root on, without "..", as `HeldFolder` compares it; links in it stay."""
     return os.path.normpath(Path(path).absolute())
 
 
 def require_held(path: str | os.PathLike[str]) -> HeldFolder | None:
-    """Check the held folders that a path is in, before something is written there.
-
-    Returns:
-        The innermost of them; None where the path is in none.
+    """Check the held folders that a path is in, before something is written there, and return the innermost.
 
     Raises:
         FolderLostError: one of them was moved, replaced or deleted.
     """
-    if not held_folders:
+    if not _held:
         return None
-    absolute = absolute_path(path)
-    covering = [held for held in list(held_folders.values()) if held.covers(absolute)]
-    covering.sort(key=lambda held: len(held.path))
+    absolute = _absolute(path)
+    covering = sorted((held for held in list(_held.values()) if held.covers(absolute)), key=lambda held: len(held.path))
     for held in covering:
         held.require()
     return covering[-1] if covering else None
@@ -103,7 +193,7 @@ def open_folder(path: str | os.PathLike[str]) -> int:
 
 
 def own_folder(path: Path) -> Path:
-    """Return the path of a folder that the program keeps, which need not exist yet; a link there is not followed.
+    """Return the path of a folder that the program keeps, which need not exist yet; a link there is refused.
 
     Raises:
         FolderLostError: it is in a held folder that was moved, replaced or deleted.
@@ -116,14 +206,9 @@ def own_folder(path: Path) -> Path:
 
 
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
-    """Open a file that the program keeps in a folder of its own, such as a lock or a log; make it if missing.
+    """Return a descriptor of a file that the program keeps in a folder of its own; it is made if missing.
 
-    Args:
-        path: its place.
-        flags: of `os.open`, such as `os.O_RDWR`.
-
-    Returns:
-        A descriptor of a regular file; a link is not followed, a pipe does not block.
+    A link is not followed, and a pipe does not block.
 
     Raises:
         FolderLostError: it is in a held folder that was moved, replaced or deleted.
@@ -140,11 +225,7 @@ def open_own(path: str | os.PathLike[str], flags: int) -> int:
 
 
 def read_regular(path: str | os.PathLike[str], max_bytes: int) -> bytes | None:
-    """Read a regular file, which a link may name; None where it is larger than `max_bytes`.
-
-    Raises:
-        OSError: it is missing, unreadable or no regular file.
-    """
+    """Read a regular file as of `open_regular`; None where it is larger than `max_bytes`."""
     with open_regular(path) as file:
         content = file.read(max_bytes + 1)
     return content if len(content) <= max_bytes else None

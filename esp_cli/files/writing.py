@@ -17,12 +17,9 @@ from pathlib import Path
 from esp_cli.files.opening import open_folder, open_own, require_held
 from esp_envs.errors import UserError
 
-MAX_LINE_BYTES = 16 * 2**20
-"""Of a file of lines, such as metrics; what is longer was not written by this program."""
-_TAIL_BYTES = 2**18
-"""Longer than most lines."""
-TEMPORARY_PREFIX = ".esp-tmp-"
-"""Names of half-written files begin so; what a killed process left under such a name may be removed."""
+MAX_LINE_BYTES = 16 * 2**20  # of a file of lines, such as metrics; what is longer was not written by this program
+TAIL_BYTES = 2**18  # longer than most lines
+TEMPORARY_PREFIX = ".esp-tmp-"  # of half-written files; what a killed process left under such a name may be removed
 
 
 def write_file(path: str | os.PathLike[str], content: bytes) -> None:
@@ -47,15 +44,7 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace a file as a whole; see `replacing`.
-
-    Args:
-        path: file to write; its folder exists.
-        content: every byte of the file.
-
-    Raises:
-        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
-    """
+    """Replace a file as a whole by this content; see `replacing`."""
     with replacing(path) as write:
         write(content)
 
@@ -63,9 +52,7 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
 def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) -> None:
     """Remove what a kill left behind the last line break, so that the next line does not run into it.
 
-    Args:
-        path: a file of lines, or none.
-        is_whole: whether what is left is a line that lacks its break alone; then it gets one.
+    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one.
 
     Raises:
         UserError: its last line is longer than any line can be.
@@ -78,7 +65,7 @@ def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) 
         while b"\n" not in tail and len(tail) < size:
             if len(tail) > MAX_LINE_BYTES:
                 raise UserError(f"{path} is damaged: its last line has more than 16 MiB; remove that line")
-            start = file.seek(max(0, size - max(2 * len(tail), _TAIL_BYTES)))
+            start = file.seek(max(0, size - max(2 * len(tail), TAIL_BYTES)))
             tail = file.read(size - start)
         last = tail.rpartition(b"\n")[2]
         if last and is_whole is not None and is_whole(last):
@@ -95,15 +82,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
     The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
     the folder's own entry is flushed. A link at ``path`` is replaced, not followed.
 
-    Args:
-        path: file to write; its folder exists.
-
     Yields:
         A function that takes the next part. After an exception the file is as it was before.
 
     Raises:
         FolderLostError: it is in a held folder that was moved, replaced or deleted.
-        OSError: the folder is missing or read-only, or the disk is full; ``path`` is as it was before.
+        OSError: the folder is missing or read-only, or the disk is full.
     """
     path = Path(path)
     temporary = f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
@@ -125,18 +109,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
             with contextlib.suppress(OSError):
                 os.unlink(temporary, dir_fd=folder)
             raise
-        # some network file systems cannot flush a folder; the rename itself has succeeded by now
-        with contextlib.suppress(OSError):
-            _sync_folder(folder)
+        with contextlib.suppress(OSError):  # some network file systems cannot flush a folder, where the rename stands
+            entries = os.open(".", os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
+            try:
+                os.fsync(entries)
+            finally:
+                os.close(entries)
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file if it is there.
-
-    Raises:
-        FolderLostError: it is in a held folder that was moved, replaced or deleted.
-        OSError: it cannot be removed.
-    """
+    """Remove a file if it is there; raises a FolderLostError as `replacing`, or an OSError where it cannot."""
     with _named(path), contextlib.suppress(FileNotFoundError), _folder_of(path) as folder:
         os.unlink(path.name, dir_fd=folder)
 
@@ -172,11 +154,3 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
-
-
-def _sync_folder(folder: int) -> None:
-    descriptor = os.open(".", os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

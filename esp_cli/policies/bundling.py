@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from esp_cli.defaults import __version__
-from esp_cli.files.locking import taking_turns
+from esp_cli.files.opening import taking_turns
 from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.policies.evaluation import play_batches
 from esp_cli.policies.loading import TrainedPolicy

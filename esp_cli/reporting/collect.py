@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import JsonValue
 
 from esp_cli.defaults import Mode
+from esp_cli.files.documents import flat
 from esp_cli.files.formatting import format_exactly
-from esp_cli.files.tables import flat
 from esp_cli.policies.curve_statistics import area_under_curve, steps_to_threshold
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.statistics import summarise

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from esp_cli.files.documents import Strict
-from esp_cli.files.locking import acquire, is_held, release
+from esp_cli.files.opening import acquire, is_held, release
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config

@@ -10,9 +10,8 @@ from typing import Any
 
 from pydantic import JsonValue, field_validator, model_validator
 
-from esp_cli.files.documents import Strict, parse_value, validated
+from esp_cli.files.documents import Strict, flat, parse_value, read_table, validated
 from esp_cli.files.suggesting import did_you_mean
-from esp_cli.files.tables import flat, read_table
 from esp_cli.prior.config import of_no_use_to
 from esp_envs.errors import UserError
 

@@ -29,8 +29,7 @@ from torch import Tensor
 
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import attempting
-from esp_cli.files.locking import LockError, acquire, release
-from esp_cli.files.opening import open_own, require_held
+from esp_cli.files.opening import LockError, acquire, open_own, release, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files.locking import LockError, acquire, is_held, release
+from esp_cli.files.opening import LockError, acquire, is_held, release
 
 
 def test_a_lock_is_let_go_of_though_a_forked_process_lives_on(tmp_path: Path) -> None:

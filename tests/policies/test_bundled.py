@@ -15,7 +15,7 @@ import pytest
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
-from esp_cli.files.locking import taking_turns
+from esp_cli.files.opening import taking_turns
 from esp_cli.policies import bundled, bundling
 from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
 from esp_cli.policies.bundling import best_seed, bundle, play_greedily, score_of

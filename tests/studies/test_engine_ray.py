@@ -20,7 +20,7 @@ pytest.importorskip("ray", reason="needs Ray, of the extra cluster")
 import ray
 from ray.cluster_utils import Cluster
 
-from esp_cli.files.locking import is_held
+from esp_cli.files.opening import is_held
 from esp_cli.run import Run
 from esp_cli.studies import engine_ray
 from esp_cli.studies.engine import Engine

@@ -7,8 +7,7 @@ import sys
 
 import pytest
 
-from esp_cli.files.locking import LockError, is_held
-from esp_cli.files.opening import FolderLostError
+from esp_cli.files.opening import FolderLostError, LockError, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine_local import LocalEngine
 from esp_cli.studies.run_set import StudyError

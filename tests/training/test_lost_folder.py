@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import app
-from esp_cli.files.locking import acquire, release
-from esp_cli.files.opening import FolderLostError, HeldFolder
+from esp_cli.files.opening import FolderLostError, HeldFolder, acquire, release
 from esp_cli.files.writing import remove_file, replace_file
 from esp_cli.training import trainer
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint

@@ -15,8 +15,8 @@ os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
 from mlflow.entities import Metric, Param
 from mlflow.tracking import MlflowClient
 
+from esp_cli.files.documents import flat
 from esp_cli.files.opening import own_folder
-from esp_cli.files.tables import flat
 from esp_cli.files.writing import replace_file
 from esp_cli.training.trackers.sink import Row, TrackedRun, scalars
 
