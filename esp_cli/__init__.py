@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from esp_cli.loop.symmetry import Symmetry
     from esp_cli.policies.loaded import LoadedPolicy, load_policy
     from esp_cli.run import Run, train
-    from esp_cli.training.metrics_table import Metrics
+    from esp_cli.training.metrics import Metrics
     from esp_cli.training.trainer import Progress
     from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, discrete_moves, layout
 
@@ -17,7 +17,7 @@ __all__ = ["Continuous", "Discrete", "Field", "Items", "Kind", "Layout", "Loaded
 __all__ += ["Symmetry", "Transitions", "__version__", "discrete_moves", "layout", "load_policy", "train"]
 _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
     "LoadedPolicy": "esp_cli.policies.loaded",
-    "Metrics": "esp_cli.training.metrics_table",
+    "Metrics": "esp_cli.training.metrics",
     "Progress": "esp_cli.training.trainer",
     "Run": "esp_cli.run",
     "Symmetry": "esp_cli.loop.symmetry",

@@ -34,8 +34,7 @@ from esp_cli.policies.loading import TrainedPolicy, register_own
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.config_file import parse_config
-from esp_cli.training.metrics import read_metrics
-from esp_cli.training.metrics_table import Metrics
+from esp_cli.training.metrics import Metrics, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_cli.training.trackers import require
 from esp_cli.training.trainer import Listener, Progress, Trainer

@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +23,16 @@ from torch import Tensor
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import open_own, open_regular, require_held
-from esp_cli.files.writing import MAX_LINE_BYTES, mend_last_line, replacing, write_all
+from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, mend_last_line, replacing, write_all
 from esp_cli.training.trackers import Sink
 from esp_envs.errors import UserError
 
+if TYPE_CHECKING:
+    import pandas
+
+Floats = NDArray[np.float64]
 Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
-
-
-_TAIL_BYTES = 2**18
-"""Longer than most rows."""
 
 
 class MetricsError(UserError):
@@ -44,13 +44,7 @@ class NoMetricError(MetricsError):
 
 
 class MetricsWriter:
-    """Append rows to a JSONL file, each on its way to the file before :meth:`write` returns.
-
-    A torn last line, left by a killed process, is removed when the file is opened.
-
-    Args:
-        path: the JSONL file; made if missing.
-        sinks: what takes each row after the file has it; closed with the file.
+    """Appends rows to a JSONL file, and hands each to sinks, which are closed with it; a torn last line is removed.
 
     Raises:
         MetricsError: the file cannot be opened.
@@ -70,11 +64,7 @@ class MetricsWriter:
         self.close()
 
     def write(self, step: int, values: Mapping[str, Value]) -> None:
-        """Append one row.
-
-        Args:
-            step: env steps per seed so far.
-            values: by name (``train/...``, ``eval/...``, ``time/...``), a number or one number per seed [S].
+        """Append one row at a step: by name (``train/...``, ``eval/...``, ``time/...``) a number, or one per seed [S].
 
         Raises:
             MetricsError: a value is neither a number nor a list of numbers.
@@ -112,7 +102,7 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
-    size, row = _TAIL_BYTES, None
+    size, row = TAIL_BYTES, None
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
         end = start = file.seek(0, os.SEEK_END)
         while row is None and start > 0 and size <= 2 * MAX_LINE_BYTES:
@@ -124,13 +114,9 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
-    """Rewrite a metrics file atomically without its torn last line and without the rows past a step.
+    """Rewrite a metrics file, or make it, without a torn last line and without the rows past the step of a checkpoint.
 
-    What remains is kept byte for byte. A missing file is made.
-
-    Args:
-        path: metrics file.
-        last_step: env steps per seed of the checkpoint that the run goes on from.
+    What remains is kept byte for byte.
 
     Returns:
         The number of whole rows removed.
@@ -151,11 +137,7 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return one metric over time; rows without it are left out, ``null`` is NaN.
-
-    Args:
-        rows: as :func:`read_metrics` returns them.
-        name: name of the metric.
+    """Return one metric of the rows of a run; rows without it are left out, ``null`` is NaN.
 
     Returns:
         Steps [K] (env steps per seed) and values [K, S]; a bare number is a value of one seed.
@@ -180,6 +162,69 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
+class Metrics(Mapping[str, Floats]):
+    """Metrics by name: one row per update, one column per seed, [U, S]; [U, 1] of what the run has as a whole.
+
+    Example:
+        Run("runs/cn").metrics["eval/return_greedy"][-1]  # the last evaluation of each seed
+
+    A number is NaN where it was not measured, or its seed had stopped. The first row is the evaluation before training.
+
+    Args:
+        rows: as `read_metrics` returns them.
+        seeds: of the run.
+
+    Attributes:
+        steps: environment steps per seed at each row, [U].
+        seeds: of the columns, [S].
+    """
+
+    def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
+        self.seeds = tuple(seeds)
+        self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
+        self._arrays: dict[str, Floats] = {}
+        self._whole: set[str] = set()
+        for index, row in enumerate(rows):
+            for name, value in row.items():
+                if name != "step":
+                    if name not in self._arrays:
+                        columns = len(self.seeds) if isinstance(value, list) else 1
+                        self._arrays[name] = np.full((len(rows), columns), math.nan)
+                        self._whole |= set() if isinstance(value, list) else {name}
+                    self._arrays[name][index] = np.array(value, dtype=np.float64)
+
+    def __getitem__(self, name: str) -> Floats:
+        """Return one metric [U, S]."""
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Return the names."""
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        """Return the number of metrics."""
+        return len(self._arrays)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table indexed by steps, with columns (metric, seed); "run" stands for what the run has as a whole.
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # noqa: PLC0415 - not a dependency
+        except ImportError:
+            raise UserError("to_pandas needs pandas, which is not installed: pip install pandas") from None
+        columns = {
+            (name, seed): array[:, column]
+            for name, array in self._arrays.items()
+            for column, seed in enumerate(("run",) if name in self._whole else self.seeds)
+        }
+        table = pd.DataFrame(columns, index=pd.Index(self.steps, name="step"))
+        table.columns = table.columns.set_names(["metric", "seed"])
+        return table
+
+
 def elapsed_s(row: Mapping[str, Any]) -> float:
     """Return the seconds of training up to a row; 0 where it states no number."""
     seconds = row.get("time/elapsed_s")
@@ -189,19 +234,16 @@ def elapsed_s(row: Mapping[str, Any]) -> float:
 def _plain(name: str, value: Value) -> float | int | list[float | int | None] | None:
     """Return a number, or a list of numbers, with None where it is not finite."""
     plain = value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
-    if isinstance(plain, list | tuple):
-        return [_number(name, item) for item in plain]
-    return _number(name, plain)
+    return [_number(name, item) for item in plain] if isinstance(plain, list | tuple) else _number(name, plain)
 
 
 def _number(name: str, value: Any) -> float | int | None:
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None:
+    number = value.item() if isinstance(value, np.generic) else value
+    if number is None:
         return None
-    if not isinstance(value, bool | int | float):
+    if not isinstance(number, bool | int | float):
         raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
-    return value if math.isfinite(value) else None
+    return number if math.isfinite(number) else None
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:

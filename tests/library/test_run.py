@@ -13,8 +13,7 @@ from esp_cli import Progress, Run, load_policy, train
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.run import begin
 from esp_cli.training.config import resolve_config
-from esp_cli.training.metrics import column, read_metrics
-from esp_cli.training.metrics_table import Metrics
+from esp_cli.training.metrics import Metrics, column, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from tests.cli.running import esp
 

@@ -1,0 +1,265 @@
+"""Trackers: where metrics go beside `metrics.jsonl`, which has them all. A tracker that fails does not stop a run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Protocol
+
+from esp_cli.files.documents import flat
+from esp_cli.files.opening import own_folder
+from esp_cli.files.writing import replace_file
+from esp_envs.errors import UserError
+from esp_envs.installed import install
+
+Row = Mapping[str, Any]
+"""Metrics by name: a number, None, or a list with one of them per seed."""
+
+
+@dataclass(frozen=True)
+class TrackedRun:
+    """What a tracker knows of a run.
+
+    Attributes:
+        folder: of the run; a tracker writes below it and nowhere else.
+        seeds: of the run, in the order of the metrics.
+        config: the resolved configuration.
+        first_step: rows after this step are written again by a resumed run.
+    """
+
+    folder: Path
+    seeds: tuple[int, ...]
+    config: Mapping[str, Any]
+    first_step: int = 0
+
+
+class Sink(Protocol):
+    """Takes the rows of a run's metrics as they come."""
+
+    def write(self, step: int, values: Row) -> None:
+        """Take one row at a step (environment steps per seed)."""
+
+    def close(self) -> None:
+        """Flush and close; nothing is written afterwards."""
+
+
+class TensorBoard:
+    """Event files in `tensorboard/`: the mean over seeds, and a sub-folder `seed-k` for each seed's curve over it."""
+
+    def __init__(self, run: TrackedRun) -> None:
+        self._run = run
+        self._boards: dict[int | None, Any] = {}  # SummaryWriter has no types
+        self._board(None)
+
+    def write(self, step: int, values: Row) -> None:
+        """Add a scalar per metric and seed."""
+        for name, seed, value in scalars(values, self._run.seeds):
+            self._board(seed).add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Close the event files."""
+        for board in self._boards.values():
+            board.close()
+
+    def _board(self, seed: int | None) -> Any:
+        if seed not in self._boards:
+            from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - only where it is asked for
+
+            folder = own_folder(self._run.folder / "tensorboard")
+            place = folder if seed is None else own_folder(folder / f"seed-{seed}")
+            # what a resumed run writes again is hidden, also where it begins anew without a checkpoint
+            purge = self._run.first_step + 1 if self._run.first_step else 0
+            self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)
+        return self._boards[seed]
+
+
+class WeightsAndBiases:
+    """Weights & Biases in `wandb/`: offline, unless the environment variable WANDB_MODE says otherwise.
+
+    `wandb sync RUN/wandb/offline-run-*` uploads it. A resumed run goes on under the same id.
+    """
+
+    def __init__(self, run: TrackedRun) -> None:
+        import wandb  # noqa: PLC0415 - only where it is asked for
+
+        self._seeds = run.seeds
+        folder = run.folder.absolute()
+        store = own_folder(folder / "wandb")
+        places = {f"WANDB_{place}_DIR": str(store / place.lower()) for place in ("CACHE", "CONFIG", "DATA", "ARTIFACT")}
+        self._set = [name for name in places if name not in os.environ]  # until the run closes: the next has its own
+        os.environ.update({name: places[name] for name in self._set})
+        os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        mode: Any = os.environ.get("WANDB_MODE", "offline")
+        off = ("disable_git", "disable_code", "disable_job_creation", "x_disable_stats", "x_disable_meta")
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "esp"),
+                name=folder.name,
+                id=recorded(store / "run-id", lambda: secrets.token_hex(4)),
+                resume="allow",
+                dir=str(folder),
+                mode=mode,
+                config=dict(run.config),
+                settings=wandb.Settings(console="off", silent=True, **dict.fromkeys(off, True)),
+            )
+        except BaseException:
+            self._forget_places()
+            raise
+        # not wandb's own step, which may not go back as that of a resumed run does
+        self._run.define_metric("*", step_metric="step")
+
+    def write(self, step: int, values: Row) -> None:
+        """Log the means under their names, and each seed's number under seed-k/NAME."""
+        self._run.log({"step": step, **named(values, self._seeds)})
+
+    def close(self) -> None:
+        """Finish the run."""
+        try:
+            self._run.finish()
+        finally:
+            self._forget_places()
+
+    def _forget_places(self) -> None:
+        for name in self._set:
+            os.environ.pop(name, None)
+
+
+class MlFlow:
+    """MLflow in `mlruns/`, a file store, unless MLFLOW_TRACKING_URI says otherwise; one run of the experiment "esp".
+
+    `mlflow ui --backend-store-uri RUN/mlruns` shows it.
+    """
+
+    def __init__(self, run: TrackedRun) -> None:
+        # read when mlflow is imported or a store is opened; what the user has set stays
+        quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_ALLOW_FILE_STORE": "true"}
+        # a server that does not answer ends the tracking within seconds, not minutes
+        brief = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}
+        for name, value in (quiet | brief).items():
+            os.environ.setdefault(name, value)
+        from mlflow.entities import Metric, Param  # noqa: PLC0415 - reads the environment
+        from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+        folder = run.folder.absolute()
+        store = own_folder(folder / "mlruns")
+        self._seeds, self._metric = run.seeds, Metric
+        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or store.as_uri())
+        found = self._client.get_experiment_by_name("esp")
+        experiment = found.experiment_id if found is not None else self._client.create_experiment("esp")
+
+        def begin() -> str:
+            run_id = self._client.create_run(experiment, run_name=folder.name).info.run_id
+            params = [Param(name, str(value)[:500]) for name, value in flat(run.config)]
+            for first in range(0, len(params), 100):  # as many as one request takes
+                self._client.log_batch(run_id, params=params[first : first + 100])
+            return str(run_id)
+
+        self._run_id = recorded(store / "run-id", begin)
+        self._client.update_run(self._run_id, status="RUNNING")
+
+    def write(self, step: int, values: Row) -> None:
+        """Log the means under their names, and each seed's number under seed-k/NAME."""
+        now_ms = int(time.time() * 1000)
+        metrics = [self._metric(name, value, now_ms, step) for name, value in named(values, self._seeds).items()]
+        for first in range(0, len(metrics), 1000):
+            self._client.log_batch(self._run_id, metrics=metrics[first : first + 1000])
+
+    def close(self) -> None:
+        """Mark the run as ended."""
+        self._client.set_terminated(self._run_id)
+
+
+TRACKERS: dict[str, Callable[[TrackedRun], Sink]] = {
+    "tensorboard": TensorBoard,
+    "wandb": WeightsAndBiases,
+    "mlflow": MlFlow,
+}
+"""The trackers by name, which is that of their package and of the extra that installs it."""
+
+
+class Guarded:
+    """A sink that hands rows to a tracker until the tracker fails; the failure becomes one sentence for the user."""
+
+    def __init__(self, name: str, make: Callable[[], Sink], tell: Callable[[str], None]) -> None:
+        self._name, self._tell = name, tell
+        self._tracker: Sink | None = None
+        self._attempt("open", lambda: setattr(self, "_tracker", make()))
+
+    def write(self, step: int, values: Row) -> None:
+        """Hand over one row, unless the tracker has failed before."""
+        if (tracker := self._tracker) is not None:
+            self._attempt("write", lambda: tracker.write(step, values))
+
+    def close(self) -> None:
+        """Close the tracker, unless it has failed before."""
+        if (tracker := self._tracker) is not None:
+            self._attempt("close", tracker.close)
+
+    def _attempt(self, verb: str, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception as error:  # a tracker is foreign code: whatever it raises, the run goes on
+            failed, self._tracker = self._tracker, None
+            if failed is not None and verb == "write":
+                with contextlib.suppress(Exception):
+                    failed.close()
+            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+            self._tell(f"tracking with {self._name} ended: it cannot {verb} ({reason[:200]}); the run goes on")
+
+
+def require(names: Sequence[str]) -> None:
+    """Refuse unknown trackers, and those whose package is not installed.
+
+    Raises:
+        UserError: with what to install.
+    """
+    for name in names:
+        if name not in TRACKERS:
+            raise UserError(f"there is no tracker '{name}'; the trackers are {', '.join(TRACKERS)}")
+        if find_spec(name) is None:
+            raise UserError(f"{name} is not installed: {install(name)}, or leave out --track {name}")
+
+
+def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:
+    """Open trackers for a run; one that cannot be opened is told and left out.
+
+    Raises:
+        UserError: as of `require`.
+    """
+    require(names)
+    return [Guarded(name, partial(TRACKERS[name], run), tell) for name in dict.fromkeys(names)]
+
+
+def scalars(values: Row, seeds: tuple[int, ...]) -> Iterator[tuple[str, int | None, float]]:
+    """Yield name, seed and number of a row's metrics: the mean over seeds, where the seed is None, then each seed's.
+
+    A metric is left out where any seed has no number, as the mean would be of other seeds than before.
+    """
+    for name, value in values.items():
+        numbers = value if isinstance(value, list) else [value]
+        if not numbers or any(number is None for number in numbers):
+            continue
+        yield name, None, sum(numbers) / len(numbers)
+        if len(numbers) == len(seeds) > 1:
+            yield from ((name, seed, number) for seed, number in zip(seeds, numbers, strict=True))
+
+
+def named(values: Row, seeds: tuple[int, ...]) -> dict[str, float]:
+    """Return the means of a row under their names, and each seed's number under seed-k/NAME."""
+    return {n if seed is None else f"seed-{seed}/{n}": value for n, seed, value in scalars(values, seeds)}
+
+
+def recorded(file: Path, make: Callable[[], str]) -> str:
+    """Return the id of a tracked run that a run folder records; made and recorded where it has none."""
+    if not file.is_file():
+        known = make()
+        file.parent.mkdir(exist_ok=True)
+        replace_file(file, known.encode())
+    return file.read_text(encoding="utf-8").strip()
