@@ -15,9 +15,9 @@ from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, s
 from esp_cli.policies.evaluation import play_batches
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import spread_over_episodes
+from esp_cli.training.checkpoint import describe_policy, write_policy
 from esp_cli.training.folder_names import CONFIG
 from esp_cli.training.play import Episodes, PolicyController
-from esp_cli.training.policy_file import describe_policy, write_policy
 from esp_envs.errors import UserError
 
 

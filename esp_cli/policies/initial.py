@@ -12,9 +12,8 @@ from torch import Tensor
 
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import open_policy
-from esp_cli.training.checkpoint import CheckpointError
+from esp_cli.training.checkpoint import CheckpointError, read_initial
 from esp_cli.training.config import InitialPolicy, RunConfig
-from esp_cli.training.policy_file import read_initial
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest

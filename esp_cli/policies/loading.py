@@ -21,9 +21,9 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.policies import bundled
 from esp_cli.training.build import spec_of
+from esp_cli.training.checkpoint import read_policy
 from esp_cli.training.config import RunConfig, resolve_task_settings
 from esp_cli.training.config_file import parse_config
-from esp_cli.training.policy_file import read_policy
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators
 from esp_envs.base import Environment

@@ -27,9 +27,9 @@ from esp_cli.studies.run_set import Cell, RefusedError, RunSet, StudyError
 from esp_cli.studies.trials import Trials
 from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, score
 from esp_cli.training.build import build_learner
-from esp_cli.training.checkpoint_names import checkpoints_in
 from esp_cli.training.folder_names import JOURNAL, METRICS, TUNING
 from esp_cli.training.metrics import elapsed_s, read_last_row
+from esp_cli.training.run_folder import checkpoints_in
 from esp_envs.errors import UserError
 
 

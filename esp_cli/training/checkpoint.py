@@ -1,8 +1,8 @@
-"""Checkpoint files: named tensors and a JSON description in one safetensors file, written whole or not at all.
+"""Checkpoint and policy files: named tensors and a JSON description in one safetensors file, written atomically.
 
 Loading never runs code, and trusts nothing. The header is checked against the size of the file before anything is
-parsed or allocated. A SHA-256 over description and tensors is verified. So a flipped bit, a truncated copy or a hostile
-file ends in one :class:`CheckpointError`. Policy files are the same container under another ``format_name``.
+parsed or allocated, and a SHA-256 over description and tensors is verified. So a flipped bit, a truncated copy or a
+hostile file ends in one `CheckpointError`.
 
 Layout: the safetensors metadata has the key ``esp``, whose text is a JSON object with ``format``, ``version``,
 ``sha256`` and, beside these three, the writer's own description.
@@ -13,29 +13,32 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import torch
 from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 from torch import Tensor
 
+from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentError, parse_object, shortened
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
+from esp_cli.training.config import InitialPolicy, RunConfig
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import METADATA_KEY, digest
+from esp_envs.mpe.frozen_prey import METADATA_KEY, POLICY_FORMAT, digest
+from esp_envs.spec import TaskSpec
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
-CHECKPOINT_VERSION = 1
+_VERSION = 1  # of both formats
 _RESERVED = ("format", "version", "sha256")
-# parsed JSON takes some 20 times the space of its text, so this bounds the memory that a hostile header can ask for
-_MAX_HEADER_BYTES = 4 * 2**20
+_MAX_HEADER_BYTES = 4 * 2**20  # parsed JSON takes some 20 times the space of its text
 _MAX_FILE_BYTES = 64 * 2**30
 _MAX_DIMENSIONS = 16
 _LENGTH_BYTES = 8
@@ -54,16 +57,14 @@ def save_checkpoint(
     tensors: Mapping[str, Tensor],
     meta: Mapping[str, Any],
     format_name: str = CHECKPOINT_FORMAT,
-    version: int = CHECKPOINT_VERSION,
 ) -> None:
-    """Write tensors and their description atomically.
+    """Write tensors and their description atomically, into a folder that exists.
 
     Args:
-        path: file to write; its folder exists.
+        path: of the file.
         tensors: dense tensors by name, on any device, float, integer or bool. Generator states are uint8 tensors.
         meta: JSON-able description. The keys ``format``, ``version`` and ``sha256`` are the container's own.
         format_name: kind of file, asked for again when it is loaded.
-        version: version of that format.
 
     Raises:
         CheckpointError: a tensor or the description cannot be stored, or the file cannot be written.
@@ -77,7 +78,7 @@ def save_checkpoint(
     except (TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"cannot write {path}: its description is not JSON ({error})") from None
     stored = _storable(path, tensors)
-    described = {"format": format_name, "version": version, **described}
+    described = {"format": format_name, "version": _VERSION, **described}
     described["sha256"] = digest(stored, described)
     content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
@@ -89,15 +90,13 @@ def save_checkpoint(
 def load_checkpoint(
     path: str | os.PathLike[str],
     format_name: str = CHECKPOINT_FORMAT,
-    version: int = CHECKPOINT_VERSION,
     sha256: str | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read and verify what :func:`save_checkpoint` wrote.
+    """Read and verify what `save_checkpoint` wrote.
 
     Args:
-        path: file to read.
+        path: of the file.
         format_name: kind of file that is expected.
-        version: newest version of that format that the caller understands.
         sha256: of the whole file, where somebody else vouches for it (the file's own is verified in any case).
 
     Returns:
@@ -107,25 +106,31 @@ def load_checkpoint(
         CheckpointError: the file is missing, unreadable, truncated, damaged, foreign or of another format.
     """
     with _naming(path):
-        content = _read(Path(path))
+        header, content = _read(Path(path))
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
             raise CheckpointError("is not the file that its manifest names: their SHA-256 differ; get both anew")
-        return _decode(content, format_name, version)
+        description = _description(header, format_name)
+        try:
+            tensors = safetensors_torch.load(content)  # checks that they fill the data exactly: no gap, no overlap
+        except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
+            raise CheckpointError(f"is truncated or damaged: {shortened(str(error))}") from None
+        _check_tensors(tensors)
+        if digest(tensors, {k: v for k, v in description.items() if k != "sha256"}) != description["sha256"]:
+            raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
+    # Copies, since the loader's tensors are not aligned to 64 bytes as torch's own are; only now, since the copy of a
+    # damaged truth value is a sound one.
+    aligned = {name: tensor.clone() for name, tensor in tensors.items()}
+    return aligned, {key: value for key, value in description.items() if key not in _RESERVED}
 
 
 def read_description(path: str | os.PathLike[str], format_name: str = CHECKPOINT_FORMAT) -> dict[str, Any]:
     """Read the description alone from the header of a file; its checksum is not verified.
 
-    Args:
-        path: file to read.
-        format_name: kind of file that is expected.
-
     Raises:
         CheckpointError: the file is missing, unreadable, foreign or of another format, or its header is damaged.
     """
     with _naming(path):
-        header = parse_object(_read(Path(path), whole=False)[_LENGTH_BYTES:], "header")
-        return _description(header, format_name, CHECKPOINT_VERSION)
+        return _description(_read(Path(path), whole=False)[0], format_name)
 
 
 @contextlib.contextmanager
@@ -159,8 +164,8 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     return stored
 
 
-def _read(path: Path, whole: bool = True) -> bytes:
-    """Return the bytes of a plain file that has the size which its header declares; all, or up to its tensors."""
+def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
+    """Return the parsed header of a plain file, and its bytes, after checking that it has the size that it declares."""
     if not path.is_file():
         raise CheckpointError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
     with open_regular(path) as file:
@@ -173,14 +178,15 @@ def _read(path: Path, whole: bool = True) -> bytes:
             raise CheckpointError(
                 "is truncated or no safetensors file: the header that it declares does not fit into it"
             )
-        header = file.read(header_bytes)
+        text = file.read(header_bytes)
+        header = parse_object(text, "header")
         if not whole:
-            return prefix + header
+            return header, b""
         data_bytes = size - _LENGTH_BYTES - header_bytes
-        if size > _MAX_FILE_BYTES or data_bytes != _declared_bytes(parse_object(header, "header")):
+        if size > _MAX_FILE_BYTES or data_bytes != _declared_bytes(header):
             raise CheckpointError(f"is truncated or damaged: its size, {size} bytes, is not what its header declares")
         try:
-            return prefix + header + file.read(data_bytes)
+            return header, prefix + text + file.read(data_bytes)
         except MemoryError:
             raise CheckpointError(f"does not fit into the memory of this machine: it has {size} bytes") from None
 
@@ -194,26 +200,7 @@ def _declared_bytes(header: Mapping[str, Any]) -> int:
         return -1
 
 
-def _decode(content: bytes, format_name: str, version: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return tensors and description; the text of a CheckpointError goes on where the name of the file ends."""
-    (header_bytes,) = struct.unpack_from("<Q", content)
-    header = parse_object(content[_LENGTH_BYTES : _LENGTH_BYTES + header_bytes], "header")
-    description = _description(header, format_name, version)
-    try:
-        tensors = safetensors_torch.load(content)  # checks that they fill the data exactly: no gap, no overlap
-    except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
-        raise CheckpointError(f"is truncated or damaged: {shortened(str(error))}") from None
-    _check_tensors(tensors)
-    expected = description.pop("sha256")
-    if digest(tensors, description) != expected:
-        raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
-    # Copies, since the loader's tensors are not aligned to 64 bytes as torch's own are; only now, since the copy of a
-    # damaged truth value is a sound one.
-    aligned = {name: tensor.clone() for name, tensor in tensors.items()}
-    return aligned, {key: value for key, value in description.items() if key not in _RESERVED}
-
-
-def _description(header: Mapping[str, Any], format_name: str, version: int) -> dict[str, Any]:
+def _description(header: Mapping[str, Any], format_name: str) -> dict[str, Any]:
     """Return the JSON object under the key ``esp`` of a file of the wanted format."""
     metadata = header.get("__metadata__")
     if not isinstance(metadata, dict) or any(not isinstance(value, str) for value in metadata.values()):
@@ -226,16 +213,11 @@ def _description(header: Mapping[str, Any], format_name: str, version: int) -> d
         hint = "; give the run's folder" if description.get("format") == CHECKPOINT_FORMAT else ""
         raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed{hint}")
     number = description.get("version")
-    if not _is_count(number) or not isinstance(description.get("sha256"), str):
+    if type(number) is not int or number < 0 or not isinstance(description.get("sha256"), str):
         raise CheckpointError("is damaged or foreign: it lacks a format version or a checksum")
-    if number > version:
-        raise CheckpointError(f"has version {number} of '{format_name}', newer than {version}; update esp")
+    if number > _VERSION:
+        raise CheckpointError(f"has version {number} of '{format_name}', newer than {_VERSION}; update esp")
     return description
-
-
-def _is_count(value: object) -> TypeGuard[int]:
-    # not isinstance: True and 1.0 would pass for 1
-    return type(value) is int and value >= 0
 
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
@@ -255,3 +237,46 @@ def same(a: Tensor, b: Tensor) -> bool:
     # a part of a longer buffer has strides that no view as bytes can have
     a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
     return torch.equal(a, b)
+
+
+def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
+    """Write a policy file; see `save_checkpoint`."""
+    save_checkpoint(path, tensors, meta, POLICY_FORMAT)
+
+
+def read_policy(path: str | os.PathLike[str], sha256: str | None = None) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read a policy file; see `load_checkpoint`."""
+    return load_checkpoint(path, POLICY_FORMAT, sha256)
+
+
+def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
+    """Return the description by which a policy file is used without its run folder.
+
+    Args:
+        config: of the run, or of the one seed of it that the file holds.
+        spec: of the task.
+        step: environment steps per seed behind it.
+        returns: of greedy episodes, one per seed; NaN where it stopped.
+    """
+    return {
+        "task": config.task,
+        "task_version": spec.version,
+        "network": config.network.name,
+        "activation": getattr(config.network, "activation", None),
+        "step": step,
+        "greedy_returns": [None if math.isnan(x) else x for x in returns],
+        "config": config.model_dump(mode="json"),
+        "esp_version": __version__,
+    }
+
+
+def read_initial(path: Path, recorded: InitialPolicy) -> dict[str, Tensor]:
+    """Read the weights that a run starts from.
+
+    Raises:
+        CheckpointError: they are missing, damaged, or not those that its configuration records.
+    """
+    tensors, _ = read_policy(path)
+    if digest(tensors, {}) != recorded.sha256:
+        raise CheckpointError(f"{path} does not hold the policy that the run started from; train anew")
+    return tensors

@@ -9,9 +9,9 @@ Layout::
     initial-policy.safetensors              the policy that the run started from, where it started from one
     run.lock                                held by the process that trains; says which
 
-Every file but the metrics is replaced as a whole. A process may be killed at any moment: the kernel lets go of its
-lock, and the next one goes on from the newest checkpoint that is good. A checkpoint carries the identity of its run and
-a digest of its configuration; that of another run is neither resumed nor removed.
+Every file but the metrics is replaced as a whole, so that a process may be killed at any moment: the next one goes on
+from the newest checkpoint that is good. A checkpoint carries the identity of its run and a digest of its configuration;
+that of another run is neither resumed nor removed.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -37,20 +38,16 @@ from esp_cli.training.checkpoint import (
     load_checkpoint,
     read_description,
     save_checkpoint,
+    write_policy,
 )
-from esp_cli.training.checkpoint_names import (
-    RUN_ID,
-    Stamp,
-    checkpoints_in,
-    file_name,
-    is_final,
-    step_of,
-    superseded,
-)
-from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY, is_leftover
-from esp_cli.training.policy_file import write_policy
+from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
+from esp_envs.mpe.frozen_prey import POLICY_FORMAT, digest
+
+KEPT_CHECKPOINTS = 2  # so that a damaged newest one leaves another to go on from
+RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"
+"""Keys of `config.json` and of a checkpoint's description; folders and checkpoints of esp 0.1 may lack them."""
+_CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 
 
 class RunFolderError(UserError):
@@ -61,11 +58,7 @@ RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolde
 
 
 def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
-    """Read the `config.json` of a run: its configuration, and its identity where it has one.
-
-    Raises:
-        RunFolderError: it is missing, damaged, foreign or newer.
-    """
+    """Return the configuration that the `config.json` of a run holds, and its identity where it has one."""
     config = RUN_FORMAT.read(path)
     identity = config.pop(RUN_ID, None)
     if not isinstance(identity, str | None):
@@ -77,27 +70,21 @@ class RunFolder:
     """A folder that holds one run; use :meth:`create` or :meth:`open`.
 
     Attributes:
-        path: the folder.
+        path: the folder; `metrics_path`, `policy_path`, `initial_path` and `lock_path` are files in it.
         config: the resolved configuration that the run was made with.
         identity: of the run, drawn when it was made; None of a run of esp 0.1.
-        metrics_path: the file that a MetricsWriter appends to.
-        policy_path: the file of the trained policy.
-        initial_path: the file of the policy that the run started from.
-        lock_path: the file that the process which trains holds.
     """
 
     def __init__(self, path: Path, config: dict[str, Any], identity: str | None = None) -> None:
         self.path, self.config, self.identity = path, config, identity
         self.metrics_path, self.policy_path = path / METRICS, path / POLICY
         self.initial_path, self.lock_path = path / INITIAL, path / LOCK
-        self._stamp = Stamp.of(identity, config)
+        # the device is left out, as a run may go on on another one
+        self._config_sha256 = digest({}, {key: value for key, value in config.items() if key != "device"})
 
     @classmethod
     def create(
-        cls,
-        path: str | os.PathLike[str],
-        config: Mapping[str, Any],
-        initial: Mapping[str, Tensor] | None = None,
+        cls, path: str | os.PathLike[str], config: Mapping[str, Any], initial: Mapping[str, Tensor] | None = None
     ) -> RunFolder:
         """Make a run folder; its configuration is written last, so that a folder with one is complete.
 
@@ -143,38 +130,29 @@ class RunFolder:
             RunFolderError: it is missing, no run folder, or its configuration is damaged, foreign or newer.
         """
         path = Path(path)
-        if not path.is_dir():
-            what = "is a file, not a run folder" if path.exists() else "does not exist"
-            raise RunFolderError(f"{path} {what}; give the folder that esp train --out made")
-        file = path / CONFIG
-        if not file.is_file():
-            raise RunFolderError(
-                f"{path} is no run folder: it has no {CONFIG}; give the folder that esp train --out made"
-            )
-        return cls(path, *read_run_config(file))
+        if (path / CONFIG).is_file():
+            return cls(path, *read_run_config(path / CONFIG))
+        what = "is a file, not a run folder" if path.exists() else "does not exist"
+        what = f"is no run folder: it has no {CONFIG}" if path.is_dir() else what
+        raise RunFolderError(f"{path} {what}; give the folder that esp train --out made")
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the folder, so that no second process writes to it.
-
-        The kernel lets go when the process ends, however it ends. Half-written files that a killed process left are
-        removed.
+        """Hold the folder, so that no second process writes to it; what a killed one left half-written is removed.
 
         Raises:
-            RunFolderError: another process, or this one, holds it already, the file system cannot lock, or the folder
-                of checkpoints is a link.
+            RunFolderError: it is held already, it cannot be locked, or the folder of checkpoints is a link.
         """
-        if (self.path / CHECKPOINTS).is_symlink():
-            raise RunFolderError(
-                f"{self.path / CHECKPOINTS} is a link, which is not followed; put the folder itself there"
-            )
+        checkpoints = self.path / CHECKPOINTS
+        if checkpoints.is_symlink():
+            raise RunFolderError(f"{checkpoints} is a link, which is not followed; put the folder itself there")
         try:
             descriptor = acquire(self.lock_path)
         except LockError as error:
             raise RunFolderError(str(error)) from None
         try:
             with attempting("tidy up", self.path, RunFolderError):
-                for folder in (self.path, self.path / CHECKPOINTS):
+                for folder in (self.path, checkpoints):
                     for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
                         remove_file(file)
                 if self.policy_path.is_file():  # a process was killed before it came to this
@@ -185,7 +163,7 @@ class RunFolder:
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""
-        return self.path / CHECKPOINTS / file_name(step, final)
+        return self.path / CHECKPOINTS / f"step-{step:012d}{'-final' if final else ''}.safetensors"
 
     def checkpoints(self) -> list[Path]:
         """Return the checkpoint files, oldest first."""
@@ -194,52 +172,41 @@ class RunFolder:
     def write_checkpoint(
         self, step: int, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], final: bool = False
     ) -> None:
-        """Write a checkpoint, then remove those that are not needed any more.
+        """Write a checkpoint at a step (env steps per seed), then remove those that are not needed any more.
 
         Write the metrics of the step first: they are flushed to the disk before the checkpoint that stands for them.
-        The newest two and the newest final one are kept. Checkpoints past ``step`` go, as the run has gone back from
-        there; those of another run stay.
-
-        Args:
-            step: env steps per seed.
-            tensors: state by name.
-            meta: JSON-able description; ``step``, the identity and the digest are added.
-            final: training is done.
-
-        Raises:
-            UserError: the file cannot be written, or the folder is no longer the one that is held.
+        The newest two and the newest final one, written when training is done, are kept. Those past ``step`` go, as
+        the run has gone back from there; those of another run stay.
         """
         path = self.checkpoint_path(step, final)
         with attempting("write", path, RunFolderError):
             require_held(path)
             path.parent.mkdir(exist_ok=True)
             sync_file(self.metrics_path)
-        save_checkpoint(path, tensors, {**meta, **self._stamp.entries(), "step": step})
-        self._remove(superseded(self.checkpoints(), step))
+        stamp = {RUN_ID: self.identity, CONFIG_SHA256: self._config_sha256}
+        save_checkpoint(path, tensors, {**meta, **stamp, "step": step})
+        regular, finals, past = list[Path](), list[Path](), list[Path]()
+        for file in self.checkpoints():
+            (past if step_of(file) > step else finals if _is_final(file) else regular).append(file)
+        self._remove([*past, *regular[:-KEPT_CHECKPOINTS], *finals[:-1]])
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
         """Write the trained policy as a file of its own that needs no run folder; training is done with that.
 
         Checkpoints before the final one go: with a replay they are large, and nothing goes on from them any more.
-
-        Raises:
-            UserError: the file cannot be written, or a checkpoint cannot be removed.
         """
         write_policy(self.policy_path, tensors, meta)
         self._remove_superseded()
 
     def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """Load the newest good checkpoint.
-
-        Args:
-            note: told, in a sentence for the user, of a damaged one that is passed over.
+        """Load the newest good checkpoint; `note` is told, in a sentence, of a damaged one that is passed over.
 
         Returns:
             Its tensors, on the CPU, and its description, with ``step``; None where the run has written none yet.
 
         Raises:
-            RunFolderError: there are checkpoints, and all are damaged, or the newest good one is of another run or
-                another configuration.
+            RunFolderError: there are checkpoints, and all are damaged.
+            CheckpointError: the newest good one is of another run or another configuration.
         """
         problem = None
         for file in reversed(self.checkpoints()):
@@ -251,10 +218,10 @@ class RunFolder:
                 if file.exists():  # another process may have ended the run, and removed it, since it was listed
                     problem = problem or str(error)
                 continue
-            self._stamp.require(file, meta)
+            self._require_own(file, meta)
             if problem:
                 note(f"{problem}; going back to step {step_of(file)}")
-            return tensors, {key: value for key, value in meta.items() if key not in self._stamp.entries()}
+            return tensors, {key: value for key, value in meta.items() if key not in (RUN_ID, CONFIG_SHA256)}
         if problem:
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
         return None
@@ -269,18 +236,47 @@ class RunFolder:
                     return version
         return None
 
+    def _require_own(self, file: Path, meta: Mapping[str, Any]) -> None:
+        """Refuse a checkpoint of another run, or one that was written under another configuration."""
+        if meta.get(RUN_ID) != self.identity:
+            raise CheckpointError(f"{file} is a checkpoint of another run; move it out of this folder")
+        if meta.get(CONFIG_SHA256, self._config_sha256) != self._config_sha256:
+            raise CheckpointError(
+                f"{file} was written under another configuration than that in {self.path / CONFIG}; restore that "
+                "file, or train anew under another --out"
+            )
+
     def _remove_superseded(self) -> None:
         """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
-        if any(map(is_final, files)):
-            self._remove([file for file in files if not is_final(file)])
+        if any(map(_is_final, files)):
+            self._remove(file for file in files if not _is_final(file))
 
     def _remove(self, checkpoints: Iterable[Path]) -> None:
-        """Remove checkpoints, but none of another run."""
+        """Remove checkpoints, but none of another run; a damaged one does not say of which it is."""
         for file in checkpoints:
-            with attempting("remove", file, RunFolderError):
-                if not self._stamp.is_foreign(file):
+            own = True
+            with contextlib.suppress(CheckpointError):
+                own = read_description(file).get(RUN_ID) == self.identity
+            if own:
+                with attempting("remove", file, RunFolderError):
                     remove_file(file)
+
+
+def checkpoints_in(run: Path) -> list[Path]:
+    """Return the checkpoint files of a run folder, oldest first."""
+    folder = run / CHECKPOINTS
+    files = folder.iterdir() if folder.is_dir() else ()
+    return sorted(file for file in files if _CHECKPOINT_NAME.fullmatch(file.name))
+
+
+def step_of(checkpoint: Path) -> int:
+    """Return the step that a checkpoint's name says."""
+    return int(checkpoint.name[len("step-") :][:12])
+
+
+def _is_final(checkpoint: Path) -> bool:
+    return checkpoint.name.endswith("-final.safetensors")
 
 
 def _refuse_taken(path: Path) -> None:
@@ -289,6 +285,15 @@ def _refuse_taken(path: Path) -> None:
         raise RunFolderError(
             f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
         )
-    foreign = sorted(entry.name for entry in path.iterdir() if not is_leftover(entry))
+    foreign = sorted(entry.name for entry in path.iterdir() if not _is_leftover(entry))
     if foreign:
         raise RunFolderError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")
+
+
+def _is_leftover(entry: Path) -> bool:
+    """Return whether `RunFolder.create`, killed before its end, may have left this."""
+    if entry.name == CHECKPOINTS:
+        return entry.is_dir() and not any(entry.iterdir())
+    if entry.name == METRICS:
+        return entry.is_file() and entry.stat().st_size == 0
+    return entry.name in (LOCK, INITIAL) or entry.name.startswith(TEMPORARY_PREFIX)

@@ -17,11 +17,10 @@ from torch import Tensor
 
 from esp_cli.algorithms.normalisation import with_variances
 from esp_cli.training.build import build_environment, build_learner, first_look
-from esp_cli.training.checkpoint import same
+from esp_cli.training.checkpoint import describe_policy, read_initial, same
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
 from esp_cli.training.play import PolicyController, play
-from esp_cli.training.policy_file import describe_policy, read_initial
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators, stream_seeds
 from esp_cli.training.trackers import TrackedRun, open_trackers, require

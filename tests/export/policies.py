@@ -9,9 +9,8 @@ import torch
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
-from esp_cli.training.checkpoint import save_checkpoint
+from esp_cli.training.checkpoint import describe_policy, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.policy_file import describe_policy
 from esp_cli.training.streams import generators
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 

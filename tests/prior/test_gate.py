@@ -15,8 +15,8 @@ from esp_cli.prior.gate import Gate, fit_gate, gated
 from esp_cli.prior.regression import inputs_of
 from esp_cli.symmetry import transform_set
 from esp_cli.training.build import build_learner
+from esp_cli.training.checkpoint import read_policy
 from esp_cli.training.config import resolve_config
-from esp_cli.training.policy_file import read_policy
 from esp_envs import make
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, Field, Kind, Spaces, layout

@@ -16,8 +16,8 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.checkpoint import read_policy
 from esp_cli.training.config import resolve_config
-from esp_cli.training.policy_file import read_policy
 from esp_envs import make
 from esp_envs.compass import Compass, framed
 from esp_envs.spec import joint_layout

@@ -37,9 +37,8 @@ from esp_cli.studies.engine_ray import (
 from esp_cli.studies.run_set import Cell
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import Study, StudyFolder
-from esp_cli.training.checkpoint_names import checkpoints_in, step_of
 from esp_cli.training.metrics import read_metrics
-from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.run_folder import RunFolder, checkpoints_in, step_of
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
 from tests.studies.test_tuning import tuning
