@@ -59,7 +59,7 @@ def _with_file(
     file = read_config_file(path)
     named = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
     named |= {"seeds"} if was_given(context, "seed_list") else set()
-    if file.is_complete:
+    if file.config is not None:
         for name in ("task", "algorithm", "preset"):
             if name in named and given[name] != file.choices[name]:
                 flag = _flag(name)
@@ -73,9 +73,9 @@ def _with_file(
     kept = file.settings
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
-    if file.is_complete:
+    if file.config is not None:
         kept = _fitting(kept, settings)
-    chosen = set(settings) if file.is_complete else {*kept, *settings}
+    chosen = set(settings) if file.config is not None else {*kept, *settings}
     return given | filled, kept | settings, chosen
 
 

@@ -22,7 +22,6 @@ from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import default_transforms
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make, task_class
-from esp_envs.spec import TaskSpec
 
 SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
 """The sections that settings of every run have, and where its configuration holds them."""
@@ -81,29 +80,21 @@ class RunConfig(Strict):
             "task": task.without_effect(),
             "prior": self.prior.without_effect() | of_others,
             "network": self.network.without_effect() | ({"compiled"} if self.device == "cuda" else set()),
-            self.algorithm: settings.without_effect(self.network, self._spec),
+            self.algorithm: settings.without_effect(
+                self.network, lambda: make(self.task, 1, (0,), self.task_settings).spec
+            ),
         }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
 
-    def _spec(self) -> TaskSpec:
-        """Return the contract of the task; for that it makes one world."""
-        return make(self.task, 1, (0,), self.task_settings).spec
-
     def own_words(self, *others: RunConfig) -> list[str]:
-        """Return the options that name what is not installed, each once, for a command about this run and others.
-
-        For example ["--task", "mine:Task"].
-        """
+        """Return the options that name code of the user in a command about runs, each once: ["--task", "mine:Task"]."""
         runs = (self, *others)
         chosen = [(("--task", run.task), ("--algo", run.algorithm), ("--network", run.network.name)) for run in runs]
         named = dict.fromkeys((option, name) for pairs in chosen for option, name in pairs if ":" in name)
         return [word for pair in named for word in pair]
 
     def command(self) -> str:
-        """Return the `esp train` command line that resolves to this configuration, quoted for a shell.
-
-        What is the default of the command, or of the preset, is left out.
-        """
+        """Return the `esp train` command line that resolves to this configuration, without what is the default."""
         # so that no world is made with other settings than the user's: what another task declares is said
         declared = None if TASKS.ships(self.task) else {"prior.transforms": PriorConfig().transforms}
         plain = resolve_config(self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device, declared)
@@ -146,13 +137,12 @@ def resolve_config(
     Args:
         task: registered task name.
         algorithm: registered algorithm name.
-        preset: one of the algorithm's presets; "default" takes what measured best on the task, where that is known,
-            "fast" what reaches the same return in fewer seconds.
+        preset: one of the algorithm's: "default" takes what measured best on the task, where that is known, "fast"
+            what reaches the same return in fewer seconds.
         steps: environment steps per seed.
         seeds: run seeds.
         device: "cpu" or "cuda".
-        overrides: dotted names to values: "mappo.learning_rate", "task.num_agents", "network.hidden",
-            "prior.kind", "evaluation.episodes". Text is read as JSON where that is possible.
+        overrides: dotted names to values, such as "mappo.learning_rate"; text is read as JSON where that is possible.
 
     Raises:
         UserError: an unknown name or a value out of range, in one sentence.
@@ -164,9 +154,14 @@ def resolve_config(
     if prior.kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
         chosen = default_transforms(make(task, 1, (0,), task_settings).spec, not prior.needs_declaration)
         prior = prior.model_copy(update={"transforms": chosen})
-    _refuse_loss_without_terms(algorithm, prior)
-    network = network_class(sections["network"].get("name", "mlp"))
-    owner = f"the network {sections['network'].get('name', 'mlp')}"
+    learner = ALGORITHMS[algorithm]
+    if prior.terms == "policy" and prior.coefficient > 0 and not learner.has_policy_term:
+        raise UserError(
+            f"prior.terms=policy leaves {algorithm} without a consistency loss, since it learns values and has no "
+            "policy to compare; use prior.terms=value, or both"
+        )
+    name = sections["network"].get("name", "mlp")
+    network = validated(network_class(name), sections["network"], "network", f"the network {name}")
     values = {
         "task": task,
         "algorithm": algorithm,
@@ -174,10 +169,8 @@ def resolve_config(
         "steps": steps,
         "seeds": tuple(seeds),
         "task_settings": task_settings,
-        "algorithm_settings": validated(
-            ALGORITHMS[algorithm].config_class, sections[algorithm], algorithm
-        ).model_dump(),
-        "network": validated(network, sections["network"], "network", owner).decided(steps, device),
+        "algorithm_settings": validated(learner.config_class, sections[algorithm], algorithm).model_dump(),
+        "network": network.decided(steps, device),
         "prior": prior,
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
         "device": device,
@@ -188,11 +181,7 @@ def resolve_config(
 def _override(
     sections: dict[str, dict[str, object]], overrides: Mapping[str, object], task: str, algorithm: str
 ) -> None:
-    """Set what the user chose, and drop what a preset chose for another network or for declared transforms.
-
-    Raises:
-        UserError: a name is not SECTION.NAME, or a number is not finite.
-    """
+    """Set what the user chose, and drop what a preset chose for another network or for declared transforms."""
     for dotted, value in overrides.items():
         section, dot, key = dotted.rpartition(".")
         if not dot or section not in sections:
@@ -206,15 +195,6 @@ def _override(
             del sections["network"][name]
     if sections["prior"].get("kind") == "auto" and "prior.transforms" not in overrides:
         sections["prior"].pop("transforms", None)
-
-
-def _refuse_loss_without_terms(algorithm: str, prior: PriorConfig) -> None:
-    """Refuse a consistency loss of the policy alone for a learner that has no policy to compare."""
-    if prior.terms == "policy" and prior.coefficient > 0 and not ALGORITHMS[algorithm].has_policy_term:
-        raise UserError(
-            f"prior.terms=policy leaves {algorithm} without a consistency loss, since it learns values and has no "
-            "policy to compare; use prior.terms=value, or both"
-        )
 
 
 def _no_section(dotted: str, task: str, algorithm: str) -> str:
@@ -233,49 +213,33 @@ def _no_section(dotted: str, task: str, algorithm: str) -> str:
 
 
 def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:
-    """Return the settings, by section, that a preset and the task change.
-
-    Raises:
-        UserError: there is no such algorithm, or it has no such preset.
-    """
-    learner = ALGORITHMS[algorithm]
-    layers = preset_layers(task, algorithm, preset)
-    asked = learner.task_settings
-    known = task_class(task).Settings.model_fields
+    """Return the settings, by section, that a preset and the task change."""
+    asked, known = ALGORITHMS[algorithm].task_settings, task_class(task).Settings.model_fields
     sections: dict[str, dict[str, object]] = {"task": {name: asked[name] for name in asked if name in known}}
     sections |= {name: {} for name in (algorithm, "network", "prior", "evaluation")}
-    for layer in layers:
+    for layer in preset_layers(task, algorithm, preset):
         for section, values in layer.items():
             sections[section].update(values)
     return sections
 
 
 def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str, Any]:
-    """Fill in the defaults of a task's settings.
-
-    Raises:
-        UserError: an unknown task or setting, or a value out of range, in one sentence.
-    """
+    """Return a task's settings with its defaults; raises a UserError for an unknown one or a value out of range."""
     return validated(task_class(task).Settings, settings, "task").model_dump()
 
 
 def completed(config: RunConfig) -> RunConfig:
-    """Return a stored configuration with the defaults of the settings that its task and learner gained since.
-
-    Raises:
-        UserError: its task or algorithm is unknown.
-    """
+    """Return a stored configuration with the defaults of the settings that its task and learner gained since."""
     models: dict[str, type[BaseModel]] = {
         "task_settings": task_class(config.task).Settings,
         "algorithm_settings": ALGORITHMS[config.algorithm].config_class,
     }
-    return config.model_copy(update={part: _defaults(models[part]) | getattr(config, part) for part in models})
-
-
-def _defaults(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the defaults of a model, as JSON shows them."""
-    fields = {name: field for name, field in model.model_fields.items() if not field.is_required()}
-    return {name: to_jsonable_python(f.get_default(call_default_factory=True)) for name, f in fields.items()}
+    changes = {}
+    for part, model in models.items():
+        fields = {name: field for name, field in model.model_fields.items() if not field.is_required()}
+        defaults = {name: f.get_default(call_default_factory=True) for name, f in fields.items()}
+        changes[part] = to_jsonable_python(defaults) | getattr(config, part)
+    return config.model_copy(update=changes)
 
 
 def _read(value: object) -> object:

@@ -17,8 +17,7 @@ from esp_cli.training.run_folder import RunFolder, read_run_config
 from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
-CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from")
-"""What a file may choose beside settings."""
+CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from")  # of a file, beside settings
 
 
 @dataclass(frozen=True)
@@ -29,18 +28,13 @@ class ConfigFile:
         path: of the file.
         choices: of `CHOICES`, those that it names; numbers of steps and seeds may be text, as 500k.
         settings: dotted names to values, as `--set` takes them.
-        config: of the run, where it is one, and so says everything.
+        config: of the run, where it is the configuration of one, and so says everything.
     """
 
     path: Path
     choices: dict[str, Any]
     settings: dict[str, Any]
     config: RunConfig | None = None
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether it is the configuration of a run, and so says everything."""
-        return self.config is not None
 
 
 def read_config_file(path: Path) -> ConfigFile:
@@ -85,12 +79,7 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
 
 
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
-    """Read a stored configuration.
-
-    Args:
-        data: as JSON gave it.
-        source: the run folder or file, for the message.
-        writer: version of esp that stored it, where that is known.
+    """Validate a configuration that a run folder or file holds, as JSON gave it and a version of esp wrote it.
 
     Raises:
         UserError: it is damaged or of another version.
@@ -111,7 +100,6 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
 
 
 def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:
-    """Refuse stored settings that a task or an algorithm does not have."""
     try:
         validate(model, settings)
     except ValidationError as error:

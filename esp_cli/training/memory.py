@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -14,25 +15,14 @@ from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 _FLOAT_BYTES = 4
-_COPIES_OF_WEIGHTS = 4
-"""Weights, gradients, and the two moments of Adam."""
+_COPIES_OF_WEIGHTS = 4  # weights, gradients, and the two moments of Adam
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
 """Where Linux says what the processes of a container may take, in its second and first version of control groups."""
-_PROCESS_BYTES = 500 * 2**20
-"""Memory of a process with torch and its libraries, before it trains."""
+_PROCESS_BYTES = 500 * 2**20  # of a process with torch and its libraries, before it trains
 
 
 def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> None:
-    """Refuse a run that needs more memory than the machine has.
-
-    Args:
-        config: of the run.
-        settings: hyperparameters of its algorithm.
-        spec: of its task.
-
-    Raises:
-        UserError: it does not fit; the message names the setting that needs most of it.
-    """
+    """Refuse a run that needs more memory than the machine has; the error names the setting that needs most of it."""
     needed = least_bytes(config, settings, spec)
     available = machine_bytes(config.device)
     if sum(needed.values()) > available:
@@ -61,12 +51,7 @@ def least_bytes(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> d
 
 
 def process_bytes(config: RunConfig, spec: TaskSpec) -> int:
-    """Return the memory that a process which trains a run is given on a cluster: twice what it has to hold, and torch.
-
-    Args:
-        config: of the run.
-        spec: of its task as the policy meets it.
-    """
+    """Return the memory for a process that trains a run on a cluster: twice what it has to hold, and torch."""
     settings = ALGORITHMS[config.algorithm].config_class(**config.algorithm_settings)
     return _PROCESS_BYTES + 2 * sum(least_bytes(config, settings, spec).values())
 
@@ -76,15 +61,10 @@ def machine_bytes(device: str) -> int:
     if device == "cuda":
         return torch.cuda.get_device_properties(0).total_memory
     installed = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return min([installed, *(limit for file in _LIMITS if (limit := _number_in(file)) is not None)])
-
-
-def _number_in(file: Path) -> int | None:
-    """Return the number that a file of the kernel holds, None where there is no such file or it says "max"."""
-    try:
-        return int(file.read_text())
-    except (OSError, ValueError):
-        return None
+    for file in _LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # there is no such file, or it says "max"
+            installed = min(installed, int(file.read_text()))
+    return installed
 
 
 def _gigabytes(size: int) -> str:

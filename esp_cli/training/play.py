@@ -24,12 +24,7 @@ class Controller(Protocol):
 
 
 class PolicyController:
-    """A trained policy, greedy or drawing its actions.
-
-    Args:
-        policy: S policies.
-        generators: one per seed for action noise, or None to act greedily.
-    """
+    """S trained policies, which draw their actions with a generator per seed, or without any act greedily."""
 
     def __init__(self, policy: Policy, generators: Sequence[torch.Generator] | None = None) -> None:
         self.policy, self.generators = policy, generators
@@ -49,10 +44,7 @@ class PolicyController:
 
 
 class ScriptedController:
-    """A policy of the task itself, such as its random one or a heuristic.
-
-    Args:
-        choose: returns the action of an environment.
+    """A policy of the task itself, such as its random one or a heuristic, as a function of the environment.
 
     Example:
         >>> play(env, ScriptedController(methodcaller("heuristic"))).returns

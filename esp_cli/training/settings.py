@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,6 +14,7 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 from esp_envs.errors import UserError
+from esp_envs.installed import Registry
 from esp_envs.registry import TASKS, task_class
 
 _UNITS = {
@@ -31,6 +32,9 @@ _UNITS = {
     "_landmark_extent": "length",
 }
 """Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
+
+
+Kind = Literal["algorithm", "task", "network", "prior", "evaluation"]
 
 
 @dataclass(frozen=True)
@@ -63,28 +67,21 @@ class Section:
     """The settings of one task, algorithm or network, or of every run, in the order of their model."""
 
     name: str
-    kind: Literal["algorithm", "task", "network", "prior", "evaluation"]
+    kind: Kind
     settings: tuple[Setting, ...]
 
 
 def sections() -> Iterator[Section]:
     """Yield the sections of everything that is built in: learners, tasks, networks, prior, evaluation."""
-    for name in filter(ALGORITHMS.ships, ALGORITHMS):
-        yield Section(name, "algorithm", _settings(name, ALGORITHMS[name].config_class))
-    yield from map(task_section, filter(TASKS.ships, TASKS))
-    for name in filter(NETWORKS.ships, NETWORKS):
-        yield Section(name, "network", _settings("network", NETWORKS[name]))
+    for kind, (registry, _) in _KINDS.items():
+        yield from (_section(kind, name) for name in filter(registry.ships, registry))
     yield Section("prior", "prior", _settings("prior", PriorConfig))
     yield Section("evaluation", "evaluation", _settings("evaluation", EvaluationConfig))
 
 
 def task_section(name: str) -> Section:
-    """Return the settings of one task, which may be of the caller.
-
-    Raises:
-        UserError: there is no such task.
-    """
-    return Section(name, "task", _settings("task", task_class(name).Settings))
+    """Return the settings of one task, which may be of the caller; raises a UserError where there is no such task."""
+    return _section("task", name)
 
 
 def own_section(name: str) -> Section:
@@ -94,19 +91,26 @@ def own_section(name: str) -> Section:
         UserError: the module cannot be imported, or holds none of these by that name.
     """
     refusals = []
-    for registry in (TASKS, ALGORITHMS, NETWORKS):
+    for kind, (registry, _) in _KINDS.items():
         try:
             registry.register(name)
         except UserError as refusal:
             refusals.append(str(refusal))
             continue
-        if registry is ALGORITHMS:
-            return Section(name, "algorithm", _settings(name, ALGORITHMS[name].config_class))
-        if registry is NETWORKS:
-            return Section(name, "network", _settings("network", NETWORKS[name]))
-        return task_section(name)
+        return _section(kind, name)
     strange = f"'{name}' is no task, algorithm or network; check its base class"
     raise UserError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
+
+
+_KINDS: dict[Kind, tuple[Registry[Any], Callable[[str], type[BaseModel]]]] = {
+    "algorithm": (ALGORITHMS, lambda name: ALGORITHMS[name].config_class),
+    "task": (TASKS, lambda name: task_class(name).Settings),
+    "network": (NETWORKS, lambda name: NETWORKS[name]),
+}
+
+
+def _section(kind: Kind, name: str) -> Section:
+    return Section(name, kind, _settings(name if kind == "algorithm" else kind, _KINDS[kind][1](name)))
 
 
 def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
@@ -118,7 +122,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             type=_type(schema[name]),
             default=schema[name].get("default"),
             bounds=_bounds(schema[name]),
-            unit=str(schema[name].get("unit", "")) or _unit(name),
+            unit=str(schema[name].get("unit", "")) or next((_UNITS[e] for e in _UNITS if f"_{name}".endswith(e)), ""),
             description=field.description or "",
             presets=_changes(section, name, PRESETS)
             | _changes(section, name, FAST, "fast on ")
@@ -147,12 +151,12 @@ def _shapes(schema: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def _type(schema: Mapping[str, Any]) -> str:
     words = {"boolean": "flag", "string": "text", "array": "list"}
-    found = []
+    found: dict[str, None] = {}
     for shape in _shapes(schema):
         word = str(shape.get("type", "text"))
         inner = f" of {_type(shape['items'])}s" if "items" in shape else ""
-        found.append(words.get(word, word) + inner)
-    return " or ".join(dict.fromkeys(found))
+        found[words.get(word, word) + inner] = None  # each once, in their order
+    return " or ".join(found)
 
 
 def _bounds(schema: Mapping[str, Any]) -> str:
@@ -168,7 +172,3 @@ def _bounds(schema: Mapping[str, Any]) -> str:
             words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
             found.append(" ".join(f"{word} {shape[key]:g}" for key, word in words.items() if key in shape))
     return ", ".join(filter(None, found))
-
-
-def _unit(name: str) -> str:
-    return next((unit for ending, unit in _UNITS.items() if f"_{name}".endswith(ending)), "")
