@@ -8,7 +8,7 @@ import numpy as np
 
 from esp_cli.defaults import __version__
 from esp_cli.export.check import Sample
-from esp_cli.export.layers import Program
+from esp_cli.export.program import Program
 from esp_cli.networks.heads import BoundedGaussian
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.registry import task_class

@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from esp_cli.export.layers import Floats, Program
+from esp_cli.export.layers import Floats
+from esp_cli.export.program import Program
 from esp_cli.networks.heads import masked
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy

@@ -1,8 +1,13 @@
-"""Whether what builds an e-puck's observation from poses agrees with the task, in thousands of states."""
+"""What surrounds an exported policy that drives e-pucks: C, a Webots project, a ROS 2 package, and checks of them.
+
+Untested in Webots, in ROS 2 and on hardware. What builds an observation from poses is compared with the task in
+thousands of states.
+"""
 
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +16,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from esp_cli.export.c_check import compiled
-from esp_cli.export.layers import Floats
-from esp_cli.export.runtime.esp_epuck import Pilot
+from esp_cli.defaults import __version__
+from esp_cli.export.c_file import compiled, numbers
+from esp_cli.export.layers import Floats, literal
+from esp_cli.export.runtime.esp_epuck import FIELDS, PATIENCE_S, Pilot
+from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
+from esp_envs.epuck.arena import Arena
+from esp_envs.errors import UserError
 
 STATES = 10_000
 """States on which the observations built from poses are compared with the task\'s."""
@@ -24,13 +33,86 @@ TOLERANCE = 1e-5
 """Largest difference of an observation's number; float32 in metres gives 1e-6."""
 Observer = Callable[[Floats, Floats, Floats], Floats]
 """(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
+ROS2_PACKAGE = "esp_formation"
+_WEBOTS_RELEASE = "R2023b"
 _WORLDS = 100
-_JITTER_M = 0.001
-"""Noise on the task\'s positions: in a perfect square two robots are equally near."""
-_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}
-"""The noise of a robot's sensors in training, which poses do not show."""
-_UNSEEN = ("heading_offset_rad", "blind_sector_rad")
-"""Settings of what a robot sees that are not built from poses."""
+_JITTER_M = 0.001  # noise on the task's positions: in a perfect square two robots are equally near
+_EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}  # of a robot's sensors in training, which poses do not show
+_UNSEEN = ("heading_offset_rad", "blind_sector_rad")  # settings of what a robot sees that are not built from poses
+
+
+def builds_observations(settings: Mapping[str, object]) -> bool:
+    """Return whether what a robot sees is built from poses under these settings of its task."""
+    return not any(settings[name] for name in _UNSEEN)
+
+
+def seen_robots(settings: Mapping[str, Any]) -> int:
+    """Return how many other robots an observation shows."""
+    return min(settings["neighbours"], settings["num_agents"] - 1)
+
+
+def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the header and the source that build observations from poses and drive the wheels.
+
+    Args:
+        description: of an exported policy without memory that drives e-pucks.
+
+    Raises:
+        UserError: the policy sees something that poses do not tell.
+    """
+    robot, settings = description["robot"], description["task"]["settings"]
+    fields = [(field["field"], field["index"].partition("..")[0]) for field in description["observation"]]
+    names, nearness = {name for name, _ in fields}, settings["sight"] == "nearness"
+    if unknown := names - FIELDS:
+        raise UserError(f"poses do not tell what this policy sees: {', '.join(sorted(unknown))}")
+    body, unit, others = robot["body_radius_m"], settings["goal_sight_m"], seen_robots(settings)
+    values = {
+        "fields": fields,
+        "pairs": numbers([x for option in description["action"].get("options", ()) for x in option["means"]]),
+        "sees_bodies": bool({"obstacle", "robots"} & names),
+        "nearness": nearness,
+        "seen": others,
+        "team": others + 1,
+        "least_pillars": int("obstacle" in names and not nearness),
+        "period": literal(description["task"]["control_period_s"]),
+        "patience": literal(PATIENCE_S),
+        "pillar_reach": literal(settings["obstacle_radius_m"] + body),
+        "robot_reach": literal(2 * body),
+        "fading": literal(robot["fading_m"]),
+        "goal_unit": None if unit is None else literal(unit),
+        "max_speed": literal(robot["max_wheel_speed_rad_s"]),
+    }
+    return {name: filled(name, **values) for name in ("esp_epuck.h", "esp_epuck.c")}
+
+
+def project_files(kind: str, policy: Mapping[str, bytes], settings: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return a project of Webots or a package of ROS 2 around a policy in Python.
+
+    Args:
+        kind: "webots" or "ros2".
+        policy: the files of the policy.
+        settings: of the task, as an export describes them.
+    """
+    side, radius = settings["arena_m"], settings["obstacle_radius_m"]
+    arena = Arena(side, settings["num_agents"], settings["num_obstacles"], radius)
+    pillars = arena.pillars().tolist()
+    if kind == "webots":
+        folder = "controllers/esp_epuck_webots"
+        robots = [(x, y, math.atan2(-y, -x)) for x, y in arena.posts().tolist()]
+        lengths = {"side": f"{side:g}", "height": f"{1.5 * side:g}", "radius": f"{radius:g}"}
+        world = filled("formation.wbt", release=_WEBOTS_RELEASE, pillars=pillars, robots=robots, **lengths)
+        around = {"worlds/formation.wbt": world}
+    else:
+        folder = ROS2_PACKAGE
+        shown = [round(x, 4) for place in pillars for x in place]
+        values = {"package": ROS2_PACKAGE, "version": __version__, "pillars": shown}
+        names = {"package.xml": "", "setup.cfg": "", "setup.py": "", "formation.launch.py": "launch/"}
+        around = {f"{place}{name}": filled(name, **values) for name, place in names.items()}
+        init = b'"""An exported policy and the node that drives e-pucks by it."""\n'
+        around |= {f"resource/{ROS2_PACKAGE}": b"", f"{ROS2_PACKAGE}/__init__.py": init}
+    # Read, not imported: the drivers import what only a robot's machine has.
+    drivers = {name: (RUNTIME / name).read_bytes() for name in ("esp_epuck.py", f"esp_epuck_{kind}.py")}
+    return {f"{folder}/{name}": content for name, content in {**policy, **drivers}.items()} | around
 
 
 @dataclass(frozen=True)
@@ -48,11 +130,6 @@ class Scenes:
     goals: Floats
     pillars: Floats
     observations: Floats
-
-
-def builds_observations(settings: Mapping[str, object]) -> bool:
-    """Return whether what a robot sees is built from poses under these settings of its task."""
-    return not any(settings[name] for name in _UNSEEN)
 
 
 @torch.no_grad()
@@ -78,10 +155,9 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool
     reach = float(str(env.spec.settings["arena_m"])) / 2
     for name in ("position", "goals", "obstacles"):
         if name in where:
-            shape = rows[:, where[name]].shape
-            rows[:, where[name]] = (
-                rows[:, where[name]] + rng.normal(0, _JITTER_M, shape) if near else rng.uniform(-reach, reach, shape)
-            )
+            own = rows[:, where[name]]
+            moved = own + rng.normal(0, _JITTER_M, own.shape) if near else rng.uniform(-reach, reach, own.shape)
+            rows[:, where[name]] = moved
     if not near:
         turn = rng.uniform(-np.pi, np.pi, (len(rows), env.spec.num_agents))
         rows[:, where["heading"]] = np.stack([np.cos(turn), np.sin(turn)], -1).reshape(len(rows), -1)
@@ -97,10 +173,6 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool
 
 def compare_scenes(scenes: Scenes, observe: Observer) -> float:
     """Return the largest difference between the task's observations and those built from poses.
-
-    Args:
-        scenes: states and what the task shows in them.
-        observe: builds observations from poses.
 
     Raises:
         RuntimeError: they do not agree, which is a bug.

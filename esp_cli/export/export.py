@@ -1,21 +1,28 @@
-"""Exports of a policy: written, checked against the policy itself, and only then put into the user's folder."""
+"""Exports of a policy: written, checked against the policy itself, and only then put into the user's folder.
+
+A format is one entry of `FORMATS`; `templates/README.md.jinja` says how its files are used.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
 
 from esp_cli.defaults import __version__
-from esp_cli.export import c_check, epuck, epuck_files
-from esp_cli.export.c_source import Cost, cost
-from esp_cli.export.card import describe, shortly, spaces, title
-from esp_cli.export.check import Agreement, compare, take_sample
-from esp_cli.export.formats import FORMATS, Files, Job
-from esp_cli.export.templates import filled
-from esp_cli.export.translate import program_of
+from esp_cli.export import c_file, epuck
+from esp_cli.export.card import describe, shortly, spaces, summary, title
+from esp_cli.export.check import Agreement, Runner, Sample, compare, take_sample
+from esp_cli.export.numpy_file import numpy_runner, numpy_source
+from esp_cli.export.onnx_file import onnx_model, onnx_runner
+from esp_cli.export.program import Program, program_of
+from esp_cli.export.templates import RUNTIME, filled
+from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_cli.files.documents import parse_object
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
@@ -27,6 +34,41 @@ STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
 
 DESCRIPTION = "policy.json"
 MAX_DESCRIPTION_BYTES = 1 << 26
+Files = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every format is written from.
+
+    Attributes:
+        trained: one seed's policy.
+        program: the same as plain arrays.
+        sample: of what it does.
+        description: what `policy.json` holds.
+        scenes: states of the task; None unless the policy can drive an e-puck.
+    """
+
+    trained: TrainedPolicy
+    program: Program
+    sample: Sample
+    description: dict[str, Any]
+    scenes: epuck.Scenes | None
+
+
+@dataclass(frozen=True)
+class Format:
+    """How a policy is written for another program.
+
+    Attributes:
+        write: returns its files.
+        run: makes what acts by the files in a folder, to be compared with the policy.
+        observer: makes what builds observations from poses by the files in a folder; None where the format has no such.
+    """
+
+    write: Callable[[Job], Files]
+    run: Callable[[Path, Program], Runner]
+    observer: Callable[[Path, Job], epuck.Observer] | None = None
 
 
 @dataclass(frozen=True)
@@ -64,7 +106,75 @@ class Exported:
     formats: tuple[Export, ...]
     parameters: int
     flops: int
-    c: Cost | None
+    c: c_file.Cost | None
+
+
+def _c(job: Job) -> Files:
+    example = job.description["example"]
+    rows = (np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask"))
+    files = c_file.c_source(job.program, summary(job.trained, job.program))
+    files |= {"policy_example.c": c_file.example_source(job.program, *rows)}
+    return files if job.scenes is None else files | epuck.c_files(job.description)
+
+
+def _policy(job: Job) -> Files:
+    return {"policy.py": numpy_source(job.program, summary(job.trained, job.program), job.description)}
+
+
+def _numpy(job: Job) -> Files:
+    beside = {} if job.scenes is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
+    return _policy(job) | beside
+
+
+def _robot(job: Job, kind: str) -> Files:
+    """Return the numpy policy with what a robot's program needs around it."""
+    spec = job.trained.spec
+    prior = job.trained.config.prior.effective()
+    if compass := prior.compass:
+        label = f" and the agent's number, from {-compass:g} to {compass:g}" if "agents" in prior.transforms else ""
+        raise UserError(
+            f"webots and ros2 build what a robot sees from poses, and know no compass; train without prior.compass, or "
+            f"export numpy or c and end each observation with {compass:g}, 0, 0, {compass:g}{label}"
+        )
+    if "robot" not in job.description:
+        raise UserError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
+    if not epuck.builds_observations(spec.settings):
+        raise UserError(
+            "webots and ros2 build what a robot sees from poses, without heading_offset_rad and blind_sector_rad; "
+            "train without them, or export numpy or c"
+        )
+    if job.program.memory_width:
+        raise UserError("webots and ros2 take policies that remember nothing; export one without --network gru")
+    return epuck.project_files(kind, _policy(job), spec.settings)
+
+
+def _run_numpy(folder: Path, _: Program) -> Runner:
+    return numpy_runner(folder / "policy.py")
+
+
+def _observe_in_python(_: Path, job: Job) -> epuck.Observer:
+    return epuck.python_observer(job.description)
+
+
+FORMATS = {
+    "onnx": Format(
+        lambda job: {"policy.onnx": onnx_model(job.program, json.dumps(job.description))},
+        lambda folder, _: onnx_runner(folder / "policy.onnx"),
+    ),
+    "torch": Format(
+        lambda job: {"policy.pt2": torch_archive(job.program, json.dumps(job.description))},
+        lambda folder, _: torch_runner(folder / "policy.pt2"),
+    ),
+    "c": Format(
+        _c,
+        lambda folder, program: c_file.c_runner(folder / "policy.c", program),
+        lambda folder, job: epuck.c_observer(folder, job.program.num_inputs),
+    ),
+    "numpy": Format(_numpy, _run_numpy, _observe_in_python),
+    "webots": Format(lambda job: _robot(job, "webots"), _run_numpy, _observe_in_python),
+    "ros2": Format(lambda job: _robot(job, "ros2"), _run_numpy, _observe_in_python),
+}
+"""The formats by name; `esp export` lists them without importing them, and -f policy beside them."""
 
 
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
@@ -91,11 +201,11 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written["README.md"] = _readme(job, results)
     _write(written, folder, force)
     program = job.program
-    return Exported(results, program.num_parameters, program.flops, cost(program) if "c" in formats else None)
+    return Exported(results, program.num_parameters, program.flops, c_file.cost(program) if "c" in formats else None)
 
 
 def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
-    program = replace(program_of(trained.policy), masked=trained.spec.masks)
+    program = program_of(trained.policy, trained.spec.masks)
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = any(FORMATS[name].observer for name in formats) and not program.memory_width
@@ -134,14 +244,14 @@ def _write(files: Files, folder: Path, force: bool) -> None:
 def _checked(name: str, files: Files, job: Job) -> Export:
     """Run a format's files in a folder of their own beside the policy."""
     size, form = sum(map(len, files.values())), FORMATS[name]
-    if name == "c" and c_check.compiler() is None:
+    if name == "c" and c_file.compiler() is None:
         return Export(name, tuple(files), size, None, "there is no C compiler cc here, so the source was not run")
     with TemporaryDirectory(prefix="esp-export-") as scratch:
         folder = Path(scratch)
         for file, content in files.items():
             (folder / Path(file).name).write_bytes(content)
         agreement = compare(job.sample, form.run(folder, job.program))
-        if name == "c" and not c_check.example_runs(folder):
+        if name == "c" and not c_file.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
         seen = None
         if job.scenes is not None and form.observer is not None:
@@ -162,7 +272,7 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         results=results,
         remembers=job.program.memory_width > 0,
         masked=job.program.masked,
-        c=cost(job.program),
+        c=c_file.cost(job.program),
         flash_bytes=STM32F4_FLASH_BYTES,
         ram_bytes=STM32F4_RAM_BYTES,
         flops=job.program.flops,
@@ -170,5 +280,5 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         robot=description["robot"] if robotic else None,
         settings=spec.settings,
         fields=[field["field"] for field in description["observation"]],
-        seen_robots=epuck_files.seen_robots(spec.settings) if robotic else 0,
+        seen_robots=epuck.seen_robots(spec.settings) if robotic else 0,
     )

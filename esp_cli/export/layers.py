@@ -1,285 +1,248 @@
-"""A policy as plain arrays: the layers, memory and head of one seed's greedy policy, which every export is made from.
+"""The kinds of layers that exports know, each with its form in C, ONNX and torch.
 
-A program maps a row of observation, and of memory where it has one, to outputs, an action and the next memory:
-
-    x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
-    x = layer(x) for each layer
-    action = argmax(x)                     head `choose`, among the allowed actions where the task has masks; or
-    action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
-
-The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
-agents exchange messages, the rows of a world's agents are adjacent.
+A kind is a function here, an entry of `LAYERS` in `runtime/numpy_policy.py` and a function of `runtime/layers.c`.
 """
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from esp_envs.spec import others_of
 
 Floats = NDArray[np.float32]
 
-NORM_EPSILON = 1e-5
-"""Layer normalisation adds this to the variance (torch's default)."""
-SQUASH_EPSILON = 1e-18
-"""Squashing adds this to the squared length (`esp_cli.networks.heads.squash`)."""
+NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch does by default
 
 
+@dataclass(frozen=True)
 class Layer:
-    """One step of a program.
+    """One step of a program: rows x to rows y.
 
     Attributes:
         kind: its name in JSON.
+        flops: operations for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one.
+        c: statements, in the macros of `templates/policy.c.jinja`; w0, w1, ... stand for the arrays.
+        onnx: an operation a line, in ONNX's text format; w0, w1, ... stand for the arrays, numbers for constants.
+        torch: makes y [rows, width] of x, the arrays, and the observations [rows, D]; the kind `gru` takes the hidden
+            state [rows, H] instead of the latter.
+        arrays: learned numbers, in the order in which exports store them.
+        onnx_arrays: what ONNX stores instead of them, where that differs.
+        numbers: what JSON says of it, beside the shapes of the arrays.
+        width: of the widest row that it reads or writes, where another layer does not tell.
     """
 
     kind: str
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """The learned arrays, in the order in which exports store them."""
-        return ()
-
-    @property
-    def flops(self) -> int:
-        """Operations for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one."""
-        return 0
+    flops: int
+    c: str
+    onnx: str
+    torch: Callable[[Tensor, list[Tensor], Tensor], Tensor]
+    arrays: tuple[Floats, ...] = ()
+    onnx_arrays: tuple[Floats, ...] = ()
+    numbers: tuple[tuple[str, float], ...] = ()
+    width: int = 0
 
     def describe(self) -> dict[str, object]:
         """Return the layer as JSON stores it: without its weights, but with their shapes."""
-        numbers = {name: value for name, value in vars(self).items() if not isinstance(value, np.ndarray | Layer)}
-        return {"kind": self.kind, **numbers, "shapes": [list(array.shape) for array in self.arrays]}
+        return {"kind": self.kind, **dict(self.numbers), "shapes": [list(array.shape) for array in self.arrays]}
 
 
-@dataclass(frozen=True)
-class Learned(Layer):
-    """A layer with a weight and a bias."""
-
-    weight: Floats
-    bias: Floats
-
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """Weight and bias."""
-        return self.weight, self.bias
-
-    @property
-    def inputs(self) -> int:
-        """Rows of the weight."""
-        return len(self.weight)
-
-    @property
-    def outputs(self) -> int:
-        """Numbers of the bias."""
-        return self.bias.size
+def affine(weight: Floats, bias: Floats) -> Layer:
+    """Return x W + b with W [in, out] and b [out]."""
+    inputs, outputs = weight.shape
+    return Layer(
+        "affine",
+        flops=2 * weight.size,
+        c=f"EACH affine(w0, w1, {inputs}, {outputs}, X, Y);\nSWAP;",
+        onnx="y = Gemm(x, w0, w1)",
+        torch=lambda x, w, _: torch.addmm(w[1], x, w[0]),
+        arrays=(weight, bias),
+        width=max(inputs, outputs),
+    )
 
 
-class Affine(Learned):
-    """x W + b with W [in, out] and b [out]."""
-
-    kind = "affine"
-
-    @property
-    def flops(self) -> int:
-        """A multiplication and an addition for each weight."""
-        return 2 * self.weight.size
-
-
-class Norm(Learned):
-    """(x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
-
-    kind = "norm"
-
-    @property
-    def flops(self) -> int:
-        """Sums for mean and variance (1 + 3 a number), then four operations a number."""
-        return 8 * self.weight.size
+def norm(weight: Floats, bias: Floats) -> Layer:
+    """Return (x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
+    return Layer(
+        "norm",
+        flops=8 * weight.size,  # a number: sums for mean and variance (1 + 3), then four operations
+        c=f"EACH normalise(w0, w1, {weight.size}, X);",
+        onnx="y = LayerNormalization<axis = -1, epsilon = 0.00001>(x, w0, w1)",
+        torch=lambda x, w, _: F.layer_norm(x, x.shape[-1:], w[0], w[1], NORM_EPSILON),
+        arrays=(weight, bias),
+    )
 
 
-@dataclass(frozen=True)
-class Activation(Layer):
-    """Relu or tanh of every number of a row `width` wide."""
+def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
+    """Return relu or tanh of every number of a row."""
+    return Layer(
+        kind,
+        flops=width,
+        c=f"EACH apply_{kind}(X, {width});",
+        onnx=f"y = {kind.capitalize()}(x)",
+        torch=lambda x, *_: torch.relu(x) if kind == "relu" else torch.tanh(x),
+        numbers=(("width", width),),
+    )
 
-    kind: Literal["relu", "tanh"]
-    width: int
 
-    @property
-    def flops(self) -> int:
-        """One a number."""
-        return self.width
+def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats) -> Layer:
+    """Return a gated recurrent unit of H numbers: r, z = s(p + q); n = tanh(p + r q); h' = n + z (h - n).
 
-
-@dataclass(frozen=True)
-class Recurrent(Layer):
-    """A gated recurrent unit of H numbers: r, z = s(p + q); n = tanh(p + r q); h' = n + z (h - n).
-
-    p = x W + b and q = h U + c, each in the order r, z, n.
+    p = x W + b and q = h U + c, each in the order r, z, n; W, b, U, c in the order of the arguments.
     """
+    size = len(hidden_weight)
 
-    input: Affine
-    recurrent: Affine
-    kind = "gru"
+    def advance(x: Tensor, w: list[Tensor], hidden: Tensor) -> Tensor:
+        pr, pz, pn = torch.addmm(w[1], x, w[0]).chunk(3, -1)
+        qr, qz, qn = torch.addmm(w[3], hidden, w[2]).chunk(3, -1)
+        reset, update = torch.sigmoid(pr + qr), torch.sigmoid(pz + qz)
+        candidate = torch.tanh(pn + reset * qn)
+        return candidate + update * (hidden - candidate)
 
-    @property
-    def hidden(self) -> int:
-        """H."""
-        return self.recurrent.inputs
+    return Layer(
+        "gru",
+        # per number two sigmoids (four operations each, sums included), tanh and the interpolation
+        flops=2 * (weight.size + hidden_weight.size) + 14 * size,
+        c=f"""
+            affine(w0, w1, {len(weight)}, 3 * {size}, x, into);
+            affine(w2, w3, {size}, 3 * {size}, memory, back);
+            recur({size}, into, back, memory);
+            memcpy(x, memory, sizeof(float) * {size});""",
+        onnx="""
+            p = Gemm(x, w0, w1)
+            q = Gemm(hidden, w2, w3)
+            pr, pz, pn = Split<axis = 1>(p)
+            qr, qz, qn = Split<axis = 1>(q)
+            r = Add(pr, qr)
+            reset = Sigmoid(r)
+            z = Add(pz, qz)
+            update = Sigmoid(z)
+            rq = Mul(reset, qn)
+            n = Add(pn, rq)
+            candidate = Tanh(n)
+            difference = Sub(hidden, candidate)
+            step = Mul(update, difference)
+            y = Add(candidate, step)""",
+        torch=advance,
+        arrays=(weight, bias, hidden_weight, hidden_bias),
+    )
 
-    @property
-    def arrays(self) -> tuple[Floats, ...]:
-        """W, b, U and c."""
-        return (*self.input.arrays, *self.recurrent.arrays)
 
-    @property
-    def flops(self) -> int:
-        """Both products; per number two sigmoids (four operations each, sums included), tanh and the interpolation."""
-        return self.input.flops + self.recurrent.flops + 14 * self.hidden
-
-
-@dataclass(frozen=True)
-class Slice(Layer):
-    """Columns `begin` to `end` of a row."""
-
-    begin: int
-    end: int
-    kind = "slice"
+def cut(begin: int, end: int) -> Layer:
+    """Return columns `begin` to `end` of a row."""
+    return Layer(
+        "slice",
+        flops=0,
+        c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
+        onnx=f"y = Slice(x, [{begin}], [{end}], [1])",
+        torch=lambda x, *_: x[:, begin:end],
+        numbers=(("begin", begin), ("end", end)),
+    )
 
 
-@dataclass(frozen=True)
-class Convolution(Learned):
-    """A filter of side k at every `stride`-th place: [channels x rows x columns] to [outputs x h x w], channels first.
+def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side: int, stride: int) -> Layer:
+    """Return a filter at every `stride`-th place of pictures, channels first.
 
-    The weight is [channels * k * k, outputs], counted by channel, then row, then column.
+    Args:
+        weight: [channels * side * side, outputs], counted by channel, then row, then column.
+        bias: [outputs].
+        shape: channels, rows and columns of a picture.
+        side: of the filter.
+        stride: places between two of its outputs, along either axis.
     """
-
-    channels: int
-    rows: int
-    columns: int
-    side: int
-    stride: int
-    kind = "convolution"
-
-    @property
-    def filters(self) -> Floats:
-        """The weight as [outputs, channels, k, k]."""
-        return self.weight.T.reshape(self.outputs, self.channels, self.side, self.side)
-
-    @property
-    def places(self) -> tuple[int, int]:
-        """Rows h and columns w of the output."""
-        return (self.rows - self.side) // self.stride + 1, (self.columns - self.side) // self.stride + 1
-
-    @property
-    def width(self) -> int:
-        """Width of the output."""
-        return self.outputs * math.prod(self.places)
-
-    @property
-    def flops(self) -> int:
-        """A multiplication and an addition for each weight and place."""
-        return 2 * self.weight.size * math.prod(self.places)
+    (channels, rows, columns), outputs = shape, bias.size
+    _, high, wide = convolved(shape, outputs, side, stride)
+    filters = (outputs, channels, side, side)
+    return Layer(
+        "convolution",
+        flops=2 * weight.size * high * wide,
+        c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X, Y);\nSWAP;",
+        onnx=f"""
+            pictures = Reshape(x, [-1,{channels},{rows},{columns}])
+            filtered = Conv<strides = [{stride}, {stride}]>(pictures, w0, w1)
+            y = Reshape(filtered, [-1,{outputs * high * wide}])""",
+        torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
+        arrays=(weight, bias),
+        onnx_arrays=(weight.T.reshape(filters), bias),
+        numbers=(("channels", channels), ("rows", rows), ("columns", columns), ("side", side), ("stride", stride)),
+        width=outputs * high * wide,
+    )
 
 
-@dataclass(frozen=True)
-class GlobalMaxPool(Layer):
-    """The largest number of each channel: [channels x places] to [channels]."""
-
-    channels: int
-    places: int
-    kind = "global_max_pool"
-
-    @property
-    def flops(self) -> int:
-        """A comparison for each place but the first."""
-        return self.channels * (self.places - 1)
+def convolved(shape: tuple[int, int, int], outputs: int, side: int, stride: int) -> tuple[int, int, int]:
+    """Return channels, rows and columns that a convolution makes of a picture."""
+    return outputs, (shape[1] - side) // stride + 1, (shape[2] - side) // stride + 1
 
 
-@dataclass(frozen=True)
-class MessageAggregation(Layer):
-    """Own features x beside the neighbours' mean message: [x, mean relative position / reach, mean of their x].
+def global_max_pool(channels: int, places: int) -> Layer:
+    """Return the largest number of each channel: [channels x places] to [channels]."""
+    return Layer(
+        "global_max_pool",
+        flops=channels * (places - 1),
+        c=f"EACH global_max_pool({channels}, {places}, X, Y);\nSWAP;",
+        onnx=f"""
+            channels = Reshape(x, [-1,{channels},{places}])
+            y = ReduceMax<axes = [2], keepdims = 0>(channels)""",
+        torch=lambda x, *_: x.unflatten(1, (channels, places)).amax(2),
+        numbers=(("channels", channels), ("places", places)),
+    )
+
+
+def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
+    """Return own features x beside the neighbours' mean message: [x, mean relative position / reach, mean of their x].
 
     The observation holds the relative positions of the others from column `begin` on, two numbers each, in team order.
     Neighbours have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
     itself.
     """
+    others, reach, index = team - 1, math.sqrt(reach_squared), others_of(team)
 
-    begin: int
-    team: int
-    width: int
-    reach_squared: float
-    kind = "aggregate"
+    def hear(x: Tensor, _: Any, observation: Tensor) -> Tensor:
+        ways = observation[:, begin : begin + 2 * others].unflatten(1, (others, 2))
+        near = (ways.square().sum(2, keepdim=True) < reach_squared).float()
+        share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
+        messages = x.unflatten(0, (-1, team))[:, torch.tensor(index)].flatten(0, 1)
+        return torch.cat([x, (share * (ways / reach)).sum(1), (share * messages).sum(1)], 1)
 
-    @property
-    def others(self) -> int:
-        """Agents of the team but one."""
-        return self.team - 1
+    return Layer(
+        "aggregate",
+        # per other agent: distance (3), comparison, count, and two operations per number of position and features
+        flops=others * (9 + 2 * width) + 4,
+        c=f"aggregate(observation + {begin}, {width}, {literal(reach_squared)}, {literal(reach)}, x, y);\nSWAP;",
+        onnx=f"""
+            positions = Slice(observation, [{begin}], [{begin + 2 * others}], [1])
+            ways = Reshape(positions, [-1,{others},2])
+            squares = Mul(ways, ways)
+            distances = ReduceSum(squares, [2])
+            within = Less(distances, {reach_squared})
+            near = Cast<to = 1>(within)
+            count = ReduceSum(near, [1])
+            divisor = Add(count, 1.0)
+            share = Div(near, divisor)
+            units = Div(ways, {reach})
+            shared_ways = Mul(share, units)
+            mean_way = ReduceSum<keepdims = 0>(shared_ways, [1])
+            worlds = Reshape(x, [-1,{team},{width}])
+            gathered = Gather<axis = 1>(worlds, {json.dumps(index, separators=(",", ":"))})
+            others = Reshape(gathered, [-1,{others},{width}])
+            shared = Mul(share, others)
+            message = ReduceSum<keepdims = 0>(shared, [1])
+            y = Concat<axis = 1>(x, mean_way, message)""",
+        torch=hear,
+        numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),
+    )
 
-    @property
-    def end(self) -> int:
-        """The column after the last relative position."""
-        return self.begin + 2 * self.others
 
-    @property
-    def reach(self) -> float:
-        """Unit of the relative positions."""
-        return math.sqrt(self.reach_squared)
-
-    @property
-    def flops(self) -> int:
-        """Per other agent: distance (3), comparison, count, and two operations per number of position and features."""
-        return self.others * (9 + 2 * self.width) + 4
-
-
-@dataclass(frozen=True)
-class Program:
-    """One greedy policy.
-
-    Attributes:
-        num_inputs: D, numbers of an observation.
-        layers: in their order.
-        num_outputs: numbers of the last layer.
-        hidden: H, numbers of the hidden state; 0 for a policy that remembers nothing.
-        previous: numbers of the previous action in the memory.
-        head: how the outputs become an action.
-        groups: widths of what is squashed together; empty where the head chooses.
-        team: agents that act together, with their rows side by side; 1 where each acts by itself.
-        masked: whether a mask of the allowed actions [A] comes with every observation; one that allows none allows all.
-    """
-
-    num_inputs: int
-    layers: tuple[Layer, ...]
-    num_outputs: int
-    hidden: int
-    previous: int
-    head: Literal["choose", "squash"]
-    groups: tuple[int, ...]
-    team: int = 1
-    masked: bool = False
-
-    @property
-    def memory_width(self) -> int:
-        """Numbers that it carries from step to step."""
-        return self.hidden + self.previous
-
-    @property
-    def weights(self) -> bytes:
-        """Every array of every layer, one after the other, as little-endian float32."""
-        return b"".join(array.astype("<f4").tobytes() for layer in self.layers for array in layer.arrays)
-
-    @property
-    def num_parameters(self) -> int:
-        """Learned numbers."""
-        return len(self.weights) // 4
-
-    @property
-    def flops(self) -> int:
-        """Operations for one action."""
-        own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
-        return sum(layer.flops for layer in self.layers) + own
-
-    def describe(self) -> dict[str, object]:
-        """Return the program without its weights, as JSON stores it."""
-        names = ("num_inputs", "num_outputs", "hidden", "previous", "head", "groups", "team", "masked")
-        return {name: getattr(self, name) for name in names} | {"layers": [layer.describe() for layer in self.layers]}
+def literal(value: float) -> str:
+    """Return a float32 in C in full: nine digits tell every one apart."""
+    text = f"{value:.9g}"
+    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"

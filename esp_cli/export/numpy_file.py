@@ -8,26 +8,28 @@ import json
 import textwrap
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
 from esp_cli.export.check import Numbers, Runner
-from esp_cli.export.layers import Floats, Program
+from esp_cli.export.layers import Floats
+from esp_cli.export.program import Program
 from esp_cli.export.runtime import numpy_policy
 from esp_cli.export.templates import filled
 
 
-def numpy_source(program: Program, comment: str, description: str) -> bytes:
+def numpy_source(program: Program, comment: str, description: dict[str, Any]) -> bytes:
     """Write a program as a Python file: the runtime as it is, then this policy's numbers.
 
     Args:
         program: the policy.
         comment: what it is, line by line.
-        description: JSON with layout, actions and the worked example.
+        description: layout, actions and the worked example.
     """
     return filled(
         "policy.py",
         comment=comment.replace("\\", "/").replace('"""', "'''"),
         runtime=inspect.getsource(numpy_policy).partition("annotations\n\n")[2],
-        description=json.dumps(json.loads(description), indent=1, ensure_ascii=True),
+        description=json.dumps(description, indent=1),
         program=json.dumps(program.describe()),
         weights="\n".join(textwrap.wrap(base64.b64encode(program.weights).decode(), 112)),
     )

@@ -12,65 +12,14 @@ from typing import Any
 import numpy as np
 
 from esp_cli.defaults import __version__
-from esp_cli.export import layers
 from esp_cli.export.check import Numbers, Runner
-from esp_cli.export.layers import Floats, Program
+from esp_cli.export.layers import Floats, Layer
+from esp_cli.export.program import SQUASH_EPSILON, Program
 from esp_envs.errors import UserError
 from esp_envs.installed import install
-from esp_envs.spec import others_of
 
-OPSET = 17
-"""The first with layer normalisation; runtimes since 2022 read it."""
-IR_VERSION = 8
+OPSET, IR_VERSION = 17, 8  # the first with layer normalisation; runtimes since 2022 read it
 
-_LAYERS: dict[type[layers.Layer], str] = {
-    layers.Affine: "y = Gemm(x, w0, w1)",
-    layers.Activation: "y = {function}(x)",
-    layers.Norm: "y = LayerNormalization<axis = -1, epsilon = 0.00001>(x, w0, w1)",
-    layers.Recurrent: """
-        p = Gemm(x, w0, w1)
-        q = Gemm(hidden, w2, w3)
-        pr, pz, pn = Split<axis = 1>(p)
-        qr, qz, qn = Split<axis = 1>(q)
-        r = Add(pr, qr)
-        reset = Sigmoid(r)
-        z = Add(pz, qz)
-        update = Sigmoid(z)
-        rq = Mul(reset, qn)
-        n = Add(pn, rq)
-        candidate = Tanh(n)
-        difference = Sub(hidden, candidate)
-        step = Mul(update, difference)
-        y = Add(candidate, step)""",
-    layers.Slice: "y = Slice(x, [{0.begin}], [{0.end}], [1])",
-    layers.Convolution: """
-        pictures = Reshape(x, [-1,{0.channels},{0.rows},{0.columns}])
-        filtered = Conv<strides = [{0.stride}, {0.stride}]>(pictures, w0, w1)
-        y = Reshape(filtered, [-1,{0.width}])""",
-    layers.GlobalMaxPool: """
-        channels = Reshape(x, [-1,{0.channels},{0.places}])
-        y = ReduceMax<axes = [2], keepdims = 0>(channels)""",
-    layers.MessageAggregation: """
-        positions = Slice(observation, [{0.begin}], [{0.end}], [1])
-        ways = Reshape(positions, [-1,{0.others},2])
-        squares = Mul(ways, ways)
-        distances = ReduceSum(squares, [2])
-        within = Less(distances, {0.reach_squared})
-        near = Cast<to = 1>(within)
-        count = ReduceSum(near, [1])
-        divisor = Add(count, 1.0)
-        share = Div(near, divisor)
-        units = Div(ways, {0.reach})
-        shared_ways = Mul(share, units)
-        mean_way = ReduceSum<keepdims = 0>(shared_ways, [1])
-        worlds = Reshape(x, [-1,{0.team},{0.width}])
-        gathered = Gather<axis = 1>(worlds, {index})
-        others = Reshape(gathered, [-1,{0.others},{0.width}])
-        shared = Mul(share, others)
-        message = ReduceSum<keepdims = 0>(shared, [1])
-        y = Concat<axis = 1>(x, mean_way, message)""",
-}
-"""A line an operation, from x to y; w0, w1, ... are the layer's arrays, and numbers stand for constants."""
 _MASK = """
     flags = Cast<to = 1>(action_mask)
     largest = ReduceMax<axes = [1], keepdims = 1>(flags)
@@ -85,7 +34,7 @@ _ENCODE = """
 _SQUASH = f"""
     squares = Mul(outputs, outputs)
     sums = MatMul(squares, same_group)
-    positive = Add(sums, {layers.SQUASH_EPSILON})
+    positive = Add(sums, {SQUASH_EPSILON})
     length = Sqrt(positive)
     bounded = Tanh(length)
     scale = Div(bounded, length)
@@ -135,7 +84,7 @@ def onnx_model(program: Program, description: str) -> bytes:
     hidden = "hidden"
     for k, layer in enumerate(program.layers):
         x = graph.add_layer(k, layer, x)
-        hidden = x if isinstance(layer, layers.Recurrent) else hidden
+        hidden = x if layer.kind == "gru" else hidden
     graph.add(f"outputs = Identity({x})")
     encoded = "action"
     if choose:
@@ -144,7 +93,7 @@ def onnx_model(program: Program, description: str) -> bytes:
             graph.add(_MASK)
         graph.add(f"action = ArgMax<axis = -1, keepdims = 0>({'scores' if program.masked else 'outputs'})")
         if program.previous:
-            graph.add(_ENCODE.format(every=_compact([list(range(program.num_outputs))])))
+            graph.add(_ENCODE.format(every=str([list(range(program.num_outputs))]).replace(" ", "")))
             encoded = "encoded"
     else:
         groups = np.repeat(np.arange(len(program.groups)), program.groups)
@@ -177,16 +126,13 @@ class _Graph:
             start, arguments = line.removesuffix(")").rsplit("(", 1)
             self.lines.append(f"{start}({', '.join(map(self._named, arguments.split(', ')))})")
 
-    def add_layer(self, k: int, layer: layers.Layer, x: str) -> str:
+    def add_layer(self, k: int, layer: Layer, x: str) -> str:
         """Add what layer k makes of x, and return its name."""
-        index = _compact(others_of(layer.team)) if isinstance(layer, layers.MessageAggregation) else ""
-        text = _LAYERS[type(layer)].format(layer, function=layer.kind.capitalize(), index=index)
-        arrays = (layer.filters, layer.bias) if isinstance(layer, layers.Convolution) else layer.arrays
+        arrays = layer.onnx_arrays or layer.arrays
         self.constants |= {f"w{i}_{k}": array for i, array in enumerate(arrays)}
-        names = [name for line in text.splitlines() for name in line.partition(" = ")[0].strip().split(", ")]
-        names += [f"w{i}" for i in range(len(layer.arrays))]
-        renamed = {name: f"{name}_{k}" for name in names} | {"x": x}
-        self.add(re.sub(r"\b[a-z]\w*", lambda match: renamed.get(match[0], match[0]), text))
+        names = [name for line in layer.onnx.splitlines() for name in line.partition(" = ")[0].strip().split(", ")]
+        renamed = {name: f"{name}_{k}" for name in (*names, *(f"w{i}" for i in range(len(arrays))))} | {"x": x}
+        self.add(re.sub(r"\b[a-z]\w*", lambda match: renamed.get(match[0], match[0]), layer.onnx))
         return f"y_{k}"
 
     def _named(self, argument: str) -> str:
@@ -198,10 +144,6 @@ class _Graph:
         name = f"c{len(self.constants)}"
         self.constants[name] = np.array(value, np.int64 if isinstance(value, list) else np.float32)
         return name
-
-
-def _compact(value: object) -> str:
-    return json.dumps(value, separators=(",", ":"))
 
 
 def onnx_runner(file: Path) -> Runner:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.export import c_check
+from esp_cli.export import c_file
 from esp_cli.policies.bundled import MANIFEST, bundled_folder, read_bundled
 from tests.cli.running import DAMAGE, esp, refused
 
@@ -23,7 +23,7 @@ def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "out" / "policy.json").read_text())["policy"]["seed"] in (3, 7)
 
 
-@pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None:
     result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7, "--json", "-")
     written = json.loads(result.stdout)
@@ -36,7 +36,7 @@ def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None
 def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(c_check, "compiler", lambda: None)
+    monkeypatch.setattr(c_file, "compiler", lambda: None)
     result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7)
     assert "there is no C compiler cc here" in result.stderr
     assert "Not compared with the policy" in (tmp_path / "README.md").read_text()

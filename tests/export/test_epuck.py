@@ -15,14 +15,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from esp_cli.export import c_check, check, epuck
-from esp_cli.export.epuck_files import c_files
+from esp_cli.export import c_file, check, epuck
 from esp_cli.export.export import export
 from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
 from esp_envs.epuck.arena import Arena
 from tests.export.policies import drawn_policy
 
-needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
     "offset": {},
     "goal in its unit": {"goal_sight_m": 0.3},
@@ -82,7 +81,7 @@ def test_an_observation_that_is_built_wrongly_is_found(monkeypatch: pytest.Monke
 def described(trained) -> dict:
     """Return what the exports of a policy are written from."""
     from esp_cli.export.card import describe
-    from esp_cli.export.translate import program_of
+    from esp_cli.export.program import program_of
 
     program = program_of(trained.policy)
     return describe(trained, program, check.take_sample(trained, program, 16))
@@ -92,7 +91,7 @@ def test_what_poses_do_not_tell_is_refused() -> None:
     description = described(drawn_policy("wheels"))
     description["observation"] = [*description["observation"], {"field": "camera", "index": "8..9"}]
     with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
-        c_files(description)
+        epuck.c_files(description)
     with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
         Pilot(description, lambda obs: obs)
 
@@ -135,7 +134,7 @@ def test_a_team_stands_still_where_its_policy_says_no_number() -> None:
 @pytest.fixture(scope="module", params=["wheels", "wheel pairs"])
 def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
     """Return an exported policy as a compiled library, and its controller in Python."""
-    if c_check.compiler() is None:
+    if c_file.compiler() is None:
         pytest.skip("needs a C compiler")
     folder, take = tmp_path_factory.mktemp("c"), epuck.take_scenes
     with pytest.MonkeyPatch.context() as patch:
@@ -144,7 +143,7 @@ def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     spec = importlib.util.spec_from_file_location("exported_for_c", folder / "policy.py")
     policy = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(policy)
-    return c_check.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
+    return c_file.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
 
 
 def driven(code: ctypes.CDLL, own: int, poses=TEAM, goals=GOALS, pillars=PILLARS, age_s=0.1, robots=3):

@@ -13,20 +13,18 @@ import pytest
 import torch
 
 from esp_cli.commands import export as command
-from esp_cli.export import c_check, check, onnx_file
-from esp_cli.export.c_source import cost
+from esp_cli.export import c_file, check, onnx_file
+from esp_cli.export.c_file import cost
 from esp_cli.export.check import compare, take_sample
-from esp_cli.export.export import export
-from esp_cli.export.formats import FORMATS
-from esp_cli.export.layers import Affine, Recurrent
+from esp_cli.export.export import FORMATS, export
+from esp_cli.export.program import program_of
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
-from esp_cli.export.translate import program_of
 from esp_cli.training.build import build_environment
 from tests.export.policies import KINDS, drawn_policy
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c", "onnx")
-needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 
 
 @needs_cc
@@ -110,9 +108,8 @@ def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: st
 def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
     program = program_of(drawn_policy("wheels", hidden=(3,)).policy)
     first, _, last = program.layers
-    assert isinstance(first, Affine)
-    assert isinstance(last, Affine)
-    assert (first.weight.shape, last.weight.shape) == ((8, 3), (3, 2))
+    assert (first.kind, last.kind) == ("affine", "affine")
+    assert (first.arrays[0].shape, last.arrays[0].shape) == ((8, 3), (3, 2))
     assert program.num_parameters == 8 * 3 + 3 + 3 * 2 + 2 == 35
     assert program.flops == 2 * 24 + 3 + 2 * 6 + 5 * 2
     assert (program.head, program.groups, program.memory_width) == ("squash", (1, 1), 0)
@@ -123,9 +120,8 @@ def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
 
 def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
     program = program_of(drawn_policy("exploring choice, recurrent", hidden=(6, 4)).policy)
-    (unit,) = [layer for layer in program.layers if isinstance(layer, Recurrent)]
-    assert unit.input.weight.shape == (4, 12)
-    assert unit.recurrent.weight.shape == (4, 12)
+    (unit,) = [layer for layer in program.layers if layer.kind == "gru"]
+    assert [array.shape for array in unit.arrays] == [(4, 12), (12,)] * 2
     assert (program.hidden, program.previous, program.memory_width) == (4, 5, 9)
     assert program.num_inputs == 14
     assert program.head == "choose"
@@ -186,11 +182,11 @@ def test_the_python_file_refuses_what_does_not_fit(tmp_path: Path) -> None:
 @needs_cc
 def test_the_worked_example_in_c_fails_where_the_weights_are_others(tmp_path: Path) -> None:
     export(drawn_policy("wheels"), ["c"], tmp_path)
-    assert c_check.example_runs(tmp_path)
+    assert c_file.example_runs(tmp_path)
     source = (tmp_path / "policy.c").read_text()
     begin = source.index("= {\n", source.index("static const float w4_1")) + 4
     (tmp_path / "policy.c").write_text(source[:begin] + "    0.5f," + source[source.index(",", begin) + 1 :])
-    assert not c_check.example_runs(tmp_path)
+    assert not c_file.example_runs(tmp_path)
 
 
 def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:

@@ -13,21 +13,20 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.export import c_check, onnx_file
-from esp_cli.export.c_check import c_runner
-from esp_cli.export.c_source import c_source
+from esp_cli.export import c_file, onnx_file
+from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import export
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
+from esp_cli.export.program import program_of
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
-from esp_cli.export.translate import program_of
 from esp_envs import register
 from esp_envs.registry import TASKS
 from tests.export.policies import KINDS, drawn_policy
 from tests.fenced import Fenced
 
-needs_cc = pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 MASKED = {
     "masked choice": ("tests.fenced:Fenced", "mappo", {}),
     "masked choice, recurrent": ("tests.fenced:Fenced", "maddpg", {"network.name": "gru"}),
@@ -84,7 +83,7 @@ def _run_calls(page: str, example: dict) -> None:
 
 def test_an_export_that_ignores_masks_is_found() -> None:
     trained = drawn_policy("masked choice")
-    sample = take_sample(trained, replace(program_of(trained.policy), masked=True), 400)
+    sample = take_sample(trained, program_of(trained.policy, masked=True), 400)
     assert sample.mask is not None
     assert not sample.mask.all()
     free = sample.outputs.argmax(-1)
@@ -93,7 +92,7 @@ def test_an_export_that_ignores_masks_is_found() -> None:
 
 
 def test_a_mask_is_asked_for_and_has_a_shape() -> None:
-    program = replace(program_of(drawn_policy("masked choice").policy), masked=True)
+    program = program_of(drawn_policy("masked choice").policy, masked=True)
     policy, obs = NumpyPolicy(program.describe(), program.weights), np.zeros((2, 4), np.float32)
     with pytest.raises(ValueError, match=r"has shape \(\), but \(2, 5\) is needed"):
         policy.act(obs)
@@ -106,7 +105,7 @@ def test_a_mask_is_asked_for_and_has_a_shape() -> None:
 @needs_cc
 @torch.no_grad()
 def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Path) -> None:
-    program = replace(program_of(drawn_policy("team").policy), masked=True)
+    program = program_of(drawn_policy("team").policy, masked=True)
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((6 * program.team, program.num_inputs)).astype(np.float32)
     memory = np.zeros((len(rows), 0), np.float32)

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli.export import c_check, check
-from esp_cli.export.c_check import c_runner
-from esp_cli.export.c_source import c_source
+from esp_cli.export import c_file, check
+from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.export import export
-from esp_cli.export.layers import Affine, Convolution, GlobalMaxPool, MessageAggregation, Program, Slice
+from esp_cli.export.layers import aggregate, convolution, cut, global_max_pool
 from esp_cli.export.onnx_file import onnx_runner
+from esp_cli.export.program import Program, program_of
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
-from esp_cli.export.translate import program_of
 from esp_cli.policies.loaded import LoadedPolicy
 from tests.export.policies import drawn_policy
 
@@ -34,16 +33,16 @@ def numpy_policy(program: Program) -> NumpyPolicy:
 def test_a_picture_through_convolution_and_largest_response_by_hand() -> None:
     # filter [[1, 2], [3, 4]] on channel 0 and its negative on channel 1, bias 0.5, every second place of 2 x 4 pixels
     weight = np.array([1, 2, 3, 4, -1, -2, -3, -4], np.float32)[:, None]
-    filters = Convolution(weight, np.array([0.5], np.float32), channels=2, rows=2, columns=4, side=2, stride=2)
-    assert (filters.places, filters.width, filters.flops) == ((1, 2), 2, 2 * 8 * 2)
-    program = Program(17, (Slice(1, 17), filters), 2, 0, 0, "choose", ())
+    filters = convolution(weight, np.array([0.5], np.float32), (2, 2, 4), side=2, stride=2)
+    assert (filters.width, filters.flops) == (2, 2 * 8 * 2)
+    program = Program(17, (cut(1, 17), filters), 2, 0, 0, "choose", ())
     first = [[1, 0, 0, 1], [0, 1, 0, 0]]
     second = [[0, 0, 0, 0], [1, 0, 1, 0]]
     row = np.concatenate([[99], np.ravel(first), np.ravel(second)]).astype(np.float32)
     # left: 1 * 1 + 4 * 1 - 3 * 1 + 0.5, right: 2 * 1 - 3 * 1 + 0.5
     for outputs in both(program, row[None]):
         assert outputs.tolist() == [[2.5, -0.5]]
-    pooled = Program(17, (Slice(1, 17), filters, GlobalMaxPool(1, 2)), 1, 0, 0, "choose", ())
+    pooled = Program(17, (cut(1, 17), filters, global_max_pool(1, 2)), 1, 0, 0, "choose", ())
     for outputs in both(pooled, row[None]):
         assert outputs.tolist() == [[2.5]]
     assert pooled.flops == 2 * 8 * 2 + 1 + 1
@@ -51,8 +50,8 @@ def test_a_picture_through_convolution_and_largest_response_by_hand() -> None:
 
 def test_what_is_heard_by_hand() -> None:
     # own feature, then the ways to the two others; agents 0 and 1 are near each other, agent 2 is too far from both
-    hear = MessageAggregation(begin=1, team=3, width=1, reach_squared=4.0)
-    program = Program(5, (Slice(0, 1), hear), 4, 0, 0, "choose", (), team=3)
+    hear = aggregate(begin=1, team=3, width=1, reach_squared=4.0)
+    program = Program(5, (cut(0, 1), hear), 4, 0, 0, "choose", (), team=3)
     rows = np.array([[10, 1, 1, 0, 2], [20, -1, -1, -1, 9], [40, 0, -2, 1, -9]], np.float32)
     # divided by two: the one heard and the agent itself; the way in reaches of 2; two cells are not less than two
     expected = [[10, 0.25, 0.25, 10], [20, -0.25, -0.25, 5], [40, 0, 0, 0]]
@@ -76,7 +75,7 @@ def test_those_just_three_cells_away_both_ways_are_not_heard_by_any_of_them(tmp_
     export(trained, ["onnx"], tmp_path)
     rows = np.random.default_rng(0).standard_normal((3, WIDTH)).astype(np.float32)
     runners = [onnx_runner(tmp_path / "policy.onnx"), runner_of(program)]
-    if c_check.compiler():
+    if c_file.compiler():
         export(trained, ["c"], tmp_path / "c")
         runners.append(c_runner(tmp_path / "c" / "policy.c", program))
 
@@ -107,34 +106,34 @@ def runner_of(program: Program) -> check.Runner:
 
 def test_a_drawn_network_as_layers_and_its_costs() -> None:
     program = program_of(drawn_policy("team", hidden=(12, 10)).policy)
-    kinds = [type(layer).__name__ for layer in program.layers]
-    pictures = ["Slice", "Convolution", "Activation", "Convolution", "Activation", "GlobalMaxPool"]
-    assert kinds == [*pictures, *["MessageAggregation", "Affine", "Activation"] * 2, "Affine"]
+    kinds = [layer.kind for layer in program.layers]
+    pictures = ["slice", "convolution", "relu", "convolution", "relu", "global_max_pool"]
+    assert kinds == [*pictures, *["aggregate", "affine", "relu"] * 2, "affine"]
     assert (program.num_inputs, program.team, program.memory_width) == (WIDTH, 3, 0)
-    shapes = [layer.weight.shape for layer in program.layers if isinstance(layer, Affine)]
+    shapes = [layer.arrays[0].shape for layer in program.layers if layer.kind == "affine"]
     # what a drone found and what it hears, 32 numbers each, and the mean way
     assert shapes == [(32 + 2 + 32, 12), (12 + 2 + 12, 10), (10, program.num_outputs)]
-    first, second = (layer for layer in program.layers if isinstance(layer, Convolution))
-    assert (first.places, second.places) == ((8, 8), (4, 4))
+    first, second = (layer for layer in program.layers if layer.kind == "convolution")
+    assert (first.width, second.width) == (16 * 8 * 8, 32 * 4 * 4)
     assert first.flops == 2 * 49 * 16 * 64
     assert second.flops == 2 * 16 * 25 * 32 * 16
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(c_check.compiler() is None, reason="needs a C compiler")
+@pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 def test_the_worked_example_is_a_whole_world(tmp_path: Path) -> None:
     export(drawn_policy("team"), ["c", "numpy"], tmp_path)
     example = json.loads((tmp_path / "policy.json").read_text())["example"]
     assert np.shape(example["observation"]) == (3, WIDTH)
     assert example["action"] == np.argmax(example["outputs"], 1).tolist()
-    assert c_check.example_runs(tmp_path)
+    assert c_file.example_runs(tmp_path)
     subprocess.run(["python", "policy.py"], cwd=tmp_path, check=True, capture_output=True)
     for file in ("README.md", "policy.h", "policy.py"):
         assert "The 3 agents of a world exchange messages and act together" in (tmp_path / file).read_text()
     changed = (tmp_path / "policy_example.c").read_text()
     begin = changed.index("expected[] = {") + len("expected[] = {")
     (tmp_path / "policy_example.c").write_text(changed[:begin] + "7" + changed[begin + 1 :])
-    assert not c_check.example_runs(tmp_path)
+    assert not c_file.example_runs(tmp_path)
 
 
 def test_an_exported_team_refuses_rows_that_are_no_world(tmp_path: Path) -> None:
@@ -170,13 +169,13 @@ def test_an_equivariant_team_is_exported_as_plain_layers() -> None:
     assert len(sample.obs) == 300
     agreement = check.compare(sample, runner_of(program))
     assert agreement.max_difference < 5e-5
-    moved = Program(**{**vars(program), "layers": (Slice(1, 442), *program.layers[1:])})
+    moved = Program(**{**vars(program), "layers": (cut(1, 442), *program.layers[1:])})
     with pytest.raises(RuntimeError, match="differs from the policy"):
         check.compare(sample, runner_of(moved))
 
 
 def test_c_refuses_a_team_whose_actions_are_no_choices() -> None:
-    program = Program(5, (Slice(0, 1), MessageAggregation(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
+    program = Program(5, (cut(0, 1), aggregate(1, 3, 1, 4.0)), 4, 0, 0, "squash", (2, 2), team=3)
     with pytest.raises(ValueError, match="supports discrete actions only"):
         c_source(program, "")
 

@@ -5,34 +5,24 @@ The functions of the layers are in runtime/layers.c, of which a source has those
 
 from __future__ import annotations
 
+import ctypes
 import re
+import shutil
+import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
-from esp_cli.export import layers
-from esp_cli.export.layers import Program
+import numpy as np
+
+from esp_cli.export.check import Numbers, Runner
+from esp_cli.export.layers import Floats, literal
+from esp_cli.export.program import SQUASH_EPSILON, Program
 from esp_cli.export.templates import RUNTIME, filled
 from esp_envs.errors import UserError
 
-_LAYERS: dict[type[layers.Layer], str] = {
-    layers.Affine: "EACH affine(w{k}_0, w{k}_1, {0.inputs}, {0.outputs}, X, Y);\nSWAP;",
-    layers.Activation: "EACH apply_{0.kind}(X, {0.width});",
-    layers.Norm: "EACH normalise(w{k}_0, w{k}_1, {0.outputs}, X);",
-    layers.Recurrent: """
-        affine(w{k}_0, w{k}_1, {0.input.inputs}, 3 * {0.hidden}, x, into);
-        affine(w{k}_2, w{k}_3, {0.hidden}, 3 * {0.hidden}, memory, back);
-        recur({0.hidden}, into, back, memory);
-        memcpy(x, memory, sizeof(float) * {0.hidden});""",
-    layers.Slice: "EACH memmove(X, X + {0.begin}, sizeof(float) * ({0.end} - {0.begin}));",
-    layers.Convolution: """
-        EACH convolve(w{k}_0, w{k}_1, {0.channels}, {0.rows}, {0.columns}, {0.side}, {0.stride}, {0.outputs}, X, Y);
-        SWAP;""",
-    layers.GlobalMaxPool: "EACH global_max_pool({0.channels}, {0.places}, X, Y);\nSWAP;",
-    layers.MessageAggregation: """
-        aggregate(observation + {0.begin}, {0.width}, {reach_squared}, {reach}, x, y);
-        SWAP;""",
-}
-"""The statements of a layer, in the macros of `templates/policy.c.jinja`."""
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+"""The source compiles without warnings under these."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +59,10 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
             "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
         )
     body = _body(program)
-    variables = ["i", *(name for name in ("k", "best") if re.search(rf"\b{name} = ", body))]
+    comment = comment.replace("*/", "* /").replace("/*", "/ *")
     values = {
         **_shape(program),
-        "comment": "\n".join(f" * {line}".rstrip() for line in _plain(comment).splitlines()),
+        "comment": "\n".join(f" * {line}".rstrip() for line in comment.splitlines()),
         "act": _signature(program),
         "outputs": f"const float *esp_policy_outputs({'int agent' if program.team > 1 else 'void'})",
         "arrays": [
@@ -82,7 +72,7 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
         ],
         "row": _row_width(program),
         "functions": "\n".join(_functions(body)),
-        "variables": ", ".join(variables),
+        "variables": ", ".join(["i", *(name for name in ("k", "best") if re.search(rf"\b{name} = ", body))]),
         "body": body,
     }
     return {name: filled(name, **values) for name in ("policy.h", "policy.c")}
@@ -115,17 +105,6 @@ def _shape(program: Program) -> dict[str, object]:
     return {name: getattr(program, name) for name in names}
 
 
-def _plain(comment: str) -> str:
-    """Return text that ends no comment in C."""
-    return comment.replace("*/", "* /").replace("/*", "/ *")
-
-
-def literal(value: float) -> str:
-    """Return a float32 in full: nine digits tell every one apart."""
-    text = f"{value:.9g}"
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
-
-
 def numbers(values: Iterable[float]) -> str:
     """Return the items of an array, eight a line."""
     literals = [literal(value) for value in values]
@@ -134,13 +113,8 @@ def numbers(values: Iterable[float]) -> str:
 
 def _row_width(program: Program) -> int:
     """Return the width of the two rows, an agent each, that layers read and write in turn."""
-    widths = [program.num_inputs + program.previous, program.num_outputs, program.hidden]
-    for layer in program.layers:
-        if isinstance(layer, layers.Affine):
-            widths += [layer.inputs, layer.outputs]
-        elif isinstance(layer, layers.Convolution):
-            widths.append(layer.width)
-    return max(widths)
+    own = (program.num_inputs + program.previous, program.num_outputs, program.hidden)
+    return max(*own, *(layer.width for layer in program.layers))
 
 
 def _signature(program: Program) -> str:
@@ -172,16 +146,19 @@ def _body(program: Program) -> str:
         copied = f"memory + {program.hidden}, sizeof(float) * {program.previous}"
         lines.append(f"memcpy(x + ESP_POLICY_OBSERVATION, {copied});")
     for k, layer in enumerate(program.layers):
-        reach = {name: literal(getattr(layer, name, 0.0)) for name in ("reach", "reach_squared")}
-        lines += _LAYERS[type(layer)].format(layer, k=k, **reach).splitlines()
+        lines += re.sub(r"\bw(\d)\b", rf"w{k}_\1", layer.c).splitlines()
     lines.append("last = x;")
     if program.team > 1:
         call = "choose_allowed(X, allowed + i * ESP_POLICY_ACTION)" if program.masked else "choose(X)"
         lines.append(f"EACH action[i] = {call};")
     elif program.head == "choose":
         lines.append(f"best = {'choose_allowed(x, allowed)' if program.masked else 'choose(x)'};")
-    else:
-        lines += _squash(program.groups)
+    start = 0
+    for width in program.groups:
+        squares = " + ".join(f"x[{i}] * x[{i}]" for i in range(start, start + width))
+        lines.append(f"length = sqrtf({squares} + {literal(SQUASH_EPSILON)});")
+        lines.append(f"for (k = {start}; k < {start + width}; k++) action[k] = x[k] * (tanhf(length) / length);")
+        start += width
     if program.previous:
         value = "action[k]" if program.head == "squash" else "k == best ? 1.0f : 0.0f"
         lines.append(f"for (k = 0; k < ESP_POLICY_ACTION; k++) memory[{program.hidden} + k] = {value};")
@@ -189,11 +166,53 @@ def _body(program: Program) -> str:
     return "\n".join(f"    {line.strip()}" for line in lines if line.strip())
 
 
-def _squash(groups: Iterable[int]) -> list[str]:
-    lines, start = [], 0
-    for width in groups:
-        squares = " + ".join(f"x[{i}] * x[{i}]" for i in range(start, start + width))
-        lines.append(f"length = sqrtf({squares} + {literal(layers.SQUASH_EPSILON)});")
-        lines.append(f"for (k = {start}; k < {start + width}; k++) action[k] = x[k] * (tanhf(length) / length);")
-        start += width
-    return lines
+def compiler() -> str | None:
+    """Return this machine's C compiler, or None."""
+    return shutil.which("cc")
+
+
+def compiled(*files: Path) -> ctypes.CDLL:
+    """Compile written C sources into a library beside the first, with every warning an error.
+
+    Raises:
+        RuntimeError: they do not compile, which is a bug.
+    """
+    shared = files[0].with_suffix(".so")
+    command = [compiler() or "cc", *FLAGS, "-shared", "-fPIC", *map(str, files), "-o", str(shared), "-lm"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    if result.returncode:
+        raise RuntimeError(f"the exported C does not compile; this is a bug\n{result.stderr}")
+    return ctypes.CDLL(str(shared))
+
+
+def c_runner(file: Path, program: Program) -> Runner:
+    """Compile a written C source and call it row by row, or of a team world by world."""
+    code = compiled(file)
+    choose, team, width = program.head == "choose", program.team, program.num_outputs
+    code.esp_policy_outputs.restype = ctypes.POINTER(ctypes.c_float)
+    code.esp_policy_act.restype = ctypes.c_int if choose and team == 1 else None
+
+    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+        obs, after = np.ascontiguousarray(obs), memory.copy()
+        outputs = np.empty((len(obs), width), np.float32)
+        action: Numbers = np.empty(len(obs), np.intc) if choose else np.empty_like(outputs)
+        written = [after] * (program.memory_width > 0) + [action] * (not choose or team > 1)
+        arrays = [obs, *([] if mask is None else [mask.astype(np.uint8)]), *written]
+        for k in range(0, len(obs), team):
+            chosen = code.esp_policy_act(*(ctypes.c_void_p(array[k:].ctypes.data) for array in arrays))
+            if choose and team == 1:
+                action[k] = chosen
+            for i in range(team):
+                agent = [i] if team > 1 else []
+                outputs[k + i] = np.ctypeslib.as_array(code.esp_policy_outputs(*agent), (width,))
+        return action, outputs, after
+
+    return run
+
+
+def example_runs(folder: Path) -> bool:
+    """Compile and run the worked example of a C export; return whether it gives the expected action."""
+    program = folder / "example"
+    files = [str(folder / name) for name in ("policy_example.c", "policy.c")]
+    subprocess.run([compiler() or "cc", *FLAGS, *files, "-o", str(program), "-lm"], check=True, capture_output=True)
+    return subprocess.run([str(program)], check=False, capture_output=True).returncode == 0

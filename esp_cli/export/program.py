@@ -1,0 +1,213 @@
+"""A policy as plain arrays: the layers, memory and head of one seed's greedy policy, which every export is made from.
+
+A program maps a row of observation, and of memory where it has one, to outputs, an action and the next memory:
+
+    x = [observation, previous action]     the latter for recurrent policies of off-policy learners alone
+    x = layer(x) for each layer
+    action = argmax(x)                     head `choose`, among the allowed actions where the task has masks; or
+    action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
+
+The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
+agents exchange messages, the rows of a world's agents are adjacent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from torch import Tensor
+
+from esp_cli.export import layers
+from esp_cli.export.layers import Floats, Layer
+from esp_cli.networks.constrained import ConstrainedLinear, Equivariant
+from esp_cli.networks.contract import Network
+from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
+from esp_cli.networks.heads import BoundedGaussian, Categorical
+from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
+from esp_cli.networks.plain import GRU, MLP
+from esp_cli.networks.policy import HistoryPolicy, Policy
+from esp_cli.networks.separate import Separate
+from esp_envs.errors import UserError
+
+SQUASH_EPSILON = 1e-18  # squashing adds this to the squared length (`esp_cli.networks.heads.squash`)
+
+
+@dataclass(frozen=True)
+class Program:
+    """One greedy policy.
+
+    Attributes:
+        num_inputs: D, numbers of an observation.
+        layers: in their order.
+        num_outputs: numbers of the last layer.
+        hidden: H, numbers of the hidden state; 0 for a policy that remembers nothing.
+        previous: numbers of the previous action in the memory.
+        head: how the outputs become an action.
+        groups: widths of what is squashed together; empty where the head chooses.
+        team: agents that act together, with their rows side by side; 1 where each acts by itself.
+        masked: whether a mask of the allowed actions [A] comes with every observation; one that allows none allows all.
+    """
+
+    num_inputs: int
+    layers: tuple[Layer, ...]
+    num_outputs: int
+    hidden: int
+    previous: int
+    head: Literal["choose", "squash"]
+    groups: tuple[int, ...]
+    team: int = 1
+    masked: bool = False
+
+    @property
+    def memory_width(self) -> int:
+        """Numbers that it carries from step to step."""
+        return self.hidden + self.previous
+
+    @property
+    def weights(self) -> bytes:
+        """Every array of every layer, one after the other, as little-endian float32."""
+        return b"".join(array.astype("<f4").tobytes() for layer in self.layers for array in layer.arrays)
+
+    @property
+    def num_parameters(self) -> int:
+        """Learned numbers."""
+        return len(self.weights) // 4
+
+    @property
+    def flops(self) -> int:
+        """Operations for one action."""
+        own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
+        return sum(layer.flops for layer in self.layers) + own
+
+    def describe(self) -> dict[str, object]:
+        """Return the program without its weights, as JSON stores it."""
+        return vars(self) | {"layers": [layer.describe() for layer in self.layers]}
+
+
+def program_of(policy: Policy, masked: bool = False) -> Program:
+    """Return the program of a policy with a single seed.
+
+    Args:
+        policy: of a task.
+        masked: whether the task has masks of allowed actions.
+
+    Raises:
+        UserError: a network or head that exports do not know.
+    """
+    actor, head = policy.actor, policy.head
+    sums: list[Layer] = []
+    if isinstance(actor, Separate):  # the sums of an action's parts are one more layer
+        parts = _plain(actor.parts)
+        actor, sums = actor.network, [layers.affine(parts, np.zeros(parts.shape[1], np.float32))]
+    own = _network(actor)
+    if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
+        groups: tuple[int, ...] = ()
+    elif isinstance(head, BoundedGaussian | BoundedPoint):
+        groups = _groups(head.disc)
+    else:
+        raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
+    previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
+    if isinstance(actor, MessagePassing):
+        inputs = max(actor.picture.stop, actor.others.stop)
+    else:
+        inputs = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine")
+    return Program(
+        num_inputs=inputs - previous,
+        layers=(*own, *sums),
+        num_outputs=head.num_outputs,
+        hidden=actor.memory_width,
+        previous=previous,
+        head="squash" if groups else "choose",
+        groups=groups,
+        team=actor.team,
+        masked=masked,
+    )
+
+
+def _network(actor: Network) -> list[Layer]:
+    """Return the layers of a network."""
+    if isinstance(actor, MLP):
+        return _perceptron(actor)
+    if isinstance(actor, GRU):
+        norm = [_norm(actor.norm)] if isinstance(actor.norm, SeedLayerNorm) else []
+        unit = layers.gru(*_arrays(actor.gru.input), *_arrays(actor.gru.recurrent))
+        return [*_perceptron(actor.body), unit, *norm, _affine(actor.head)]
+    if isinstance(actor, Equivariant):
+        *hidden, last = actor.layers
+        return [*(part for layer in hidden for part in _activated(layer, actor.activation)), _affine(last)]
+    if isinstance(actor, MessagePassing):
+        return _message_passing(actor)
+    raise UserError(
+        f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, equivariant, mpn and empn can, "
+        "without symmetrise"
+    )
+
+
+def _message_passing(actor: MessagePassing) -> list[Layer]:
+    """Return the layers of a team: the pictures, then message passing."""
+    own = [layers.cut(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
+    for layer in actor.layers:
+        inputs = len(_arrays(layer)[0])
+        own.append(layers.aggregate(actor.others.start, actor.team, (inputs - 2) // 2, REACH_SQUARED))
+        own += _activated(layer, "relu")
+    return [*own, _affine(actor.head)]
+
+
+def _pictures(encoder: PictureEncoder) -> list[Layer]:
+    own: list[Layer] = []
+    shape = encoder.shape
+    for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
+        filters = layers.convolution(*_arrays(layer), shape, side, stride)
+        own += [filters, layers.activation("relu", filters.width)]
+        shape = layers.convolved(shape, filters.arrays[1].size, side, stride)
+    channels, rows, columns = shape
+    return [*own, layers.global_max_pool(channels, rows * columns)]
+
+
+def _perceptron(mlp: SeedMLP) -> list[Layer]:
+    """Return the layers in the order in which `SeedMLP` applies them."""
+    norms = [] if mlp.norms is None else [_norm(norm) for norm in mlp.norms]
+    own: list[Layer] = [*norms[:1]]
+    last = len(mlp.layers) - 1
+    for k, linear in enumerate(mlp.layers):
+        if k < last or mlp.activate_output:
+            own += [*_activated(linear, mlp.activation), *norms[k + 1 : k + 2]]
+        else:
+            own.append(_affine(linear))
+    return own
+
+
+def _activated(linear: object, name: str) -> list[Layer]:
+    """Return a linear layer and the activation after it."""
+    weight, bias = _arrays(linear)
+    return [layers.affine(weight, bias), layers.activation("relu" if name == "relu" else "tanh", bias.size)]
+
+
+def _affine(linear: object) -> Layer:
+    return layers.affine(*_arrays(linear))
+
+
+def _arrays(linear: object) -> tuple[Floats, Floats]:
+    """Return weight [in, out] and bias [out] of a linear layer."""
+    if isinstance(linear, ConstrainedLinear):
+        return _plain(linear.weight()[0]), _plain(linear.bias()[0, 0])
+    assert isinstance(linear, SeedLinear)
+    return _plain(linear.weight[0]), _plain(linear.bias[0, 0])
+
+
+def _norm(norm: object) -> Layer:
+    assert isinstance(norm, SeedLayerNorm)
+    return layers.norm(_plain(norm.weight[0, 0]), _plain(norm.bias[0, 0]))
+
+
+def _plain(tensor: Tensor) -> Floats:
+    return tensor.detach().cpu().float().numpy().copy()
+
+
+def _groups(disc: Tensor) -> tuple[int, ...]:
+    """Return the widths of the blocks of a block-diagonal matrix of ones."""
+    starts = disc.argmax(1).unique(return_counts=True)  # a row's first one is where its block begins
+    return tuple(starts[1].tolist())
