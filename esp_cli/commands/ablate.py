@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from esp_cli.commands.study_costs import forecast_study
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 from esp_envs.errors import UserError
@@ -62,5 +61,4 @@ def ablate(
         *(("--broken-by", ",".join(settings)) if settings else ()),
     ]
     request = choices.request(kind, "ablate", part, *words)
-    act = forecast_study if choices.dry_run else run_study
-    act(kind, replace(request, variants=names, breakings=settings), choices)
+    run_study(kind, replace(request, variants=names, breakings=settings), choices)

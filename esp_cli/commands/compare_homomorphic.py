@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from esp_cli.commands.options import check_finite
-from esp_cli.commands.study_costs import forecast_study
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_study
 from esp_cli.defaults import Mode
@@ -56,7 +55,4 @@ def compare_homomorphic(
     if twice := sorted(board.keys() & request.overrides.keys()):
         raise UserError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
     request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
-    if choices.dry_run:
-        forecast_study("homomorphic", request, choices)
-    else:
-        run_study("homomorphic", request, choices, mode, limits)
+    run_study("homomorphic", request, choices, mode, limits)

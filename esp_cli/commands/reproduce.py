@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from esp_cli.commands.study_costs import forecast_study
 from esp_cli.commands.study_options import StudyChoices, study_command
 from esp_cli.commands.studying import run_study
 
@@ -26,5 +25,4 @@ def reproduce(
     choices: StudyChoices,
 ) -> None:
     """Train, evaluate and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    act = forecast_study if choices.dry_run else run_study
-    act(table, choices.request(table, "reproduce", table), choices)
+    run_study(table, choices.request(table, "reproduce", table), choices)

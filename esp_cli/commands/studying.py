@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
+from esp_cli.machine import busy_with
 from esp_cli.training.folder_names import LOG
 from esp_envs.errors import UserError
 from esp_envs.installed import install
@@ -25,8 +27,12 @@ if TYPE_CHECKING:
     from esp_cli.defaults import Mode
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
+    from esp_cli.studies.forecast import Forecast
     from esp_cli.studies.scheduler import Scheduler, Snapshot
     from esp_cli.studies.study import Study, StudyFolder
+
+BUSY = 0.5  # load per core from which a forecast is called unreliable
+_MEBIBYTE = 2**20
 
 
 @dataclass(frozen=True)
@@ -76,7 +82,7 @@ def _open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
 def run_study(
     kind: str, request: Request, choices: StudyChoices, mode: Mode | None = None, thresholds: Sequence[float] = ()
 ) -> None:
-    """Plan a study, run it, and report it.
+    """Plan a study, run it, and report it; or say what that costs, where only that was asked for.
 
     Args:
         kind: of `studies.kinds`.
@@ -89,8 +95,11 @@ def run_study(
     from esp_cli.studies.study import StudyFolder
 
     out, study = choices.folder(kind), plan(kind, request)
-    refuse_untrainable(study)
     note_without_effect(without_effect(kind, request))
+    if choices.dry_run:
+        _forecast_study(study, choices, out)
+        return
+    refuse_untrainable(study)
     with (
         open_resources(choices, out, study.cells[0].config.device) as resources,
         StudyFolder.held(out),
@@ -104,6 +113,60 @@ def run_study(
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     report_study(folder, choices.json, mode, thresholds)
     refuse_failed(failed, out)
+
+
+def _forecast_study(study: Study, choices: StudyChoices, out: Path) -> None:
+    """Say what a study costs; what the study itself would refuse before its first run is refused."""
+    from esp_cli.studies.forecast import forecast_study
+    from esp_cli.studies.study import StudyFolder
+
+    with open_resources(choices, out, study.cells[0].config.device) as resources:
+        StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
+        with measuring(len(study.cells)) as listener:
+            found = forecast_study(StudyFolder(out, study), resources.reused, resources.jobs, listener)
+    print_forecast(found, choices.json, f"{sum(run.status != 'finished' for run in found.runs)} runs to do")
+
+
+@contextmanager
+def measuring(total: int) -> Iterator[Callable[[int], object]]:
+    """Yield a progress callback; say afterwards if the machine was too busy to measure."""
+    with console.TrainingProgress(total, description="measure") as progress:
+        busy = busy_with()  # before the measurement, which keeps a core busy itself
+        yield progress.update
+    if busy > BUSY:
+        console.note(
+            f"this machine was busy (load {busy:.1f} per core) while this was measured, so the times are unreliable; "
+            "ask again when it is idle"
+        )
+
+
+def print_forecast(found: Forecast, json: str | None, what: str) -> None:
+    """Print `what` is left to do, such as "2 runs to do", how long it takes, and whether the disk has room for it."""
+    rows = [
+        (
+            run.name,
+            f"{console.format_count(run.steps)} x {run.num_seeds}",
+            run.status if run.status == "finished" else f"at {console.format_count(run.step)}" if run.step else "new",
+            console.format_duration(run.seconds),
+        )
+        for run in found.runs
+    ]
+    core, side_by_side = map(console.format_duration, (found.core_seconds, found.seconds))
+    done, peak = (size / _MEBIBYTE for size in (found.disk_bytes, found.disk_peak_bytes))
+    free = shutil.disk_usage(next(p for p in (found.out, *found.out.absolute().parents) if p.exists())).free / _MEBIBYTE
+
+    def show() -> None:
+        console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=found.title)
+        console.say(
+            f"{what}: {core} on one core, {side_by_side} with {found.jobs} side by side, if nothing else runs here"
+        )
+        console.say(
+            f"disk: {done:.0f} MiB when done, at most {peak:.0f} MiB on the way; {free:.0f} MiB are free -> {found.out}"
+        )
+        if peak > free:
+            console.note("the disk is too small for that; choose another --out, or fewer --jobs")
+
+    console.result(json, found, show)
 
 
 def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests: Sequence[int]) -> list[str]:

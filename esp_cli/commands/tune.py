@@ -12,9 +12,17 @@ import typer
 from esp_cli import console
 from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
-from esp_cli.commands.study_costs import forecast_search
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import follow, open_resources, refuse_failed, report_study, run_cells, stopped
+from esp_cli.commands.studying import (
+    follow,
+    measuring,
+    open_resources,
+    print_forecast,
+    refuse_failed,
+    report_study,
+    run_cells,
+    stopped,
+)
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
@@ -72,7 +80,7 @@ def tune(
     idle = frozenset.intersection(*map(tuning.without_effect, priors))
     note_without_effect([name for name in tuning.overrides if name in idle])
     if choices.dry_run:
-        forecast_search(tuning, request, choices, choices.folder("tune"))
+        _forecast(tuning, request, choices)
     else:
         _tune(tuning, request, choices)
 
@@ -121,6 +129,18 @@ def _tuning(
     )
     tuning.check(request.seeds)
     return tuning
+
+
+def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
+    """Say what a search costs."""
+    from esp_cli.studies.forecast import forecast_search
+
+    out = choices.folder("tune")
+    with open_resources(choices, out, tuning.device) as resources:
+        jobs = resources.jobs
+    with measuring(len(tuning.priors)) as listener:
+        found = forecast_search(tuning, out, request.seeds, request.episodes, jobs, listener)
+    print_forecast(found, choices.json, "all trials with the default settings, of which pruning saves about half")
 
 
 def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:

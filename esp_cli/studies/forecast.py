@@ -1,75 +1,75 @@
-"""What is left of a study, or what a search costs, by probes of its runs: time on a number of cores, and disk."""
+"""What a study or a search still costs on this machine: seconds by a short probe of each run, and bytes on the disk."""
 
 from __future__ import annotations
 
-import math
+import json
+import multiprocessing
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
 
-from esp_cli.studies.probe import Cost, Probes
-from esp_cli.studies.run_set import Cell
+import torch
+
+from esp_cli.algorithms.learner import Learner
 from esp_cli.studies.scheduler import Status, makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.tuning import Tuning
-from esp_cli.studies.tuning_space import space_of
+from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.config import RunConfig
+from esp_cli.training.play import PolicyController, play
+from esp_cli.training.streams import generators
+from esp_envs.registry import task_class
 
-LIKELY_SHARE = 0.5
-"""What a search takes of the steps of its trials; 0.44 to 0.56 where it was measured (docs/measurements/tuned.md)."""
+PROBE_SECONDS = 1.0  # for which iterations of a run are timed, after a first that is not
+_LONG_SECONDS = 3.0  # an iteration that takes as long is measured once
+_PROBED_EPISODES = 8  # of an evaluation, at most; longer ones take their share more
+_CHECKPOINTS = 3  # two are kept while a third is written
+_POLICIES = 3  # a final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What one run takes on this machine, alone on one thread."""
+
+    training_s: float  # for all of its steps, evaluations included
+    evaluation_s: float  # for its final evaluation
+    disk_bytes: int  # of what stays when it is done
+    peak_bytes: int  # of what lies on the disk at most while it trains
 
 
 @dataclass(frozen=True)
 class RunForecast:
-    """What is left of one run."""
+    """What is left of one run, or of all trials of a search with one kind of prior."""
 
-    name: str  # of its cell
-    # of its cell; "finished" also where another study has it, or another run of this one trains the same
-    status: Status
-    step: int  # environment steps per seed that are done
-    seconds_left: float  # alone on one thread
-    seconds: float | None  # of the whole run; None where nothing is left of it, which is not measured
-    disk_bytes: int  # of what stays when it is done
-    peak_bytes: int  # of what lies on the disk at most while it trains
-    config: RunConfig  # what is run
+    name: str
+    status: Status  # "finished" also where another study has the run, or another run of this one trains the same
+    steps: int  # environment steps per seed of the whole run
+    step: int  # those that are done
+    num_seeds: int
+    seconds: float  # that are left, on one thread
+    disk_bytes: int
+    peak_bytes: int
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is left of a study."""
+    """What is left of a study or a search."""
 
-    kind: str  # of the study
-    title: str  # of the study
+    title: str
     out: Path  # its folder
     jobs: int  # runs side by side
     seconds: float  # until the last run ends, where `jobs` run side by side and nothing else does
     core_seconds: float  # of all runs added up
     disk_bytes: int  # of the folder when all is done
-    disk_peak_bytes: int  # of the folder at most, where the `jobs` runs that need most on the way end together
+    disk_peak_bytes: int  # at most, where the `jobs` runs that need most on the way end together
     runs: tuple[RunForecast, ...]  # in the order in which they are begun
-
-
-@dataclass(frozen=True)
-class SearchForecast:
-    """What the search with one kind of prior costs, on one core."""
-
-    prior: str  # its kind
-    trials: int  # of the search
-    settings: tuple[str, ...]  # names of what is searched
-    default_s: float  # seconds of a whole trial with the default settings
-    mean_s: float  # of one as the space has them on average, where what each setting costs multiplies
-    longest_s: float  # of one with the values that take longest
-    likely_s: float  # of the search with pruning, and of the runs on fresh seeds
-    at_most_s: float  # of both, where every trial takes longest and none is pruned
-    disk_bytes: int  # of the trials and the runs on fresh seeds when all is done, at most
-    peak_bytes: int  # of what one run has on the disk on the way beyond that, at most
 
 
 def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of a study by probes of runs that are not finished.
+    """Measure what is left of a study; runs that cost the same are measured once.
 
     Args:
         folder: of the study; need not exist.
@@ -77,86 +77,125 @@ def forecast_study(
         jobs: runs side by side.
         listener: told how many runs have been looked at.
     """
-    study, probes = folder.study, Probes(folder.study.episodes)
-    found: list[RunForecast] = []
-    for cell in study.cells:
+    known, runs, cells = dict[str, Cost](), list[RunForecast](), folder.study.cells
+    for k, cell in enumerate(cells):
+        config, step = cell.config, folder.progress(cell)[0]
         twin = folder.run_path(cell) if folder.is_finished(cell) else folder.find_twin(cell, others)
-        again = any(cell.config == earlier.config for earlier in found)  # an earlier run trains the same
         if twin is not None:
-            found.append(_nothing_left(cell, _bytes_in(twin)))
+            disk = peak = sum(file.stat().st_size for file in twin.rglob("*") if file.is_file())
         else:
-            found.append(_left(cell, folder.progress(cell)[0], probes.cost(cell.config), again))
-        listener(len(found))
-    disk = sum(run.disk_bytes for run in found)
-    extra = sorted((run.peak_bytes - run.disk_bytes for run in found), reverse=True)
-    return Forecast(
-        kind=study.kind,
-        title=study.title,
-        out=folder.path,
-        jobs=jobs,
-        seconds=makespan([], [run.seconds_left for run in found if run.status != "finished"], jobs),
-        core_seconds=sum(run.seconds_left for run in found),
-        disk_bytes=disk,
-        disk_peak_bytes=disk + sum(extra[:jobs]),
-        runs=tuple(found),
-    )
-
-
-def _left(cell: Cell, step: int, cost: Cost, again: bool) -> RunForecast:
-    """Return what is left of a run at a step by what one costs; `again`: another one trains the same."""
-    if again and not step:
-        return _nothing_left(cell, cost.disk_bytes)
-    whole = cost.training_s + cost.evaluation_s
-    left = cost.training_s * (1 - step / cell.config.steps) + cost.evaluation_s
-    return RunForecast(cell.name, "waiting", step, left, whole, cost.disk_bytes, cost.peak_bytes, cell.config)
-
-
-def _nothing_left(cell: Cell, size: int) -> RunForecast:
-    return RunForecast(cell.name, "finished", cell.config.steps, 0.0, None, size, size, cell.config)
-
-
-def _bytes_in(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+            cost = _cost(config, folder.study.episodes, known)
+            disk, peak = cost.disk_bytes, cost.peak_bytes
+        if twin is not None or (not step and any(config == earlier.config for earlier in cells[:k])):
+            runs.append(
+                RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0, disk, disk)
+            )
+        else:
+            left = cost.training_s * (1 - step / config.steps) + cost.evaluation_s
+            runs.append(RunForecast(cell.name, "waiting", config.steps, step, len(config.seeds), left, disk, peak))
+        listener(len(runs))
+    seconds = makespan([], [run.seconds for run in runs if run.status != "finished"], jobs)
+    return _added_up(folder.study.title, folder.path, jobs, seconds, runs)
 
 
 def forecast_search(
-    tuning: Tuning, prior: str, seeds: Sequence[int], episodes: int, listener: Callable[[], object]
-) -> SearchForecast:
-    """Measure what a search costs by probes of the default trial and of the ends of each setting's range.
+    tuning: Tuning, out: Path, seeds: Sequence[int], episodes: int, jobs: int, listener: Callable[[int], object]
+) -> Forecast:
+    """Measure what a search costs where every trial takes as long as that of the default settings and none is pruned.
 
     Args:
         tuning: what is asked for.
-        prior: the kind of prior.
-        seeds: of the runs that judge the best settings.
+        out: its folder.
+        seeds: of the two runs that judge the best settings.
         episodes: per seed, of their final evaluations.
-        listener: told after each setting.
+        jobs: runs side by side.
+        listener: told how many kinds of prior have been looked at.
     """
-    probes, space = Probes(episodes), space_of(tuning.space, prior)
-    default = longest = largest = probes.cost(tuning.config(prior, {}))
-    mean_s, slowest = default.training_s, dict[str, object]()
-    for name, dimension in space.items():
-        costs = [(probes.cost_if_trained(tuning.config(prior, {name: v})), v) for v in dimension.corners()]
-        tried = [(cost, value) for cost, value in costs if cost is not None]
-        if tried:
-            mean_s *= fmean(cost.training_s for cost, _ in tried) / default.training_s
-            slowest[name] = max(tried, key=lambda one: one[0].training_s)[1]
-        longest = max([longest, *(cost for cost, _ in tried)], key=lambda cost: cost.training_s)
-        largest = max([largest, *(cost for cost, _ in tried)], key=lambda cost: cost.peak_bytes)
-        listener()
-    longest = probes.cost_if_trained(tuning.config(prior, slowest)) or longest
-    longest_s = max(longest.training_s, mean_s)
-    judged = probes.cost(tuning.config(prior, {}, seeds))
-    judged_s = judged.training_s + judged.evaluation_s
-    growth = math.ceil(len(seeds) / len(tuning.trial_seeds))
-    return SearchForecast(
-        prior=prior,
-        trials=tuning.budget,
-        settings=tuple(space),
-        default_s=default.training_s,
-        mean_s=mean_s,
-        longest_s=longest_s,
-        likely_s=LIKELY_SHARE * tuning.budget * mean_s + judged_s * (1 + mean_s / default.training_s),
-        at_most_s=tuning.budget * longest_s + judged_s * (1 + longest_s / default.training_s),
-        disk_bytes=(tuning.budget + growth) * max(longest.disk_bytes, largest.disk_bytes) + judged.disk_bytes,
-        peak_bytes=growth * max(one.peak_bytes - one.disk_bytes for one in (longest, largest)),
+    runs, trials = list[RunForecast](), tuning.budget
+    for prior in tuning.priors:
+        trial, last = (measure(tuning.config(prior, {}, own), episodes) for own in (tuning.trial_seeds, seeds))
+        seconds = trials * trial.training_s + 2 * (last.training_s + last.evaluation_s)
+        disk = trials * trial.disk_bytes + 2 * last.disk_bytes
+        peak = disk + max(one.peak_bytes - one.disk_bytes for one in (trial, last))
+        name, count = f"{trials} trials, prior {prior}", len(tuning.trial_seeds)
+        runs.append(RunForecast(name, "waiting", tuning.steps, 0, count, seconds, disk, peak))
+        listener(len(runs))
+    title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
+    return _added_up(title, out, jobs, sum(run.seconds for run in runs) / jobs, runs)
+
+
+def _added_up(title: str, out: Path, jobs: int, seconds: float, runs: Sequence[RunForecast]) -> Forecast:
+    core, disk = sum(run.seconds for run in runs), sum(run.disk_bytes for run in runs)
+    extra = sorted((run.peak_bytes - run.disk_bytes for run in runs), reverse=True)
+    return Forecast(title, out, jobs, seconds, core, disk, disk + sum(extra[:jobs]), tuple(runs))
+
+
+def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
+    """Return what a run costs, measured once for those that differ in fractions alone, as in the size of a wind.
+
+    Fractions of the task are left out; of others it counts whether they are 0, which switches things off.
+    """
+    parts = config.model_dump(mode="json", exclude={"prior": {"weights"}}) | {"seeds": len(config.seeds)}
+    parts["task_settings"] = {k: v for k, v in parts["task_settings"].items() if not isinstance(v, float)}
+    key = str(json.loads(json.dumps(parts), parse_float=lambda text: float(text) != 0))
+    if key not in known:
+        known[key] = measure(config, episodes)
+    return known[key]
+
+
+def measure(config: RunConfig, episodes: int) -> Cost:
+    """Measure a run by some of its iterations and an evaluation, without writing anything.
+
+    Args:
+        config: of the run.
+        episodes: per seed, of its final evaluation.
+
+    Raises:
+        UserError: its parts do not go together.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the runs of a study do
+    try:
+        learner = build_learner(config)
+        iterations = -(-config.steps // learner.steps_per_iteration)
+        clock, done = _clock(config), 0
+        begun = clock()
+        metrics = learner.iterate(0.0).metrics
+        per_iteration = clock() - begun
+        if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
+            begun = clock()
+            while done == 0 or (clock() - begun < PROBE_SECONDS and done < iterations):
+                metrics = learner.iterate(done / iterations).metrics
+                done += 1
+            per_iteration = (clock() - begun) / done
+        side_by_side = min(config.evaluation.episodes, _PROBED_EPISODES)
+        env = build_environment(config, side_by_side, "probe")
+        clock = _clock(config)
+        begun = clock()
+        play(env, PolicyController(learner.policy, generators(config.seeds, "probe")))
+        per_episode = (clock() - begun) / side_by_side
+    finally:
+        torch.set_num_threads(threads)
+    evaluations = 1 + config.steps // config.evaluation.every_steps
+    weights = sum(tensor.nbytes for tensor in learner.policy.state_dict().values())
+    row = len(json.dumps({name: value.tolist() for name, value in metrics.items()}))
+    kept = weights + _bytes(learner, complete=True) + iterations * row
+    return Cost(
+        training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
+        evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * episodes * per_episode,
+        disk_bytes=kept,
+        peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + learner.bytes_to_come(config.steps)),
     )
+
+
+def _clock(config: RunConfig) -> Callable[[], float]:
+    """Return the processor time of this process, to which other work adds little.
+
+    Where a GPU or processes of their own for the worlds work, this one waits, and time is that of a clock on the wall.
+    """
+    alone = config.device == "cpu" and not multiprocessing.active_children()
+    return time.process_time if alone else time.monotonic
+
+
+def _bytes(learner: Learner, complete: bool = False) -> int:
+    return sum(tensor.nbytes for tensor in learner.state_dict(complete).values())

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import app, console
-from esp_cli.commands import study_costs, studying
+from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.files.opening import acquire, release
@@ -56,7 +56,7 @@ def test_names_and_steps_are_read_from_lists() -> None:
 def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load: float, unreliable: bool
 ) -> None:
-    monkeypatch.setattr(study_costs, "busy_with", lambda: load)
+    monkeypatch.setattr(studying, "busy_with", lambda: load)
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "s", "--dry-run", "--jobs", 2)
     assert ("this machine was busy (load 3.0 per core)" in told.stderr) == unreliable
     assert ("the times are unreliable" in told.stderr) == unreliable

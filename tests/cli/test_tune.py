@@ -25,14 +25,14 @@ def command(tmp_path: Path) -> list[object]:
 
 def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: list[object], tmp_path: Path) -> None:
     told = esp(*command, "--prior", "esp,none", "--budget", 5, "--steps", 300, "--seeds", 2, "--jobs", 3, "--dry-run")
-    assert "if pruning saves half of the steps, at most" in told.stdout
+    assert "all trials with the default settings, of which pruning saves about half: " in told.stdout
+    assert "with 3 side by side" in told.stdout
     assert re.search(r"disk: \d+ MiB when done", told.stdout)
-    assert "3 runs side by side" in told.stdout
     assert not (tmp_path / "t").exists()
     assert "no such folder" in refused(*command, "--steps", 300, "--dry-run", "--reuse", tmp_path / "nowhere")
     planned = json.loads(esp(*command, "--prior", "esp,none", "--steps", 300, "--dry-run", "--json", "-").stdout)
-    assert [(one["prior"], one["trials"]) for one in planned["searches"]] == [("esp", 30), ("none", 30)]
-    assert 0 < planned["likely_s"] < planned["at_most_s"]
+    assert [one["name"] for one in planned["runs"]] == ["30 trials, prior esp", "30 trials, prior none"]
+    assert planned["core_seconds"] == pytest.approx(sum(run["seconds"] for run in planned["runs"]))
     assert planned["disk_bytes"] < planned["disk_peak_bytes"]
 
 

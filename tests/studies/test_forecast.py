@@ -1,17 +1,29 @@
-"""What is left of a study: only what is not finished is measured, and sums are those of the runs."""
+"""What is left of a study: only what is not finished is measured, sums are those of the runs, nothing is written."""
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import pytest
+import torch
 
 from esp_cli.studies import forecast as module
-from esp_cli.studies import probe as probing
+from esp_cli.studies.forecast import Cost, forecast_search
 from esp_cli.studies.forecast import forecast_study as forecast
-from esp_cli.studies.probe import Cost
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
 from tests.studies.small_studies import small_study, write_run
+from tests.studies.test_tuning import tuning
+from tests.training.runs import tiny_config
+
+SMALL = {"network.hidden": [8], "evaluation.episodes": 2, "maddpg.num_envs": 2, "maddpg.replay_episodes": 40}
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    monkeypatch.setattr(module, "PROBE_SECONDS", 0.0)
 
 
 @pytest.fixture
@@ -19,11 +31,11 @@ def probed(monkeypatch) -> list[str]:
     """Let every probe say the same, and return the algorithms of the runs that were probed."""
     seen: list[str] = []
 
-    def probe(config, episodes):
+    def measure(config, episodes):
         seen.append(config.prior.kind)
         return Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
 
-    monkeypatch.setattr(probing, "probe", probe)
+    monkeypatch.setattr(module, "measure", measure)
     return seen
 
 
@@ -38,11 +50,10 @@ def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed
     assert not folder.path.exists()
 
 
-def test_a_run_that_has_begun_takes_what_is_left_of_its_training_and_its_evaluation() -> None:
-    cell = small_study().cells[0]
-    cost = Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
-    found = module._left(cell, cell.config.steps // 4, cost, again=False)
-    assert found.seconds_left == 75.0 + 4.0
+def test_a_run_that_has_begun_takes_what_is_left_of_its_training_and_its_evaluation(tmp_path, probed, monkeypatch):
+    folder = StudyFolder(tmp_path / "s", small_study())
+    monkeypatch.setattr(folder, "progress", lambda cell: (cell.config.steps // 4, 1.0))
+    assert [run.seconds for run in forecast(folder, [], 1, lambda done: None).runs] == [75.0 + 4.0] * 2
 
 
 def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_once(tmp_path, probed) -> None:
@@ -54,7 +65,7 @@ def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_on
     assert probed == ["none", "esp", "esp"]
     assert [run.name for run in found.runs if run.status == "finished"] == ["navigation-unbroken-mappo-200-gate"]
     assert found.core_seconds == 8 * 104.0
-    assert [run.seconds_left for run in found.runs].count(104.0) == 8
+    assert [run.seconds for run in found.runs].count(104.0) == 8
 
 
 def test_a_finished_run_is_not_measured_and_takes_the_place_that_it_takes(tmp_path: Path, probed: list[str]) -> None:
@@ -71,3 +82,57 @@ def test_a_finished_run_is_not_measured_and_takes_the_place_that_it_takes(tmp_pa
     reused = forecast(other, [folder], 2, lambda done: None)
     assert (reused.seconds, reused.disk_bytes) == (104.0, size + 50)
     assert probed == ["esp", "esp"]
+
+
+def test_the_forecast_of_a_search_by_hand(tmp_path: Path, probed: list[str]) -> None:
+    """Each prior: 6 trials of 100 s and 50 bytes, and two runs of 104 s and 50 bytes; one of them has 20 more."""
+    found = forecast_search(tuning(budget=6), tmp_path, (0, 1, 2, 3), 2, 2, lambda done: None)
+    assert [run.seconds for run in found.runs] == [6 * 100.0 + 2 * 104.0] * 2
+    assert (found.core_seconds, found.seconds) == (2 * 808.0, 808.0)
+    assert (found.disk_bytes, found.disk_peak_bytes) == (2 * 8 * 50, 2 * 8 * 50 + 2 * 20)
+
+
+def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeypatch):
+    # a clock that ticks once at every look: an iteration and an evaluation cost the same in both
+    ticks = iter(range(10**6))
+    monkeypatch.setattr(module.time, "process_time", lambda: float(next(ticks)))
+    one, two = module.measure(tiny_config(steps=1000), 4), module.measure(tiny_config(steps=2000), 4)
+    # 20 and 40 iterations; 11 and 21 evaluations of 2 x 2 episodes; an episode takes half a tick
+    iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
+    assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
+    # greedy, drawn, random, and the two heuristics of navigation, four episodes each
+    assert one.evaluation_s == two.evaluation_s == 5 * 4 * 0.5
+
+
+def test_other_work_on_the_machine_costs_a_run_nothing(monkeypatch):
+    """The processor time of a process does not pass while it sleeps; a GPU's time does."""
+    monkeypatch.setattr(module.time, "process_time", lambda: 7.0)
+    own, watch = threading.get_ident(), module.time.monotonic
+
+    def read() -> float:
+        return pytest.fail("a watch was read") if threading.get_ident() == own else watch()  # others wait by it
+
+    monkeypatch.setattr(module.time, "monotonic", read)
+    assert module.measure(tiny_config(steps=100), 4).training_s == 0.0
+    assert module._clock(tiny_config().model_copy(update={"device": "cuda"})) is module.time.monotonic
+
+
+def test_the_replay_is_counted_as_full_as_it_will_be():
+    config = resolve_config("navigation", "maddpg", steps=25 * 30, overrides=SMALL)
+    learner = build_learner(config)
+    whole = learner.replay.num_bytes
+    assert learner.bytes_to_come(config.steps) == whole * 30 // 40
+    longer = config.model_copy(update={"steps": 25 * 300})
+    assert learner.bytes_to_come(longer.steps) == whole, "it keeps the last 40"
+    learner.iterate(0.0)
+    assert learner.bytes_to_come(longer.steps) == whole * 38 // 40
+    found = module.measure(config, 4)
+    assert found.peak_bytes - found.disk_bytes > 3 * (whole * 30 // 40)
+
+
+def test_an_on_policy_run_has_no_replay_and_threads_are_as_before():
+    before = torch.get_num_threads()
+    config = tiny_config(steps=100)
+    assert build_learner(config).bytes_to_come(config.steps) == 0
+    assert module.measure(config, 4).disk_bytes > 0
+    assert torch.get_num_threads() == before

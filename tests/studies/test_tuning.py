@@ -9,12 +9,9 @@ import re
 import pytest
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.studies import forecast, probe
-from esp_cli.studies.probe import Cost
 from esp_cli.studies.tuning import Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
 from esp_cli.training.metrics import MetricsError
-from esp_envs.errors import UserError
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
@@ -224,36 +221,3 @@ def test_tuned_is_compared_with_tuned_and_default_with_default():
     without = fresh_study(tuning(), {"esp": (3, faster)}, (0, 1), 4)
     assert [cell.name for cell in without.cells] == ["plain-default", "esp-default", "esp-tuned-trial-3"]
     assert without.cells[2].reference == "plain-default"
-
-
-def test_the_forecast_of_a_search_by_hand(monkeypatch):
-    """Wide networks take 4 times as long, 2 epochs twice; both together 8 times, and 3 minibatches go with neither.
-
-    On average (1 + 4) / 2 * (1 + 2) / 2 = 3.75 defaults of 10 s. Half of 6 trials, and the two runs of 25 s + 5 s that
-    judge: 112.5 s + 30 s * 4.75 = 255 s. At most 6 * 80 s + 30 s * 9 = 750 s. Disk: 6 trials and twice 2 seeds of 40
-    bytes, and 100 bytes of the default settings on 4 seeds.
-    """
-
-    def measured(config, episodes):
-        if config.algorithm_settings["num_minibatches"] == 3:
-            raise UserError("does not go together")
-        judged = len(config.seeds) == 4
-        wide, epochs = config.network.hidden == (16,), config.algorithm_settings["num_epochs"]
-        seconds = 25.0 if judged else 10.0 * (4 if wide else 1) * epochs
-        disk = 100 if judged else 40 if wide else 10
-        return Cost(training_s=seconds, evaluation_s=5.0, disk_bytes=disk, peak_bytes=disk + 7)
-
-    monkeypatch.setattr(probe, "probe", measured)
-    space = {
-        "network.hidden": Dimension(choices=([8], [16])),
-        "mappo.num_epochs": Dimension(low=1, high=2),
-        "mappo.num_minibatches": Dimension(choices=(1, 3)),
-        "mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True),
-    }
-    told = []
-    asked = tuning(budget=6, space=space)
-    found = forecast.forecast_search(asked, "none", (0, 1, 2, 3), 2, lambda: told.append(1))
-    assert len(told) == 4
-    assert (found.default_s, found.mean_s, found.longest_s) == (10.0, 37.5, 80.0)
-    assert (found.likely_s, found.at_most_s) == (255.0, 750.0)
-    assert (found.disk_bytes, found.peak_bytes) == (6 * 40 + 2 * 40 + 100, 2 * 7)
