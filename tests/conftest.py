@@ -51,11 +51,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="module")
 def forked_jobs() -> Iterator[None]:
     """Let the jobs of a module's studies be forks of this process, which import nothing again."""
-    from esp_cli.studies import engine_local
+    from esp_cli.studies import engine
     from tests.forks import ForkEngine
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine_local, "LocalEngine", ForkEngine)
+        patch.setattr(engine, "LocalEngine", ForkEngine)
         yield
 
 

@@ -17,7 +17,7 @@ import torch.profiler  # noqa: F401 - so does the first step of an optimizer
 from esp_cli import app
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
-from esp_cli.studies import engine_local
+from esp_cli.studies import engine
 from esp_envs.registry import TASKS
 from tests import faults
 
@@ -96,7 +96,7 @@ def forked_esp(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     def job() -> None:
         os.chdir(folder)
         forget_own_code(folder)
-        engine_local.LocalEngine = ForkEngine
+        engine.LocalEngine = ForkEngine
         app.app(list(words))
 
     code = wait(fork(job, folder, out, err))
@@ -116,7 +116,7 @@ class ForkEngine:
 
         def job() -> None:
             os.closerange(3, 256)  # the lock of the study is not theirs
-            engine_local.follow_parent()
+            engine.follow_parent()
             forget_own_code(Path.cwd())
             faults.forget()
             app.app(list(arguments))

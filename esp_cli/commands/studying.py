@@ -62,7 +62,7 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
 
 @contextmanager
 def _open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
-    from esp_cli.studies.engine_local import LocalEngine
+    from esp_cli.studies.engine import LocalEngine
 
     if choices.engine == "local":
         if choices.address is not None:

@@ -91,7 +91,7 @@ def write_page(search: Search, outcomes: Sequence[Outcome], out: Path) -> Path:
         lines += [f"## {table.title}", "", table.markdown(), ""]
     lines += _refused_lines(outcomes)
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` evaluates them on others."]
-    for prior, study in search.trials.studies.items():
+    for prior, study in search.studies.items():
         for name, title in _draw(study, out, prior):
             lines += ["", f"## {NAMES[prior]}: {title}", "", f"![{title}]({name})"]
     page = out / "tuning.md"

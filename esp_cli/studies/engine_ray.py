@@ -26,8 +26,7 @@ from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import sentence
 from esp_cli.files.opening import is_held
-from esp_cli.studies.engine import Job
-from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.training.build import spec_of
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import LOCK

@@ -3,7 +3,7 @@
 Layout::
 
     tuning.json         what is asked for
-    journal.jsonl       Optuna's record of all trials
+    journal.jsonl       Optuna's record of all trials: it proposes their settings, keeps their scores, and prunes
     trials/PRIOR-NUMBER/    a run folder per trial
     preset-PRIOR.json   the best settings, for esp train --config
     fresh/              the study that evaluates them on seeds that no trial had
@@ -15,40 +15,30 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import optuna
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from esp_cli.files.writing import remove_file, replace_file
+from esp_cli.files.documents import parse_value, shortened
+from esp_cli.files.opening import require_held
+from esp_cli.files.writing import mend_last_line, remove_file, replace_file
 from esp_cli.studies.run_set import Cell, RefusedError, RunSet, StudyError
-from esp_cli.studies.trials import Trials
-from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, score
+from esp_cli.studies.tuning import REDUCTION, RUNGS, TUNING_FORMAT, Outcome, Point, Tuning, curve_of, score
+from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
 from esp_cli.training.folder_names import JOURNAL, METRICS, TUNING
 from esp_cli.training.metrics import elapsed_s, read_last_row
 from esp_cli.training.run_folder import checkpoints_in
 from esp_envs.errors import UserError
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came out for one prior."""
-
-    prior: str  # its kind
-    trials: int  # that were begun
-    completed: int  # trials with a score
-    pruned: int  # trials that were ended early, broke, or did not reach the return
-    refused: tuple[str, ...]  # why settings did not go together, one text for each such trial; they count as pruned
-    env_steps: int  # environment steps of all seeds of all trials
-    seconds: float  # of training, all trials added up
-    best: int | None  # number of the best trial; None where no trial has a score
-    best_score: float | None  # of its curve, on the seeds of the trials
-    # of the default settings, where trial 0 had them; None where the space does not hold them all
-    default_score: float | None
-    settings: Mapping[str, object]  # of the best trial
+_REFUSED = "refused"  # attribute of a trial: why its settings do not go together
+_SEED = 0
 
 
 class Search(RunSet):
@@ -60,21 +50,39 @@ class Search(RunSet):
 
     Attributes:
         cells: of all trials. The settings of one are proposed when it begins; until then it has the default ones.
-        trials: the record.
+        studies: of Optuna, by prior.
 
     Raises:
-        StudyError: its journal is damaged.
+        StudyError: its journal is damaged, or no search with this space wrote it.
     """
 
     document, runs, noun = TUNING, "trials", "tuning"
 
     def __init__(self, path: Path, tuning: Tuning) -> None:
         super().__init__(path, f"Tuning of {tuning.algorithm.upper()} on {tuning.task}")
-        self.tuning, self.trials = tuning, Trials(path / JOURNAL, tuning)
+        self.tuning = tuning
         keys = [(prior, number) for number in range(tuning.budget) for prior in tuning.priors]
         self._keys = {f"{prior}-{number:03d}": (prior, number) for prior, number in keys}
         self.cells = [self._cell(name, {}) for name in self._keys]
         self._begun: dict[str, Any] = {}
+        self._spaces = {prior: space_of(tuning.space, prior) for prior in tuning.priors}
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        journal = path / JOURNAL
+        mend_last_line(journal)
+        try:
+            storage = optuna.storages.JournalStorage(JournalFileBackend(str(journal), lock_obj=_HeldLock(journal)))
+            self.studies = {prior: self._study(storage, prior) for prior in tuning.priors}
+        except UserError:  # the folder is lost
+            raise
+        except Exception as error:  # whatever Optuna stumbles over
+            raise self._damaged(shortened(str(error))) from None
+        for prior in tuning.priors:
+            self._refuse_forged(prior)
+            if not self.trials(prior):
+                self.studies[prior].enqueue_trial(self._defaults(prior))
+
+    def _damaged(self, what: str) -> StudyError:
+        return StudyError(f"{self.path / JOURNAL} is damaged: {what}; choose another --out")
 
     @classmethod
     def create(cls, path: Path, tuning: Tuning) -> Search:
@@ -96,29 +104,89 @@ class Search(RunSet):
         TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))
         return cls(path, tuning)
 
+    def _study(self, storage: Any, prior: str) -> Any:
+        pruner = optuna.pruners.SuccessiveHalvingPruner(
+            min_resource="auto" if self.tuning.goal == "seconds" else max(1, self.tuning.steps // REDUCTION**RUNGS),
+            reduction_factor=REDUCTION,
+        )
+        study = optuna.create_study(
+            storage=storage, study_name=prior, direction="maximize", pruner=pruner, load_if_exists=True
+        )
+        begun = len(study.get_trials(deepcopy=False))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            study.sampler = optuna.samplers.TPESampler(seed=_SEED + begun, multivariate=True, constant_liar=True)
+        return study
+
+    def _refuse_forged(self, prior: str) -> None:
+        """Refuse trials that no search with this space leaves behind, before anything is computed from them."""
+        space = {name: _distribution(d) for name, d in self._spaces[prior].items()}
+        if [direction.name for direction in self.studies[prior].directions] != ["MAXIMIZE"]:
+            raise self._damaged("it maximises something else")
+        for trial in self.trials(prior):
+            try:
+                sound = _is_sound(trial, space)
+            except (TypeError, AttributeError):  # a part of it is no dictionary, or a number is none
+                sound = False
+            if not sound:
+                raise self._damaged(
+                    f"trial {trial.number} of {prior} has settings or scores that no trial of this search has"
+                )
+
+    def _defaults(self, prior: str) -> dict[str, object]:
+        """Return the default settings, as far as they are in the space."""
+        config = self.tuning.config(prior, {}).model_dump(mode="json")
+        sections = {"task": "task_settings", self.tuning.algorithm: "algorithm_settings"}
+        found = {}
+        for name, dimension in self._spaces[prior].items():
+            section, _, key = name.partition(".")
+            found[name] = dimension.encoded(config[sections.get(section, section)].get(key))
+        return {name: value for name, value in found.items() if value is not None}
+
     def _cell(self, name: str, settings: Mapping[str, object]) -> Cell:
         prior = self._keys[name][0]
         return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
 
-    def is_finished(self, cell: Cell) -> bool:
-        """Return whether the record has the end of a trial."""
-        return self.trials.is_done(*self._keys[cell.name])
+    def trials(self, prior: str) -> Sequence[Any]:
+        """Return the trials of a prior, by number."""
+        return self.studies[prior].get_trials(deepcopy=False)
 
-    def begin(self, cell: Cell) -> Cell:
-        """Make the run folder of a trial with the settings that are proposed for it; return what it runs.
+    def trial(self, prior: str, number: int) -> Any:
+        """Return a trial that was begun, or begin it.
 
         Raises:
-            RefusedError: they do not go together; the record has that as its end.
-            UserError: what is there is damaged or another run.
+            StudyError: the journal lacks one before it.
         """
+        study, known = self.studies[prior], self.trials(prior)
+        if number < len(known) and known[number].state != TrialState.WAITING:
+            return optuna.trial.Trial(study, known[number]._trial_id)
+        trial = study.ask()
+        if trial.number != number:
+            raise self._damaged(f"trial {number} of {prior} is missing")
+        return trial
+
+    def _settings(self, prior: str, trial: Any) -> dict[str, object]:
+        """Return the settings of a trial; those that it does not have yet are proposed."""
+        drawn = {name: trial._suggest(name, _distribution(d)) for name, d in self._spaces[prior].items()}
+        return {name: parse_value(v) if isinstance(v, str) else v for name, v in drawn.items()}  # choices are JSON
+
+    def is_finished(self, cell: Cell) -> bool:
+        """Return whether the record has the end of a trial."""
+        prior, number = self._keys[cell.name]
+        known = self.trials(prior)
+        return number < len(known) and known[number].state.is_finished()
+
+    def begin(self, cell: Cell) -> Cell:
+        """Make the run folder of a trial with the settings that are proposed for it; return what it runs."""
         if cell.name not in self._begun:
             prior, number = self._keys[cell.name]
-            trial = self._begun[cell.name] = self.trials.trial(prior, number)
+            trial = self._begun[cell.name] = self.trial(prior, number)
             try:
-                cell = self._cell(cell.name, self.trials.settings(prior, trial))
+                cell = self._cell(cell.name, self._settings(prior, trial))
                 build_learner(cell.config.of_one_seed())
             except UserError as error:
-                self.trials.end(trial, None, refused=str(error))
+                trial.set_user_attr(_REFUSED, str(error))
+                trial.study.tell(trial.number, state=TrialState.PRUNED)
                 raise RefusedError(str(error)) from None
         self.prepare(cell)
         return cell
@@ -127,47 +195,57 @@ class Search(RunSet):
         """Record the curve of a trial; return False once it is complete, broken, or does not keep up."""
         if self.is_finished(cell):
             return False
-        trial, curve, complete = self._begun[cell.name], self.curve(cell), self.is_trained(cell)
-        keeps_up = self.trials.keeps_up(trial, curve)
+        trial, complete = self._begun[cell.name], self.is_trained(cell)
+        curve = curve_of(self.run_path(cell) / METRICS)
+        keeps_up = self.keeps_up(trial, curve)
         value, broken = score(curve, self.tuning), bool(curve) and not math.isfinite(curve[-1].mean)
         if broken or not (complete or self.tuning.goal != "return"):
             value = None
         if value is None and keeps_up and not (broken or complete):
             return True
-        self.trials.end(trial, value)
+        trial.study.tell(trial.number, value, state=TrialState.PRUNED if value is None else TrialState.COMPLETE)
         return False
+
+    def keeps_up(self, trial: Any, points: Sequence[Point]) -> bool:
+        """Record evaluations of a trial that are not recorded yet; return whether the trial may go on after each.
+
+        The first trial may always go on, and so may one that has all its steps.
+        """
+        known = trial.study.get_trials(deepcopy=False)[trial.number].last_step
+        for point in points:
+            resource = int(point.seconds) if self.tuning.goal == "seconds" else point.step
+            if (known is None or resource > known) and math.isfinite(point.value):
+                trial.report(point.value, resource)
+                known = resource
+                if trial.number > 0 and point.step < self.tuning.steps and trial.should_prune():
+                    return False
+        return True
 
     def end(self, cell: Cell) -> None:
         """Remove what a trial that has ended would go on from; a replay is large."""
         for file in checkpoints_in(self.run_path(cell)):
             remove_file(file)
 
-    def curve(self, cell: Cell) -> list[Point]:
-        """Return the evaluations of a trial; none before it has begun.
-
-        Raises:
-            MetricsError: its metrics are damaged.
-        """
-        return curve_of(self.run_path(cell) / METRICS)
-
     def outcome(self, prior: str) -> Outcome:
         """Return what came out for one prior."""
-        trials = self.trials.all(prior)
+        trials, tuning = self.trials(prior), self.tuning
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         best = max(done, key=lambda t: (t.value, -t.number), default=None)
         rows = [read_last_row(self.path / self.runs / f"{prior}-{t.number:03d}" / METRICS) for t in trials]
+        default = tuning.config(prior, {})
+        defaults = (t for t in done[:1] if t.number == 0 and tuning.config(prior, self._settings(prior, t)) == default)
         return Outcome(
             prior=prior,
             trials=sum(t.state != TrialState.WAITING for t in trials),
             completed=len(done),
             pruned=sum(t.state == TrialState.PRUNED for t in trials),
-            refused=self.trials.refused(prior),
-            env_steps=len(self.tuning.trial_seeds) * sum(int(row.get("step", 0)) for row in rows),
+            refused=tuple(t.user_attrs[_REFUSED] for t in trials if _REFUSED in t.user_attrs),
+            env_steps=len(tuning.trial_seeds) * sum(int(row.get("step", 0)) for row in rows),
             seconds=sum(map(elapsed_s, rows)),
             best=None if best is None else best.number,
             best_score=None if best is None else best.value,
-            default_score=next((t.value for t in done if t.number == 0 and self.trials.has_defaults(prior, t)), None),
-            settings={} if best is None else self.trials.settings(prior, best),
+            default_score=next((t.value for t in defaults), None),
+            settings={} if best is None else self._settings(prior, best),
         )
 
     def write_presets(self, outcomes: Sequence[Outcome]) -> list[Path]:
@@ -182,3 +260,46 @@ class Search(RunSet):
             replace_file(path, (json.dumps(document, indent=2) + "\n").encode())
             written.append(path)
         return written
+
+
+def _distribution(dimension: Dimension) -> BaseDistribution:
+    """Return what Optuna draws the values of a setting from; choices as JSON."""
+    if dimension.choices is not None:
+        return CategoricalDistribution([json.dumps(value) for value in dimension.choices])
+    low, high = dimension.low or 0, dimension.high or 0
+    return (IntDistribution if dimension.is_whole else FloatDistribution)(low, high, log=dimension.log)
+
+
+def _is_sound(trial: Any, space: Mapping[str, BaseDistribution]) -> bool:
+    """Return whether a search of this space can have left a trial."""
+    ended, names = trial.state in (TrialState.COMPLETE, TrialState.PRUNED), trial.params.keys()
+    if (names != space.keys() if ended else names - space.keys()) or trial.state == TrialState.FAIL:
+        return False
+    inside = all(
+        isinstance(d := space[name], CategoricalDistribution) or d.low <= value <= d.high
+        for name, value in trial.params.items()
+    )
+    rungs = [value for name, value in trial.system_attrs.items() if name.startswith("completed_rung_")]
+    values = [] if trial.values is None else list(trial.values)
+    return (
+        inside
+        and all(trial.distributions[name] == space[name] for name in names)
+        and (trial.state != TrialState.COMPLETE or len(values) == 1)
+        and trial.system_attrs.get("fixed_params", {}).keys() <= space.keys()
+        and all(math.isfinite(value) for value in (*trial.intermediate_values.values(), *rungs, *values))
+        and isinstance(trial.user_attrs.get(_REFUSED, ""), str)
+    )
+
+
+class _HeldLock:
+    """No lock: that of the search's folder is held, and no kill leaves a file behind."""
+
+    def __init__(self, journal: Path) -> None:
+        self._journal = journal
+
+    def acquire(self) -> bool:
+        require_held(self._journal)
+        return True
+
+    def release(self) -> None:
+        pass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ from esp_cli.files.formatting import file_name, format_count
 from esp_cli.studies.run_set import Cell, StudyError
 from esp_cli.studies.study import Study
 from esp_cli.studies.tuning_space import Dimension, space_of
-from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.metrics import column, elapsed_s, read_metrics
 from esp_envs.errors import UserError
@@ -77,8 +75,7 @@ class Tuning(Strict):
 
         Raises:
             UserError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
-                learner's or changes nothing, nothing is left to search, a choice cannot be trained, or the goal lacks
-                its return.
+                learner's or changes nothing, nothing is left to search, or the goal lacks its return.
         """
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
@@ -88,67 +85,54 @@ class Tuning(Strict):
             raise UserError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
-        for name in self.space:
-            if name.partition(".")[0] in _GIVEN:
-                raise UserError(
-                    f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
-                    f"--set {name}=VALUE"
-                )
+        effective, searched = set[str](), set[str]()
         for prior in self.priors:
-            for name, dimension in space_of(self.space, prior).items():
-                if name in self.overrides:
-                    raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
-                for value in dimension.corners():
-                    self.config(prior, {name: value})
-        self._check_effects()
-        for prior in self.priors:
-            self._check_choices(prior)
-
-    def _check_effects(self) -> None:
-        """Refuse a setting that changes nothing with any prior that it is searched for, and a search of no setting."""
-        spaces = {prior: space_of(self.space, prior) for prior in self.priors}
-        for prior, space in spaces.items():
+            space = space_of(self.space, prior)
             if not space:
                 raise UserError(
                     f"with --prior {prior} no setting of the space changes anything, so its trials would be equal; add "
                     "a setting of the learner, or leave this prior out"
                 )
-        idle = {prior: self.without_effect(prior) for prior in self.priors}
-        for name in self.space:
-            searched = [prior for prior, space in spaces.items() if name in space]
-            if searched and all(name in idle[prior] for prior in searched):
-                raise UserError(
-                    f"the space varies '{name}', which is without effect beside the other settings; leave it out"
-                )
+            for name, dimension in space.items():
+                self._check_setting(prior, name, dimension)
+            searched |= space.keys()
+            effective |= space.keys() - self.without_effect(prior)
+        if idle := sorted(searched - effective):
+            raise UserError(
+                f"the space varies '{idle[0]}', which is without effect beside the other settings; leave it out"
+            )
 
-    def _check_choices(self, prior: str) -> None:
-        """Refuse a choice with which nothing can be trained, before trials are spent on it.
-
-        All else is at its default. A choice may need another value of one other setting of the space, such as 64
-        minibatches with 64 worlds; then it is left to the search.
-        """
-        space = space_of(self.space, prior)
-        for name, dimension in space.items():
-            for value in dimension.choices or ():
-                reason = self._refusal(prior, {name: value})
-                others = (
-                    {other: corner} for other, tried in space.items() if other != name for corner in tried.corners()
-                )
-                if reason and all(self._refusal(prior, {name: value, **other}) for other in others):
-                    raise UserError(
-                        f"the space tries {json.dumps(value)} for '{name}', which cannot be trained: {reason}"
-                    )
-
-    def _refusal(self, prior: str, settings: Mapping[str, object]) -> str:
-        """Return why no learner can be built with these settings, or nothing where it can."""
-        try:
-            build_learner(self.config(prior, settings).of_one_seed())
-        except UserError as error:
-            return str(error)
-        return ""
+    def _check_setting(self, prior: str, name: str, dimension: Dimension) -> None:
+        """Refuse a setting that is not the learner's, that --set fixes, or that does not take each value."""
+        if name.partition(".")[0] in _GIVEN:
+            raise UserError(
+                f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
+                f"--set {name}=VALUE"
+            )
+        if name in self.overrides:
+            raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
+        for value in dimension.corners():
+            self.config(prior, {name: value})
 
 
 TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyError)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out for one prior."""
+
+    prior: str
+    trials: int  # that were begun
+    completed: int  # trials with a score
+    pruned: int  # trials that were ended early, broke, or did not reach the return
+    refused: tuple[str, ...]  # why settings did not go together, one text for each such trial; they count as pruned
+    env_steps: int  # of all seeds of all trials
+    seconds: float  # of training, all trials added up
+    best: int | None  # number of the best trial; None where no trial has a score
+    best_score: float | None  # of its curve, on the seeds of the trials
+    default_score: float | None  # of the default settings; None where the space does not hold them all
+    settings: Mapping[str, object]  # of the best trial
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,10 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from pydantic import JsonValue, field_validator, model_validator
 
-from esp_cli.files.documents import Strict, flat, parse_value, read_table, validated
+from esp_cli.files.documents import Strict, flat, read_table, validated
 from esp_cli.files.suggesting import did_you_mean
 from esp_cli.prior.config import of_no_use_to
 from esp_envs.errors import UserError
@@ -44,7 +43,8 @@ class Dimension(Strict):
         return self
 
     @property
-    def _is_whole(self) -> bool:
+    def is_whole(self) -> bool:
+        """Whether the values are whole numbers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     def corners(self) -> tuple[JsonValue, ...]:
@@ -56,16 +56,8 @@ class Dimension(Strict):
             return self.choices
         assert self.low is not None
         assert self.high is not None
-        between = () if self._is_whole else (self.low + (self.high - self.low) / math.e,)
+        between = () if self.is_whole else (self.low + (self.high - self.low) / math.e,)
         return (self.low, *between, self.high)
-
-    def suggest(self, trial: Any, name: str) -> JsonValue:
-        """Return the value that a trial of Optuna tries."""
-        if self.choices is not None:
-            return parse_value(trial.suggest_categorical(name, [json.dumps(value) for value in self.choices]))
-        if isinstance(self.low, int) and isinstance(self.high, int):
-            return int(trial.suggest_int(name, self.low, self.high, log=self.log))
-        return float(trial.suggest_float(name, self.low, self.high, log=self.log))
 
     def encoded(self, value: JsonValue) -> object:
         """Return a value as a trial of Optuna holds it; None where it is outside of the space."""
@@ -73,7 +65,7 @@ class Dimension(Strict):
             return next((json.dumps(choice) for choice in self.choices if choice == value), None)
         if not isinstance(value, int | float) or self.low is None or self.high is None:
             return None
-        fits = value % 1 == 0 or not self._is_whole
+        fits = value % 1 == 0 or not self.is_whole
         return value if fits and self.low <= value <= self.high else None
 
 

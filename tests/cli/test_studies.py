@@ -16,7 +16,7 @@ from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.files.opening import acquire, release
-from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder

@@ -23,8 +23,7 @@ from ray.cluster_utils import Cluster
 from esp_cli.files.opening import is_held
 from esp_cli.run import Run
 from esp_cli.studies import engine_ray
-from esp_cli.studies.engine import Engine
-from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.engine import Engine, LocalEngine
 from esp_cli.studies.engine_ray import (
     CLUSTER_FORMAT,
     ClusterError,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.studies.engine_local import APPLICATION, LocalEngine
+from esp_cli.studies.engine import APPLICATION, LocalEngine
 from esp_cli.studies.scheduler import Scheduler, makespan
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, stand_in, write_part, write_study
@@ -172,10 +172,10 @@ def test_a_run_that_a_killed_study_left_behind_is_waited_for_and_not_run_twice(f
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent ended")
 def test_a_job_ends_with_the_process_that_started_it(tmp_path):
-    waiter = "from esp_cli.studies.engine_local import follow_parent; follow_parent(); import time; time.sleep(60)"
+    waiter = "from esp_cli.studies.engine import follow_parent; follow_parent(); import time; time.sleep(60)"
     parent = (
         "import os, signal, sys, pathlib, time\n"
-        "from esp_cli.studies.engine_local import APPLICATION, LocalEngine\n"
+        "from esp_cli.studies.engine import APPLICATION, LocalEngine\n"
         f"engine = LocalEngine([sys.executable, '-c', {waiter!r}])\n"
         f"print(engine.start([], pathlib.Path({str(tmp_path / 'log')!r})).pid, flush=True)\n"
         "time.sleep(60)\n"

@@ -9,7 +9,7 @@ import pytest
 
 from esp_cli.files.opening import FolderLostError, LockError, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
-from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder, read_evaluation

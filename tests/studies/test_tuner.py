@@ -98,7 +98,7 @@ def search(path: Path, plan: Tuning, engine: CurveEngine | None = None, listener
 
 
 def states(made: Search, prior: str) -> list[TrialState]:
-    return [trial.state for trial in made.trials.all(prior)]
+    return [trial.state for trial in made.trials(prior)]
 
 
 def last_step(path: Path) -> int:
@@ -157,7 +157,7 @@ def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early
             == tuning().config(prior, {}).algorithm_settings["learning_rate"]
         )
         assert found.default_score is not None
-        trials = tuner.folder.trials.all(prior)
+        trials = tuner.folder.trials(prior)
         assert found.best_score == max(trial.value for trial in trials if trial.state == TrialState.COMPLETE)
     assert "prior.consistency_coef" in tuner.folder.outcome("esp").settings
     assert "prior.consistency_coef" not in tuner.folder.outcome("none").settings
@@ -165,13 +165,13 @@ def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early
 
 def test_a_third_goes_on_after_a_ninth_and_after_a_third_of_the_steps(tmp_path):
     """Of 1, 2, 3, ... values at a rung the best 1, 1, 1, 1, 1, 2, 2, 2, 3 may go on; 9, 8.5 and 8.4 are among them."""
-    trials = Search.create(tmp_path / "t", tuning(priors=("none",), budget=10)).trials
+    made = Search.create(tmp_path / "t", tuning(priors=("none",), budget=10))
     ends = []
     for number, value in enumerate((0.0, 9.0, 6.0, 7.0, 8.0, 5.0, 8.5, 8.2, 8.3, 8.4)):
-        trial = trials.trial("none", number)
+        trial = made.trial("none", number)
         looks = [Point(step, step / 10, value, value) for step in range(50, 901, 50)]
-        assert trials.keeps_up(trial, looks) == (number in (0, 1))
-        ends.append(trials.all("none")[number].last_step)
+        assert made.keeps_up(trial, looks) == (number in (0, 1))
+        ends.append(made.trials("none")[number].last_step)
     assert ends == [900, 900, 100, 100, 100, 100, 300, 100, 100, 300]
 
 

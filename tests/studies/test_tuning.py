@@ -119,31 +119,6 @@ def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
         tuning(**changes).check((0, 1))
 
 
-@pytest.mark.parametrize(
-    ("space", "sentence"),
-    [
-        ({"prior.transforms": Dimension(choices=("c4", "zz"))}, "tries \"zz\" for 'prior.transforms', which cannot be"),
-        ({"mappo.num_minibatches": Dimension(choices=(1, 9999))}, "tries 9999 for 'mappo.num_minibatches'"),
-    ],
-)
-def test_a_choice_that_cannot_be_trained_is_refused_before_trials_are_spent_on_it(space, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        tuning(overrides=UNFIXED, space=SPACE | space).check((0, 1))
-    name, wrong = next(iter(space.items()))
-    tuning(overrides=UNFIXED, space=SPACE | {name: Dimension(choices=wrong.choices[:1])}).check((0, 1))
-
-
-def test_a_choice_that_goes_with_another_setting_of_the_space_is_left_to_the_search():
-    many = {"mappo.num_minibatches": Dimension(choices=(1, 64))}
-    with pytest.raises(ValueError, match=r"tries 64 for 'mappo\.num_minibatches'"):
-        tuning(overrides=UNFIXED | {"mappo.num_envs": 2}, space=many).check((0, 1))
-    tuning(overrides=UNFIXED, space=many | {"mappo.num_envs": Dimension(choices=(2, 64))}).check((0, 1))
-
-
-def test_a_choice_of_the_prior_is_not_asked_of_the_plain_learner():
-    tuning(priors=("none",), space=SPACE | {"prior.transforms": Dimension(choices=("c4", "zz"))}).check((0, 1))
-
-
 def test_a_setting_that_another_one_of_the_space_gives_an_effect_is_searched():
     doubt = {"prior.doubt": Dimension(low=1.0, high=9.0)}
     with pytest.raises(ValueError, match=r"varies 'prior\.doubt', which is without effect"):

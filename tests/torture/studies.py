@@ -12,8 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from esp_cli.studies.catalogue import plan
-from esp_cli.studies.engine import Engine
-from esp_cli.studies.engine_local import LocalEngine
+from esp_cli.studies.engine import Engine, LocalEngine
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
