@@ -50,10 +50,10 @@ def table(
         caption: line below, such as the reward convention.
     """
     target = out if out.is_terminal else SafeConsole(highlight=False, width=PIPE_WIDTH)
-    laid = lay_out(columns, [[escaped(str(cell)) for cell in row] for row in rows], target.width)
+    laid = lay_out(columns, [[escaped(str(cell)) for cell in row] for row in rows], target)
     if title:  # outside the grid, which would wrap it to its own width
         target.print(Text(title, style="bold"), soft_wrap=not out.is_terminal)
-    for part in laid if isinstance(laid, list) else [laid]:
+    for part in laid:
         target.print(part)
     if caption:
         target.print(Text(caption, style="dim"), soft_wrap=not out.is_terminal)
