@@ -17,6 +17,7 @@ from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from types import MethodType
+from typing import Any
 
 from esp_cli import machine
 
@@ -43,21 +44,23 @@ EPISODES = 256
 THREADS = 1
 
 
-def train(algorithm: str, task: str, unit: str, steps: int, seeds: int) -> list[float]:
-    """Train on changed rewards, and return each seed's mean greedy return on the task's own."""
+def train(cell: tuple[str, str, str], steps: int, seeds: int) -> list[float]:
+    """Train a cell (algorithm, task, unit), and return each seed's mean greedy return on the task's own rewards."""
+    algorithm, task, unit = cell
     torch.set_num_threads(THREADS)
     offset, scale = UNITS[unit]
     overrides = {"prior.kind": "none"} | TASKS[task]
     config = resolve_config(task, algorithm, steps=steps, seeds=range(seeds), overrides=overrides)
     learner = build_learner(config)
-    collect = learner.collector.collect
+    collector: Any = learner.collector
+    collect = collector.collect
 
     def changed(_: object, *sizes: int) -> object:
         collected = collect(*sizes)
         (collected[0] if isinstance(collected, tuple) else collected).reward.mul_(scale).add_(offset)
         return collected
 
-    learner.collector.collect = MethodType(changed, learner.collector)
+    collector.collect = MethodType(changed, collector)
     iterations = -(-steps // learner.steps_per_iteration)
     for number in range(iterations):
         learner.iterate(number / iterations)
@@ -76,9 +79,9 @@ def main() -> None:
     args = parser.parse_args()
     names = [f"{algorithm} {task}" for algorithm, task in product(ALGORITHMS, TASKS)]
     names = [name for name in names if any(fnmatch(name, pattern) for pattern in args.cases)]
-    cells = [(*name.split(), unit) for name, unit in product(names, UNITS)]
+    cells = [(algorithm, task, unit) for (algorithm, task), unit in product(map(str.split, names), UNITS)]
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        runs = {cell: pool.submit(train, *cell, args.steps, args.seeds) for cell in cells}
+        runs = {cell: pool.submit(train, cell, args.steps, args.seeds) for cell in cells}
         returns = {cell: run.result() for cell, run in runs.items()}
     table, records = Table("learner and task", *UNITS), []
     for algorithm, task in map(str.split, names):
