@@ -6,9 +6,8 @@ import itertools
 from collections.abc import Sequence
 
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
-from esp_cli.symmetry.admission import declares, exchangeable
+from esp_cli.symmetry.admission import declares, exchangeable, scene_of
 from esp_cli.symmetry.elements import order_name
-from esp_cli.symmetry.parse import Factors
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
@@ -59,7 +58,7 @@ def _refusals(texts: Sequence[str], spaces: Spaces) -> dict[Element, str | None]
 
 def _defaults(spaces: Spaces) -> list[str]:
     """Return the texts of what is tried where nobody asks."""
-    texts = [*_TRIED, Factors.of(spaces.symmetry).scene]
+    texts = [*_TRIED, scene_of(spaces.symmetry, spaces.num_agents)]
     if isinstance(spaces.action, Discrete) and spaces.action.kind.is_vector:
         texts.append(f"d{max(1, sum(any(point) for point in spaces.action.points))}")
     for name, count in {"agents": spaces.num_agents, **exchangeable(spaces)}.items():

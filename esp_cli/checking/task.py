@@ -11,7 +11,7 @@ from esp_cli.checking.naming import named
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element
-from esp_cli.symmetry.parse import Factors
+from esp_cli.symmetry.admission import scene_of
 from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.spec import Spaces
 
@@ -108,6 +108,6 @@ def _reported(
     transforms: str | None,
 ) -> SymmetryReport:
     holding = [e for e, verdict in zip(elements, verdicts, strict=True) if verdict.outcome == "holds"]
-    found, usable = named(holding, elements, Factors.of(spaces.symmetry).scene)
+    found, usable = named(holding, elements, scene_of(spaces.symmetry, spaces.num_agents))
     left_out = {} if transforms is None else refused(spaces, transforms)
     return SymmetryReport(source, method, spaces.symmetry, found, usable, tuple(verdicts), left_out)

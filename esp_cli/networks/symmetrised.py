@@ -10,7 +10,7 @@ from torch import Tensor
 from esp_cli.networks.contract import Network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.symmetry.maps import map_of
-from esp_cli.symmetry.operators import layout_operator
+from esp_cli.symmetry.representation import layout_operator
 
 
 class Symmetrised(Network):

@@ -5,10 +5,8 @@ from esp_cli.symmetry.checks import environment_errors, network_equivariance_err
 from esp_cli.symmetry.elements import Element, Geometry
 from esp_cli.symmetry.groups import FiniteGroup, Group, agent_permutations, direct_product, item_orders
 from esp_cli.symmetry.parse import parse_elements, parse_group
-from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
-from esp_cli.symmetry.plane_groups import cyclic, dihedral, orthogonal, special_orthogonal
-from esp_cli.symmetry.transform_set import TransformSet, transform_set
-from esp_cli.symmetry.transforms import Transform, build_transform
+from esp_cli.symmetry.plane import PlaneElement, cyclic, dihedral, mirror, orthogonal, rotation, special_orthogonal
+from esp_cli.symmetry.transforms import Transform, TransformSet, build_transform, transform_set
 
 __all__ = [
     "Element",

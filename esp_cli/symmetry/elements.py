@@ -6,7 +6,7 @@ A new kind of geometry is one file beside this one: see `plane`. Orders of agent
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,12 +18,9 @@ from esp_envs.spec import Field
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
-Order = tuple[int, ...]
-"""The place that each of some things moves to: thing i to place order[i]."""
-Orders = tuple[tuple[str, Order], ...]
-"""Fields by name, each with the order of its items."""
-AGENTS = "agents"
-"""Stands for the agents where orders are named."""
+Order = tuple[int, ...]  # thing i moves to place order[i]
+Orders = tuple[tuple[str, Order], ...]  # fields by name, each with the order of its items
+AGENTS = "agents"  # stands for the agents where orders are named
 
 
 class Geometry(ABC):
@@ -122,7 +119,7 @@ class Element:
 
     @property
     def participle(self) -> str:
-        """How messages say that something was transformed: "turned by 45 degrees"."""
+        """How messages say that something was transformed."""
         return " and ".join(g.participle for g in self.geometry) or f"under {self.name}"
 
     @property
@@ -174,22 +171,13 @@ class Element:
         return Element(tuple(g.inverse() for g in self.geometry), permutation, items)
 
 
-def aspects_of(elements: Iterable[Element]) -> frozenset[Any]:
-    """Return all that some elements act on, see `Element.aspects`."""
-    return frozenset[Any]().union(*(element.aspects for element in elements))
-
-
 def order_name(name: str, order: Sequence[int]) -> str:
     """Return the name of an order of agents or items: "agents-1-0-2"."""
     return "-".join(map(str, (name, *order)))
 
 
 def _moves(order: Order) -> bool:
-    """Return whether an order moves something.
-
-    Raises:
-        UserError: it is none.
-    """
+    """Return whether an order moves something, and refuse what is no order."""
     stay = tuple(range(len(order)))
     if tuple(sorted(order)) != stay:
         raise UserError(f"{order} is not a permutation; write each number from 0 to {len(order) - 1} once")

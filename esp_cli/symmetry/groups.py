@@ -1,4 +1,4 @@
-"""Groups from generators, orders of agents and items, and direct products; `plane_groups` has those of the plane."""
+"""Groups from generators, orders of agents and items, and direct products; `plane` has those of the plane."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from esp_cli.symmetry.elements import AGENTS, Element, Geometry, aspects_of
+from esp_cli.symmetry.elements import AGENTS, Element, Geometry
 from esp_envs.errors import UserError
 
-LISTED_LIMIT = 1024
-"""Largest number of elements that is listed; larger groups (all orders of 7 agents: 5040) are sampled instead."""
-MOST_ITEMS = 6
-"""Items of a field all of whose orders make a group; of more, they are too many to list."""
+LISTED_LIMIT = 1024  # most elements that are listed; larger groups (all orders of 7 agents: 5040) are sampled instead
+MOST_ITEMS = 6  # most items of a field all of whose orders make a group
 
 
 class Group(ABC):
@@ -43,11 +41,7 @@ class Group(ABC):
     @cached_property
     def aspects(self) -> frozenset[Any]:
         """All that its elements act on, see `Element.aspects`."""
-        return aspects_of(self.generators())
-
-    def part(self, element: Element) -> Element:
-        """Return what an element does to all that the group acts on."""
-        return element.restricted(self.aspects)
+        return frozenset[Any]().union(*(element.aspects for element in self.generators()))
 
 
 class FiniteGroup(Group):
@@ -79,7 +73,7 @@ class FiniteGroup(Group):
             frontier = [p for p in {g @ h for g in gens for h in frontier} if p not in found]
             found.update(frontier)
             if len(found) > LISTED_LIMIT:
-                raise UserError(f"{name} has more than {LISTED_LIMIT} elements; use a smaller group or so2, o2")
+                raise UserError(f"'{name}' has more than {LISTED_LIMIT} elements; use a smaller group or so2, o2")
         return cls(name, found)
 
     @property
@@ -93,14 +87,12 @@ class FiniteGroup(Group):
         return np.array([[self._index[g @ h] for h in self.elements] for g in self.elements])
 
     def draw(self, generator: torch.Generator) -> Element:
-        """Draw uniformly; see `Group.draw`."""
         return self.elements[int(torch.randint(self.order, (), generator=generator))]
 
     def __contains__(self, element: object) -> bool:
         return element in self._index
 
     def generators(self) -> tuple[Element, ...]:
-        """Return all elements."""
         return self.elements
 
 
@@ -112,7 +104,6 @@ class AgentPermutations(Group):
         self.num_agents = num_agents
 
     def draw(self, generator: torch.Generator) -> Element:
-        """Draw an order uniformly."""
         return Element(permutation=tuple(torch.randperm(self.num_agents, generator=generator).tolist()))
 
     def __contains__(self, element: object) -> bool:
@@ -121,7 +112,6 @@ class AgentPermutations(Group):
         return element.permutation is None or len(element.permutation) == self.num_agents
 
     def generators(self) -> tuple[Element, ...]:
-        """Return the swap of the first two agents and the round of all of them, which generate every order."""
         return tuple(Element(permutation=order) for order in swap_and_round(self.num_agents))
 
 
@@ -133,18 +123,16 @@ class ProductGroup(Group):
         self.factors = factors
 
     def draw(self, generator: torch.Generator) -> Element:
-        """Draw each factor."""
         return reduce(matmul, [factor.draw(generator) for factor in self.factors])
 
     def __contains__(self, element: object) -> bool:
         if not isinstance(element, Element):
             return False
-        parts = [factor.part(element) for factor in self.factors]
+        parts = [element.restricted(factor.aspects) for factor in self.factors]
         within = all(part in factor for part, factor in zip(parts, self.factors, strict=True))
         return within and reduce(matmul, parts, Element()) == element
 
     def generators(self) -> tuple[Element, ...]:
-        """Return those of all factors."""
         return tuple(element for factor in self.factors for element in factor.generators())
 
 

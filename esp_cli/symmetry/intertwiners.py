@@ -9,12 +9,10 @@ import numpy as np
 
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.groups import FiniteGroup
-from esp_cli.symmetry.operators import field_operator, item_operator, item_places
-from esp_cli.symmetry.representation import action_map
+from esp_cli.symmetry.representation import action_map, field_operator, item_operator, item_places
 from esp_envs.spec import ActionSpace, Discrete, Field, Kind, Layout
 
-_INDEPENDENT = 1e-6
-"""Length of what is new in a map, of those that are averaged, below which it is rounding."""
+_INDEPENDENT = 1e-6  # length of what is new in a map, of those that are averaged, below which it is rounding
 
 
 @dataclass(frozen=True)

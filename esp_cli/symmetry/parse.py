@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import reduce
 from operator import matmul
 
@@ -21,12 +20,12 @@ from esp_cli.symmetry.groups import (
     item_orders,
     swap_and_round,
 )
-from esp_cli.symmetry.plane_groups import read_plane
+from esp_cli.symmetry.plane import read_plane
 from esp_envs.errors import UserError
 
 _KNOWN = "rot90, rot45, flip-x, flip-y, flip-diagonal, c4, d4, c8, so2, o2, agents, landmarks-3, d4*agents"
+# a field and numbers: how many items it has, or the place that each of them moves to
 _ORDER = r"(?!(?i:rot|flip|agents)-)([A-Za-z]\w*)((?:-\d{1,4})+)"
-"""A field and numbers: how many items it has, or the place that each of them moves to."""
 
 
 def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
@@ -72,10 +71,10 @@ def declared_factors(text: str, num_agents: int) -> list[Group]:
     """Return independent groups whose direct product is a declared symmetry, see `parse_group`."""
     groups = [group for part in text.split(",") for group in _declared(part.strip(), text, num_agents)]
     if are_independent(groups):
-        return sorted(groups, key=_rank)
+        return sorted(groups, key=rank)
     if not all(isinstance(group, FiniteGroup) for group in groups):
         raise UserError(f"'{text}' generates no group that can be listed; let so2, o2 or many agents act on their own")
-    return [FiniteGroup.generated_by(f"'{text}'", [g for group in groups for g in group.generators()])]
+    return [FiniteGroup.generated_by(text, [g for group in groups for g in group.generators()])]
 
 
 def _declared(part: str, text: str, num_agents: int) -> list[Group]:
@@ -92,53 +91,13 @@ def _declared(part: str, text: str, num_agents: int) -> list[Group]:
     return groups
 
 
-@dataclass(frozen=True)
-class Factors:
-    """The words of a declared symmetry, by what they move: "d4*agents*landmarks-3".
-
-    Attributes:
-        scene: what moves the scene, with coupled orders if there are: "d4", "flip-x*hips-3-2-1-0"; or empty.
-        agents: whether all orders of agents belong to it.
-        items: fields all of whose orders belong to it, each with how many items it has.
-    """
-
-    scene: str
-    agents: bool = False
-    items: dict[str, int] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, symmetry: str) -> Factors:
-        """Read a task's symmetry."""
-        if "," in symmetry:
-            return cls(symmetry)
-        scene, items = [], dict[str, int]()
-        words = [part.strip() for part in symmetry.split("*")]
-        for word in words:
-            match = re.fullmatch(_ORDER, word)
-            if match is not None and match[2].count("-") == 1 and _read_word(word.lower(), 2) is None:
-                items[match[1]] = int(match[2][1:])
-            elif word.lower() != AGENTS:
-                scene.append(word if match else word.lower())
-        return cls("*".join(scene), AGENTS in map(str.lower, words), items)
-
-    @property
-    def name(self) -> str:
-        """The symmetry as a task declares it."""
-        return "*".join((*filter(None, [self.scene]), *([AGENTS] if self.agents else []), *self.orders))
-
-    @property
-    def orders(self) -> list[str]:
-        """The groups of all orders of items: ["landmarks-3"]."""
-        return [f"{name}-{count}" for name, count in self.items.items()]
-
-
 def is_item_name(name: str) -> bool:
     """Return whether orders of the items of a field with this name can be written: "landmarks-1-0-2"."""
     return "-" not in name and re.fullmatch(_ORDER, f"{name}-2") is not None
 
 
-def _rank(group: Group) -> tuple[int, str]:
-    """Return where a group stands in a direct product: scene, agents, items of each field by name."""
+def rank(group: Group) -> tuple[int, str]:
+    """Return where a group stands in a direct product: scene 0, agents 1, items of each field by name 2."""
     names = [aspect for aspect in group.aspects if isinstance(aspect, str)]
     if len(names) < len(group.aspects) or not names:
         return (0, "")
@@ -151,13 +110,13 @@ def _moves_scene(group: Group) -> bool:
 
 
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
-    """Read one item of the list: a tuple of elements, or a group that has to be sampled."""
+    """Read one entry of the list: a tuple of elements, or a group that has to be sampled."""
     factors = [_factor(word.strip(), text, num_agents) for word in part.split("*")]
     groups = [factor for factor in factors if isinstance(factor, Group)]
     if len(groups) == len(factors):
         ordered = len(groups) == 1 or not _moves_scene(groups[-1])
         if are_independent(groups) and (ordered or all(map(_moves_scene, groups))):
-            group = direct_product(*sorted(groups, key=_rank))
+            group = direct_product(*sorted(groups, key=rank))
             return group.elements if isinstance(group, FiniteGroup) else group
         if ordered:
             raise UserError(f"'{part}' is not a direct product; write each thing that moves once, as in d4*agents")
@@ -214,11 +173,7 @@ def _read_items(word: str) -> Element | Group | None:
 
 
 def _order(word: str, count: int) -> tuple[int, ...]:
-    """Read the place that each of some things moves to: "agents-1-0-2".
-
-    Raises:
-        UserError: it is no order of so many.
-    """
+    """Read the place that each of some things moves to: "agents-1-0-2"."""
     name, *numbers = word.split("-")
     places = tuple(map(int, numbers))
     if sorted(places) != list(range(count)):

@@ -1,35 +1,103 @@
-"""Turns and mirrors of the plane, and how they act on each kind of field.
+"""Turns and mirrors of the plane, their groups C_n, D_n, SO(2) and O(2), and how they act on each kind of field.
 
 Convention, pinned by `tests/symmetry/test_elements.py`: angles are counter-clockwise, `rot90` sends (1, 0) to (0, 1),
 so *right* becomes *up*; a product `g @ h` applies h first, hence L_g L_h = L_{gh}. `flip-x` is the mirror in the
 x-axis, (x, y) -> (x, -y); `flip-y` the one in the y-axis, (x, y) -> (-x, y).
-
-An element is an exact fraction of a turn and a mirror flag, so that closure, products and inverses are decided without
-rounding; matrices are derived.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property, lru_cache
 
 import numpy as np
+import torch
 
 from esp_cli.symmetry.elements import Element, Floats, Geometry, Indices
+from esp_cli.symmetry.groups import FiniteGroup, Group
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
 
 _PIXEL_TOLERANCE = 1e-6
+_MIRRORS = {"flip-x": 0, "flip-diagonal": 45, "flip-y": 90, "flip-antidiagonal": 135}  # axis in degrees
+_DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
+_MAX_FOLD = 360
 
-_MIRROR_NAMES = {
-    Fraction(0): "flip-x",
-    Fraction(45): "flip-diagonal",
-    Fraction(90): "flip-y",
-    Fraction(135): "flip-antidiagonal",
-}
+
+@dataclass(frozen=True)
+class PlaneElement(Geometry):
+    """Mirror in the x-axis if `mirrored`, then turn. Products and inverses are exact; matrices are derived.
+
+    PlaneElement(Fraction(1, 4)).block(Field("way", Kind.VECTOR))  # [[0, -1], [1, 0]]
+
+    Attributes:
+        turn: counter-clockwise fraction of a full turn in [0, 1).
+        mirrored: whether y changes sign before the turn.
+    """
+
+    turn: Fraction = Fraction(0)
+    mirrored: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "turn", Fraction(self.turn) % 1)
+
+    @staticmethod
+    def of(element: Element) -> PlaneElement:
+        """Return what an element does to the plane."""
+        return next((g for g in element.geometry if isinstance(g, PlaneElement)), PlaneElement())
+
+    @cached_property
+    def matrix(self) -> Floats:
+        """The orthogonal 2x2 matrix, Eq. 1; exact integers at multiples of 90 degrees."""
+        cos, sin = _cos_sin(self.turn)
+        sign = -1.0 if self.mirrored else 1.0
+        return np.array([[cos, -sin * sign + 0.0], [sin, cos * sign + 0.0]])
+
+    @property
+    def degrees(self) -> Fraction:
+        """The turn in degrees."""
+        return self.turn * 360
+
+    @property
+    def is_identity(self) -> bool:
+        return not (self.turn or self.mirrored)
+
+    @property
+    def sort_key(self) -> tuple[bool, Fraction]:
+        return self.mirrored, self.turn
+
+    @property
+    def participle(self) -> str:
+        return f"mirrored by {self.name}" if self.mirrored else f"turned by {float(self.degrees):g} degrees"
+
+    @property
+    def name(self) -> str:
+        """The name that `parse_elements` reads: rot90, flip-x, flip22.5."""
+        if self.mirrored:
+            axis = self.degrees / 2
+            return next((name for name, named in _MIRRORS.items() if named == axis), f"flip{_number(axis)}")
+        return f"rot{_number(self.degrees)}" if self.turn else "identity"
+
+    def __matmul__(self, other: PlaneElement) -> PlaneElement:
+        # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
+        turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
+        return PlaneElement(turn, self.mirrored != other.mirrored)
+
+    def inverse(self) -> PlaneElement:
+        return self if self.mirrored else PlaneElement(-self.turn)
+
+    def block(self, field: Field) -> Floats | Indices:
+        if field.pixels is not None:
+            return picture_sources(field.pixels, self.matrix)
+        if field.rays:
+            return ring_sources(field.rays, self.matrix)
+        if field.kind not in KIND_MATRICES:
+            raise UserError(f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns")
+        return KIND_MATRICES[field.kind](self.matrix)
 
 
 @lru_cache(maxsize=1024)
@@ -74,16 +142,9 @@ A kind that turns and mirrors leave alone, such as one of another geometry, says
 
 
 def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
-    """Return where each pixel of a transformed picture comes from.
+    """Return [rows * columns]: the index of the old pixel that shows in each pixel of a transformed picture.
 
     A pixel's place is its middle's (x, y), seen from the picture's: the first row is the top, the first column left.
-
-    Args:
-        pixels: rows and columns.
-        planar: orthogonal matrix [2, 2].
-
-    Returns:
-        [rows * columns], the index of the old pixel that shows in each new one.
 
     Raises:
         UserError: some pixel would come to lie between others, or outside.
@@ -100,16 +161,9 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
 
 
 def ring_sources(rays: int, planar: Floats) -> Indices:
-    """Return where each ray of a transformed ring comes from.
+    """Return [rays]: the index of the old ray that shows in each ray of a transformed ring.
 
     Ray k points at k / rays of a turn, counter-clockwise from the x-axis.
-
-    Args:
-        rays: n.
-        planar: orthogonal matrix [2, 2].
-
-    Returns:
-        [n], the index of the old ray that shows in each new one.
 
     Raises:
         UserError: some ray would come to lie between others.
@@ -123,88 +177,6 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
     return whole.astype(np.int64) % rays
 
 
-@dataclass(frozen=True)
-class PlaneElement(Geometry):
-    """Mirror in the x-axis if `mirrored`, then turn.
-
-    PlaneElement(Fraction(1, 4)).block(Field("way", Kind.VECTOR))  # [[0, -1], [1, 0]]
-
-    Attributes:
-        turn: counter-clockwise fraction of a full turn in [0, 1).
-        mirrored: whether y changes sign before the turn.
-    """
-
-    turn: Fraction = Fraction(0)
-    mirrored: bool = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "turn", Fraction(self.turn) % 1)
-
-    @staticmethod
-    def of(element: Element) -> PlaneElement:
-        """Return what an element does to the plane."""
-        return next((g for g in element.geometry if isinstance(g, PlaneElement)), PlaneElement())
-
-    @cached_property
-    def matrix(self) -> Floats:
-        """The orthogonal 2x2 matrix, Eq. 1; exact integers at multiples of 90 degrees."""
-        cos, sin = _cos_sin(self.turn)
-        sign = -1.0 if self.mirrored else 1.0
-        return np.array([[cos, -sin * sign + 0.0], [sin, cos * sign + 0.0]])
-
-    @property
-    def degrees(self) -> Fraction:
-        """The turn in degrees."""
-        return self.turn * 360
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether nothing moves."""
-        return not (self.turn or self.mirrored)
-
-    @property
-    def sort_key(self) -> tuple[bool, Fraction]:
-        """What the elements of a group are sorted by: mirror, turn."""
-        return self.mirrored, self.turn
-
-    @property
-    def participle(self) -> str:
-        """How messages say that something was transformed."""
-        return f"mirrored by {self.name}" if self.mirrored else f"turned by {float(self.degrees):g} degrees"
-
-    @property
-    def name(self) -> str:
-        """The name that `parse_elements` reads: rot90, flip-x, flip22.5."""
-        if self.mirrored:
-            axis = self.degrees / 2
-            return _MIRROR_NAMES.get(axis, f"flip{_number(axis)}")
-        return f"rot{_number(self.degrees)}" if self.turn else "identity"
-
-    def __matmul__(self, other: PlaneElement) -> PlaneElement:
-        """Compose: `g @ h` applies h first, then g."""
-        # R(a) F R(b) = R(a - b) F: a mirror reverses the sense of the turn that it passes.
-        turn = self.turn - other.turn if self.mirrored else self.turn + other.turn
-        return PlaneElement(turn, self.mirrored != other.mirrored)
-
-    def inverse(self) -> PlaneElement:
-        """Return the element that undoes this one."""
-        return self if self.mirrored else PlaneElement(-self.turn)
-
-    def block(self, field: Field) -> Floats | Indices:
-        """Return how the numbers of one item of a field transform.
-
-        Raises:
-            UserError: pixels or rays do not come to lie on others, or the kind is unknown in the plane.
-        """
-        if field.pixels is not None:
-            return picture_sources(field.pixels, self.matrix)
-        if field.rays:
-            return ring_sources(field.rays, self.matrix)
-        if field.kind not in KIND_MATRICES:
-            raise UserError(f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns")
-        return KIND_MATRICES[field.kind](self.matrix)
-
-
 def rotation(degrees: Fraction | int | str) -> Element:
     """Return the counter-clockwise turn by an exact number of degrees."""
     return Element.of(PlaneElement(Fraction(degrees) / 360))
@@ -213,3 +185,64 @@ def rotation(degrees: Fraction | int | str) -> Element:
 def mirror(axis_degrees: Fraction | int | str = 0) -> Element:
     """Return the mirror in the line through the origin at this angle; 0 is `flip-x`, 90 is `flip-y`."""
     return Element.of(PlaneElement(Fraction(axis_degrees) / 180, mirrored=True))
+
+
+class PlaneGroup(Group):
+    """SO(2), all turns, or O(2), all turns and mirrors; drawn from the uniform (Haar) measure."""
+
+    def __init__(self, mirrors: bool) -> None:
+        self.name = "o2" if mirrors else "so2"
+        self.mirrors = mirrors
+
+    def draw(self, generator: torch.Generator) -> Element:
+        turn = Fraction(float(torch.rand((), generator=generator, dtype=torch.float64)))
+        mirrored = self.mirrors and bool(torch.randint(2, (), generator=generator))
+        return Element.of(PlaneElement(turn, mirrored))
+
+    def __contains__(self, element: object) -> bool:
+        if not isinstance(element, Element) or element.aspects - {PlaneElement}:
+            return False
+        return self.mirrors or not PlaneElement.of(element).mirrored
+
+    def generators(self) -> tuple[Element, ...]:
+        radian = Element.of(PlaneElement(Fraction(1 / math.tau)))  # its multiples come near every turn
+        return (radian, mirror()) if self.mirrors else (radian,)
+
+
+def cyclic(n: int) -> FiniteGroup:
+    """Return C_n, the turns by multiples of 360/n degrees."""
+    return FiniteGroup.generated_by(f"c{n}", [PlaneElement(Fraction(1, n))])
+
+
+def dihedral(n: int) -> FiniteGroup:
+    """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
+    return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])
+
+
+def special_orthogonal() -> PlaneGroup:
+    """Return SO(2)."""
+    return PlaneGroup(mirrors=False)
+
+
+def orthogonal() -> PlaneGroup:
+    """Return O(2)."""
+    return PlaneGroup(mirrors=True)
+
+
+def read_plane(word: str, _: int) -> Element | Group | None:
+    """Read a turn, a mirror or a group of these; see `parse_elements`."""
+    if word == "identity":
+        return Element()
+    if word in _MIRRORS:
+        return mirror(_MIRRORS[word])
+    if word in ("so2", "o2"):
+        return PlaneGroup(mirrors=word == "o2")
+    if match := re.fullmatch(r"([cd])(\d{1,3})", word):
+        if not 1 <= int(match[2]) <= _MAX_FOLD:
+            raise UserError(f"group '{word}' is out of range; take n from 1 to {_MAX_FOLD}, or so2 / o2")
+        return cyclic(int(match[2])) if match[1] == "c" else dihedral(int(match[2]))
+    if match := re.fullmatch("rot" + _DEGREES, word):
+        return rotation(Fraction(match[1]))
+    if match := re.fullmatch("flip-?" + _DEGREES, word):
+        return mirror(Fraction(match[1]))
+    return None

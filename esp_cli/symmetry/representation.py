@@ -5,22 +5,17 @@ Layouts say how the numbers of one row transform; here agents change places too.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Indices
-from esp_cli.symmetry.operators import Operator, item_operator, layout_operator, numbers_of, order_array
+from esp_cli.symmetry.elements import Element, Geometry, Indices, Order
+from esp_cli.symmetry.maps import Operator
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, others_of
 
 _MATCH_TOLERANCE = 1e-6
-
-
-def agent_places(elements: Sequence[Element], num_agents: int) -> Indices | None:
-    """Return [G, N] the place that each agent moves to under each element, or None where all stay."""
-    orders = [element.permutation for element in elements]
-    return None if not any(orders) else order_array(orders, num_agents)
 
 
 def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) -> Operator:
@@ -38,7 +33,7 @@ def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) 
         An operator on D or on N D numbers.
     """
     row, places = layout_operator(layout, elements), agent_places(elements, num_agents)
-    return row if places is None else _reordered(row.repeated(num_agents), joint_sources(layout, places))
+    return row if places is None else row.repeated(num_agents).ordered(joint_sources(layout, places))
 
 
 def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
@@ -54,7 +49,7 @@ def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     if places is not None and spaces.is_joint:
         return rows_operator(spaces.observation, elements, spaces.num_agents)
     state = layout_operator(spaces.state, elements)
-    return state if places is None else _reordered(state, state_sources(spaces.state, places))
+    return state if places is None else state.ordered(state_sources(spaces.state, places))
 
 
 def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
@@ -65,22 +60,14 @@ def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     row = Operator.reordering(np.argsort(action_map(action, elements), axis=1))
     if places is None:
         return row
-    return _reordered(row.repeated(spaces.num_agents), numbers_of(np.argsort(places, axis=1), action.count))
-
-
-def _reordered(rows: Operator, sources: Indices) -> Operator:
-    """Return an operator whose results then change places as agents do."""
-    return rows.ordered(sources)
+    return row.repeated(spaces.num_agents).ordered(numbers_of(np.argsort(places, axis=1), action.count))
 
 
 def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
-    """Return K_g of a discrete action space: entry [g, j] is the action that j becomes.
+    """Return K_g of a discrete action space [G, A]: entry [g, j] is the action that j becomes.
 
     It is derived by turning each action's physical meaning and looking for the action that means the result. Of
     several actions with one meaning the first goes to the first, the second to the second.
-
-    Returns:
-        [G, A].
 
     Raises:
         UserError: some action's image is no action.
@@ -99,18 +86,105 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
     return nearest
 
 
-def field_names(spaces: Spaces) -> list[str]:
-    """Return the names of the fields whose items an order may name: those of the observation and of the action."""
+def layout_operator(layout: Layout, elements: Sequence[Element]) -> Operator:
+    """Return L_g of a layout of D numbers, field by field, with all agents in their places."""
+    return Operator.beside([field_operator(field, elements) for field in layout.fields], len(elements))
+
+
+def field_operator(field: Field, elements: Sequence[Element]) -> Operator:
+    """Return how a field transforms: each of its items, and their order.
+
+    Raises:
+        UserError: an element cannot transform it.
+    """
+    items, places = item_operator(field, elements).repeated(field.count), item_places(field, elements)
+    return items if places is None else items.ordered(numbers_of(np.argsort(places, axis=1), field.item_width))
+
+
+def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
+    """Return how the numbers of one item of a field transform, with all things in their places.
+
+    Raises:
+        UserError: a geometry cannot transform the field, or two do not commute on it.
+    """
+    geometries = list(dict.fromkeys(element.geometry for element in elements))
+    index = [geometries.index(element.geometry) for element in elements]
+    if field.parts:
+        return layout_operator(Layout(field.parts), [Element(geometry) for geometry in geometries]).selected(index)
+    each = [_item_operator(field, geometry) for geometry in geometries]
+    terms = max(one.terms for one in each)
+    source, weight = (
+        np.concatenate([np.pad(part, ((0, 0), (0, 0), (0, terms - part.shape[2]))) for part in parts])
+        for parts in zip(*((one.source, one.weight) for one in each), strict=True)
+    )
+    return Operator(source, weight).selected(index)
+
+
+def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
+    """Return how one item transforms under one of each kind of geometry, G = 1."""
+    whole = Operator.reordering(np.arange(field.item_width)[None])
+    for one in geometry:
+        part = Operator.of_block(one.block(field))
+        if part.width != field.item_width:
+            raise UserError(
+                f"{one.name} transforms {part.width} numbers of field '{field.name}', but an item of it has "
+                f"{field.item_width}"
+            )
+        probe = np.random.default_rng(0).normal(size=field.item_width)
+        if not np.allclose(part.push(whole.push(probe)[0]), whole.push(part.push(probe)[0])):
+            names = " and ".join(g.name for g in geometry)
+            raise UserError(f"{names} do not commute on field '{field.name}', so their product is no symmetry")
+        whole = part.after(whole)
+    return whole
+
+
+def item_places(field: Field, elements: Sequence[Element]) -> Indices | None:
+    """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
+
+    Raises:
+        UserError: the field has another number of items, is a picture, or its items follow the agents.
+    """
+    name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
+    orders = [dict(element.items).get(name) for element in elements]
+    moved = [order for order in orders if order is not None]
+    if moved and (field.items is not Items.FIXED or field.pixels is not None):
+        raise UserError(f"the items of field '{name}' cannot be exchanged: they are the agents', or pictures")
+    if any(len(order) != field.count for order in moved):
+        raise UserError(f"field '{name}' has {field.count} items, not {len(moved[0])}")
+    return _order_array(orders, field.count)
+
+
+def agent_places(elements: Sequence[Element], num_agents: int) -> Indices | None:
+    """Return [G, N] the place that each agent moves to under each element, or None where all stay.
+
+    Raises:
+        UserError: an element permutes another number of agents.
+    """
+    orders = [element.permutation for element in elements]
+    if any(order and len(order) != num_agents for order in orders):
+        raise UserError(f"the permutation is not one of its {num_agents} agents")
+    return _order_array(orders, num_agents)
+
+
+def _order_array(orders: Sequence[Order | None], count: int) -> Indices | None:
+    return np.array([order or range(count) for order in orders], dtype=np.int64) if any(orders) else None
+
+
+def require_items(elements: Sequence[Element], spaces: Spaces) -> None:
+    """Refuse orders of the items of fields that neither an observation nor an action has.
+
+    Raises:
+        UserError: there are some.
+    """
     acted = () if isinstance(spaces.action, Discrete) else spaces.action.layout.fields
-    return list(dict.fromkeys(field.name for field in (*spaces.observation.fields, *acted)))
+    known = list(dict.fromkeys(field.name for field in (*spaces.observation.fields, *acted)))
+    for name in dict.fromkeys(name for element in elements for name, _ in element.items):
+        if name not in known:
+            raise UserError(f"{spaces.label} has no field '{name}', but {', '.join(known)}")
 
 
 def state_sources(layout: Layout, places: Indices) -> Indices:
-    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents.
-
-    Args:
-        layout: of the state.
-        places: [G, N], places[g, i] = sigma_g(i).
+    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents to `places`.
 
     Raises:
         UserError: a field's items cannot follow the agents.
@@ -119,23 +193,22 @@ def state_sources(layout: Layout, places: Indices) -> Indices:
     for field in layout.fields:
         if field.items is Items.OTHERS:
             raise UserError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
-    return _sources(layout, [_old_slots(field, came_from[:, None])[:, 0] for field in layout.fields])
+    return _sources(layout, came_from[:, None])[:, 0]
 
 
 def joint_sources(layout: Layout, places: Indices) -> Indices:
     """Return [G, N * D]: the old place of each number of all rows end to end when only agents move (to `places`)."""
     came_from = np.argsort(places, axis=1)
     observers = np.broadcast_to(came_from[:, None], (*came_from.shape, came_from.shape[1]))
-    within = _sources(layout, [_old_slots(field, observers) for field in layout.fields])
+    within = _sources(layout, observers)
     return (within + came_from[:, :, None] * layout.width).reshape(len(places), -1)
 
 
-def _sources(layout: Layout, slots: Sequence[Indices]) -> Indices:
-    """Return [..., D] the old place of each number, of each field's old items [..., count]."""
-    numbers, start = [], 0
-    for field, old in zip(layout.fields, slots, strict=True):
-        numbers.append(start + numbers_of(old, field.item_width))
-        start += field.width
+def _sources(layout: Layout, came_from: Indices) -> Indices:
+    """Return [G, R, D]: the old place of each number in its row, see `_old_slots`."""
+    starts = np.cumsum([0, *(field.width for field in layout.fields)])
+    slots = [(field, _old_slots(field, came_from)) for field in layout.fields]
+    numbers = [start + numbers_of(old, field.item_width) for start, (field, old) in zip(starts, slots, strict=False)]
     return np.concatenate(numbers, axis=-1)
 
 
@@ -149,17 +222,17 @@ def _old_slots(field: Field, came_from: Indices) -> Indices:
     num_agents = came_from.shape[2]
     if field.items is Items.FIXED:
         return np.broadcast_to(np.arange(field.count), (*came_from.shape[:2], field.count))
+    what, expected = ("agents", num_agents) if field.items is Items.AGENTS else ("other agents", num_agents - 1)
+    if field.count != expected:
+        raise UserError(f"field '{field.name}' has {field.count} items for {expected} {what}; give it one for each")
     if field.items is Items.AGENTS:
-        _require_count(field, num_agents)
         return came_from
-    _require_count(field, num_agents - 1)
     others = np.array(others_of(num_agents), dtype=np.int64).reshape(num_agents, -1)
     described = np.take_along_axis(came_from, np.broadcast_to(others, (len(came_from), *others.shape)), 2)
     # The observer is left out of its own list, so agents after it sit one slot earlier.
     return described - (described > np.diagonal(came_from, axis1=1, axis2=2)[:, :, None])
 
 
-def _require_count(field: Field, expected: int) -> None:
-    if field.count != expected:
-        what = "other agents" if field.items is Items.OTHERS else "agents"
-        raise UserError(f"field '{field.name}' has {field.count} items for {expected} {what}; give it one for each")
+def numbers_of(slots: Indices, width: int) -> Indices:
+    """Expand item indices [..., count] to number indices [..., count * width]."""
+    return (slots[..., None] * width + np.arange(width)).reshape(*slots.shape[:-1], -1)

@@ -1,9 +1,9 @@
 """Transforms of whole batches: L_g on observations and states, K_g on actions, and the way back for outputs.
 
-A `Transform` holds one element per seed as stacked maps, so that a batch of any size costs one matrix product or one
-gather for each space. Observations, states and actions are pushed forward (`obs`, `state`, `action`, `per_agent`); what
-a network returns on transformed inputs is pulled back (`pull_back`, `values`) and compared with what it returns on the
-originals: an equivariant policy has pull_back(policy(obs(x))) == policy(x).
+Observations, states and actions are pushed forward (`obs`, `state`, `action`, `per_agent`); what a network returns on
+transformed inputs is pulled back (`pull_back`, `values`) and compared with what it returns on the originals: an
+equivariant policy has pull_back(policy(obs(x))) == policy(x). A batch of any size costs one matrix product or one
+gather for each space.
 
 Multiplying by a signed permutation matrix (every element of D4 and every agent permutation on scalars and vectors)
 is exact in floating point, as long as the device does not round the factors (TF32 does).
@@ -11,25 +11,28 @@ is exact in floating point, as long as the device does not round the factors (TF
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.symmetry.elements import Element
-from esp_cli.symmetry.maps import Gather, Map, gather_of, map_of
-from esp_cli.symmetry.operators import Operator
+from esp_cli.symmetry.groups import Group
+from esp_cli.symmetry.maps import Gather, Map, Operator, gather_of, map_of
 from esp_cli.symmetry.representation import (
     action_map,
     agent_places,
-    field_names,
     output_operator,
+    require_items,
     rows_operator,
     state_operator,
 )
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
+
+_STACK_LIMIT = 512  # most elements that are built once; of more (d4*agents with N >= 5) those that are drawn
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Transform:
     Attributes:
         elements: the element of each seed.
         agents: how agents change places, on one number for each; None where all stay.
-        obs_map: L_g of an observation, or of all agents' observations end to end where agents move.
+        obs_map: L_g of an observation, or where agents move of all agents' observations end to end.
         state_map: L_g of the global state.
         output_map: K_g of one number per discrete action, or of a continuous action, likewise.
         action_index: K_g of a discrete action, [S, A] int64: what action j becomes; None of continuous ones.
@@ -83,13 +86,12 @@ class Transform:
     def select(self, indices: Sequence[int]) -> Transform:
         """Return the transform made of the elements at these positions, one per seed."""
         index = torch.tensor(indices, dtype=torch.int64)
-        chosen = tuple(self.elements[i] for i in indices)
 
         def pick(tensor: Tensor) -> Tensor:
             return tensor.index_select(0, index.to(tensor.device, non_blocking=True))
 
         return Transform(
-            elements=chosen,
+            elements=tuple(self.elements[i] for i in indices),
             agents=None if self.agents is None else self.agents.apply(pick),
             obs_map=self.obs_map.apply(pick),
             state_map=self.state_map.apply(pick),
@@ -99,11 +101,11 @@ class Transform:
 
     def obs(self, x: Tensor) -> Tensor:
         """Apply L_g to observations [S, ..., N, D]; row i moves to row sigma(i)."""
-        return self._move(x, self.obs_map.push, self.obs_map.width, agent_axis=-2)
+        return self._move(x, self.obs_map, agent_axis=-2)
 
     def state(self, x: Tensor) -> Tensor:
         """Apply L_g to global states [S, ..., Ds]."""
-        return self._move(x, self.state_map.push, self.state_map.width)
+        return self._move(x, self.state_map)
 
     def action(self, action: Tensor) -> Tensor:
         """Apply K_g to actions: [S, ..., N] int64 (discrete) or [S, ..., N, width]."""
@@ -116,54 +118,47 @@ class Transform:
         """Let a number per agent [S, ..., N] (reward, advantage) move with it; one per world [S, ..., 1] stays."""
         if self.agents is None or x.shape[-1] == 1:
             return x
-        return self._move(x, self.agents.push, self.agents.width, agent_axis=-1)
+        return self._move(x, self.agents, agent_axis=-1)
 
     def push_outputs(self, outputs: Tensor) -> Tensor:
         """Apply K_g to one number per discrete action, or to those of a continuous one; undoes `pull_back`."""
-        return self._move(outputs, self.output_map.push, self.output_map.width, agent_axis=-2)
+        return self._move(outputs, self.output_map, agent_axis=-2)
 
     def pull_back(self, outputs: Tensor) -> Tensor:
         """Apply K_g^-1 to a policy's outputs at L_g s, so that they compare with its outputs at s.
 
         Logits and action values: out[..., n, a] = outputs[..., sigma(n), K_g a]. Continuous actions: K_g^-1 of each.
-
-        Shape:
-            [S, ..., N, A] or [S, ..., N, width] to the same.
         """
-        return self._move(outputs, self.output_map.pull, self.output_map.width, agent_axis=-2)
+        return self._move(outputs, self.output_map, agent_axis=-2, back=True)
 
     def pull_back_variance(self, variance: Tensor) -> Tensor:
-        """Return the diagonal of K_g^-1 diag(variance) K_g: the variances of an action's numbers, pulled back.
-
-        Shape:
-            as of `pull_back`.
-        """
-        return self._move(variance, self.output_map.squared.pull, self.output_map.width, agent_axis=-2)
+        """Return the diagonal of K_g^-1 diag(variance) K_g: the variances of an action's numbers, pulled back."""
+        return self._move(variance, self.output_map.squared, agent_axis=-2, back=True)
 
     def values(self, values: Tensor) -> Tensor:
         """Return values per agent [S, ..., N] to their agents; one value per world [S, ..., 1] stays."""
         if self.agents is None or values.shape[-1] == 1:
             return values
-        return self._move(values, self.agents.pull, self.agents.width, agent_axis=-1)
+        return self._move(values, self.agents, agent_axis=-1, back=True)
 
-    def _move(self, x: Tensor, move: Callable[[Tensor], Tensor], width: int, agent_axis: int | None = None) -> Tensor:
-        """Apply a map of rows of `width` numbers; where agents move, a row holds all N agents' numbers.
+    def _move(self, x: Tensor, by: Map, agent_axis: int | None = None, back: bool = False) -> Tensor:
+        """Apply a map of rows, or its inverse; where agents move, a row holds all N agents' numbers.
 
         Raises:
             UserError: the rows have another width, the agent axis another size, or the first axis other seeds.
         """
+        expected = by.width
         if self.agents is not None and agent_axis is not None:
             num_agents = self.agents.width
             if x.dim() < -agent_axis or x.shape[agent_axis] != num_agents:
                 raise UserError(
                     f"agents change places: axis {agent_axis} of {list(x.shape)} must hold {num_agents} agents"
                 )
-            expected = width // num_agents if agent_axis == -2 else width
-        else:
-            expected = width
+            expected = by.width // num_agents if agent_axis == -2 else by.width
         if x.shape[-1] != expected:
             raise UserError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
-        return move(x.reshape(self._seeds_of(x), -1, width)).reshape(x.shape)
+        rows = x.reshape(self._seeds_of(x), -1, by.width)
+        return (by.pull(rows) if back else by.push(rows)).reshape(x.shape)
 
     def _seeds_of(self, x: Tensor) -> int:
         """Return the size of the first axis to compute with: one element for all seeds makes seeds part of a batch."""
@@ -182,9 +177,7 @@ def build_transform(
     """
     if not elements:
         raise UserError("a transform needs one element per seed, got none")
-    if missing := [name for e in elements for name, _ in e.items if name not in field_names(spaces)]:
-        names = ", ".join(field_names(spaces))
-        raise UserError(f"{spaces.label} has no field '{missing[0]}' whose items change places, but {names}")
+    require_items(elements, spaces)
     places = agent_places(elements, spaces.num_agents)
     image = action_map(spaces.action, elements) if isinstance(spaces.action, Discrete) else None
     state, outputs = state_operator(spaces, elements), output_operator(spaces, elements)
@@ -197,3 +190,113 @@ def build_transform(
         output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
         action_index=None if image is None else torch.as_tensor(image, device=device),
     )
+
+
+class TransformSet:
+    """The transforms that a learner may use, and the draw of one: listed elements, or a group that is sampled.
+
+    Attributes:
+        names: the elements' names; the group's name alone where it is sampled.
+        is_finite: whether the elements are listed; False for continuous groups and for more than `LISTED_LIMIT`.
+        size: how many elements are listed, the identity not counted; 0 where the group is sampled.
+    """
+
+    def __init__(
+        self,
+        elements: Sequence[Element] | Group,
+        spaces: Spaces,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.spaces, self.device, self.dtype = spaces, device, dtype
+        self._group = elements if isinstance(elements, Group) else None
+        self._elements = () if isinstance(elements, Group) else tuple(elements)
+        self.is_finite = self._group is None
+        self.size = len(self._elements)
+        self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
+        # Built once where it fits, with the identity at the end: a draw is then a selection.
+        fits = 0 < self.size <= _STACK_LIMIT
+        self._stack = self._build([*self._elements, Element()]) if fits else None
+        self._singles: dict[int, Transform] = {}
+
+    def draw(self, generators: Sequence[torch.Generator], keep: Sequence[float] = ()) -> Transform:
+        """Draw one element per seed, uniformly among those that are not the identity.
+
+        The identity is left out because a copy of the batch that equals the batch adds nothing: a consistency loss of
+        zero and a second gradient on the same rows. Each seed draws from its own generator, so seed k draws the
+        same alone and among ten.
+
+        Args:
+            generators: one per seed, on the CPU.
+            keep: by listed element (one number for a sampled group) how likely it is beside the others, 0 to 1. With
+                probability 1 - max(keep) the identity takes the place of the drawn one. Empty: all alike, and all stay.
+        """
+        if self._group is not None:
+            return self._build([self._sampled(keep, g) for g in generators])
+        return self._picked([self._pick(keep, g) for g in generators])
+
+    def _sampled(self, keep: Sequence[float], generator: torch.Generator) -> Element:
+        assert self._group is not None
+        while (element := self._group.draw(generator)).is_identity:
+            pass
+        return element if not keep or _stays(keep[0], generator) else Element()
+
+    def _pick(self, keep: Sequence[float], generator: torch.Generator) -> int:
+        """Draw an index by rejection; with equal weights the random stream equals the unweighted one."""
+        most = max(keep, default=1.0)
+        while most > 0:
+            index = int(torch.randint(self.size, (), generator=generator))
+            if not keep or _stays(keep[index] / most, generator):
+                return index if _stays(most, generator) else self.size
+        return self.size
+
+    def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:
+        """Return one of the listed elements, for each seed with probability `strength`, else the identity."""
+        return self._picked([index if _stays(strength, g) else self.size for g in generators])
+
+    def _picked(self, picks: Sequence[int]) -> Transform:
+        """Return the elements at these places, one per seed; the place behind the last is the identity."""
+        if self._stack is None:
+            elements = (*self._elements, Element())
+            return self._build([elements[i] for i in picks])
+        return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
+
+    def each(self) -> list[Transform]:
+        """Return every element in order, each the same for all seeds.
+
+        Raises:
+            UserError: the group is sampled.
+        """
+        if not self.is_finite:
+            raise UserError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
+        if self._stack is not None:
+            return [self._single(i) for i in range(self.size)]
+        return [self._build([e]) for e in self._elements]
+
+    def _single(self, index: int) -> Transform:
+        """Return one element of the stack, selected once."""
+        assert self._stack is not None
+        if index not in self._singles:
+            self._singles[index] = self._stack.select([index])
+        return self._singles[index]
+
+    def _build(self, elements: Sequence[Element]) -> Transform:
+        return build_transform(elements, self.spaces, self.device, self.dtype)
+
+
+def transform_set(
+    text: str, spaces: Spaces, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+) -> TransformSet:
+    """Read transforms from text (see `parse_elements`) and build them for a task.
+
+    transform_set("d4", spec).draw([torch.Generator()]).obs(obs)
+
+    Raises:
+        UserError: the text means nothing, or the task cannot carry what it means.
+    """
+    return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
+
+
+def _stays(strength: float, generator: torch.Generator) -> bool:
+    """Draw whether an element stays; nothing is drawn where it is certain."""
+    return strength >= 1 or float(torch.rand((), generator=generator)) < strength

@@ -64,7 +64,7 @@ def test_actions_that_cannot_follow_are_refused_in_one_sentence(make_spec) -> No
         ),
         ("landmarks-3", {"symmetry": "d4*landmarks-3"}, "field 'landmarks' has 2 items, not 3"),
         ("others-1-0", {}, "items of field 'others' cannot be exchanged: they are the agents'"),
-        ("islands-1-0", {}, "it has no field 'islands', but velocity"),
+        ("islands-1-0", {}, "toy has no field 'islands', but velocity"),
     ],
 )
 def test_refusals(make_spec, text, changes, message) -> None:
@@ -103,7 +103,7 @@ def test_declared_orders_of_items_are_carried(make_spec) -> None:
 
 def test_what_is_discovered_may_order_items_that_are_not_declared(make_spec) -> None:
     assert transform_set("discovered:d4*landmarks-2", make_spec(symmetry="c1")).size == 15
-    with pytest.raises(ValueError, match="it has no field 'islands', but velocity, battery, "):
+    with pytest.raises(ValueError, match="toy has no field 'islands', but velocity, battery, "):
         transform_set("discovered:islands-1-0", make_spec(symmetry="c1"))
 
 
@@ -190,5 +190,5 @@ def test_a_symmetry_that_means_nothing_or_cannot_act_is_refused(make_spec) -> No
         admit_declared(make_spec(symmetry="foo"))
     with pytest.raises(ValueError, match="c8 cannot act on toy: action 'left' turned by 45 degrees"):
         admit_declared(make_spec(symmetry="c8"))
-    with pytest.raises(ValueError, match="goals-3 cannot act on toy: it has no field 'goals'"):
+    with pytest.raises(ValueError, match="goals-3 cannot act on toy: toy has no field 'goals'"):
         admit_declared(replace(make_spec(symmetry="c4"), nearly="d4*goals-3"))

@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from esp_cli.symmetry import Element, PlaneElement, agent_permutations, dihedral, direct_product, mirror, rotation
-from esp_cli.symmetry.operators import field_operator, item_operator, layout_operator
-from esp_cli.symmetry.representation import action_map, joint_sources, rows_operator, state_operator
+from esp_cli.symmetry.representation import (
+    action_map,
+    field_operator,
+    item_operator,
+    joint_sources,
+    layout_operator,
+    rows_operator,
+    state_operator,
+)
 from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
