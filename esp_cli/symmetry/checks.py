@@ -22,10 +22,10 @@ def network_equivariance_error(
     """Measure how far a policy is from pi(K_g a | L_g s) = pi(a | s) and a value from V(L_g s) = V(s).
 
     Args:
-        policy: obs to logits [S, ..., N, A] (compared as probabilities) or to means [S, ..., N, width]; or None.
-        value: state to values [S, ..., 1] or [S, ..., N]; or None.
-        obs: [S, ..., N, D].
-        state: [S, ..., Ds].
+        policy: obs [S, ..., N, D] to logits [S, ..., N, A] (compared as probabilities) or to means; or None.
+        value: state [S, ..., Ds] to values [S, ..., 1] or [S, ..., N]; or None.
+        obs: some observations.
+        state: some states.
         transform: the elements to try.
 
     Returns:
@@ -55,12 +55,11 @@ def environment_errors(
 
     Eq. 5: r(L_g s, K_g a) = r(s, a). Eq. 6: P(L_g s' | L_g s, K_g a) = P(s' | s, a).
 
-    The worlds are put into `state` and take the actions, then into L_g state and take K_g of the actions; every
-    observation, state and reward of the second run is compared with the transformed one of the first. A world counts
-    until its episode ends. Noise enters equally: both runs start from the same generator states.
+    The worlds take the actions from `state`, then K_g of them from L_g state, with the same noise; what the second run
+    gives is compared with the transform of what the first gave. A world counts until its episode ends.
 
     Args:
-        env: worlds to use; they are left in the second run's last state.
+        env: worlds to use.
         transform: the elements to try, for as many seeds as `env` has, or one for all.
         state: [S, E, state width].
         actions: joint actions, one tensor per step.

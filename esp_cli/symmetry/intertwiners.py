@@ -81,18 +81,10 @@ def with_pixels(block: Block, side: int, group: FiniteGroup) -> Block:
 
 
 def intertwiners(inputs: Block, outputs: Block) -> Floats:
-    """Return an orthonormal basis of all W with rho_in(g) x followed by W equal to x followed by W, then rho_out(g).
+    """Return an orthonormal basis [K, d_in, d_out] of all W with W = rho_in(g) W rho_out(g)', for rows x W.
 
-    Rows are vectors here, x W, so that the constraint reads W = rho_in(g) W rho_out(g)'. The average of any matrix over
-    the group satisfies it, and every solution is such an average. The number of independent solutions is the mean over
-    the group of the product of both characters.
-
-    Args:
-        inputs: one copy of it counts.
-        outputs: likewise.
-
-    Returns:
-        [K, d_in, d_out].
+    The average of any matrix over the group satisfies it, and every solution is such an average. The number of
+    independent solutions is the mean over the group of the product of both characters. One copy of a block counts.
     """
     rows, columns = inputs.matrices, outputs.matrices
     traces = np.trace(rows, axis1=1, axis2=2) * np.trace(columns, axis1=1, axis2=2)

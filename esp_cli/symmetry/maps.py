@@ -1,8 +1,7 @@
-"""Orthogonal linear maps of rows of numbers: one for each element in float64 numpy, or one for each seed as tensors.
+"""Orthogonal linear maps of rows of numbers, one per seed: a matrix, or a signed permutation that costs one gather.
 
-The tensors are a matrix, or a signed permutation that costs one gather; `pull` undoes `push`. A stack of one map acts
-on any rows; results are new tensors of the rows' own type, inside autocast too, and gradients flow through. An inf or
-NaN reaches only the numbers that it is mixed into.
+`pull` undoes `push`. A stack of one map acts on any rows; results are new tensors of the rows' own type, inside
+autocast too, and gradients flow through. An inf or NaN reaches only the numbers that it is mixed into.
 
 Shape:
     rows [S, B, width] to the same.
@@ -10,99 +9,18 @@ Shape:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry.elements import Floats, Indices
+from esp_cli.symmetry.representation import Operator
 from esp_envs.errors import UserError
 
 _GATHERED_WIDTH = 128  # numbers in a row from which a gather is faster than a matrix on a CPU; elsewhere it always is
 _LARGEST_MATRIX = 4096  # numbers in a row beyond which no matrix is built
-
-
-@dataclass(frozen=True)
-class Operator:
-    """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]].
-
-    It is sparse, so that a permutation of the pixels of a picture is no matrix of their square.
-
-    Attributes:
-        source: [G, D, m] int64; a new number is made of m old ones.
-        weight: [G, D, m].
-    """
-
-    source: Indices
-    weight: Floats
-
-    @classmethod
-    def of_block(cls, block: Floats | Indices) -> Operator:
-        """Return the operator of one block, as `Geometry.block` gives it."""
-        if block.ndim == 1:
-            return cls.reordering(np.asarray(block, dtype=np.int64)[None])
-        most = max(1, np.count_nonzero(block, axis=1).max(initial=0))
-        source = np.argsort(block == 0, axis=1, kind="stable")[None, :, :most]
-        return cls(source, np.take_along_axis(np.asarray(block, dtype=np.float64)[None], source, 2))
-
-    @classmethod
-    def reordering(cls, order: Indices) -> Operator:
-        """Return the operator that puts old number order[g, k] at place k: [G, D]."""
-        return cls(order[:, :, None], np.ones((*order.shape, 1)))
-
-    @classmethod
-    def beside(cls, parts: Sequence[Operator], num_elements: int) -> Operator:
-        """Return the operator of rows laid end to end, each with its own."""
-        starts = np.cumsum([0, *(part.width for part in parts)])
-        shape = (num_elements, starts[-1], max((part.terms for part in parts), default=1))
-        source, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape)
-        for part, start in zip(parts, starts, strict=False):
-            where = np.s_[:, start : start + part.width, : part.terms]
-            source[where], weight[where] = part.source + start, part.weight
-        return cls(source, weight)
-
-    @property
-    def terms(self) -> int:
-        """m; 1 where numbers only change places and signs."""
-        return self.source.shape[2]
-
-    @property
-    def width(self) -> int:
-        """D."""
-        return self.source.shape[1]
-
-    @property
-    def matrix(self) -> Floats:
-        """The same as matrices [G, D, D]."""
-        out = np.zeros((len(self.source), self.width, self.width))
-        elements, rows = np.arange(len(self.source))[:, None, None], np.arange(self.width)[:, None]
-        np.add.at(out, (elements, rows, self.source), self.weight)
-        return out
-
-    def push(self, rows: Floats) -> Floats:
-        """Apply it to rows [D]: [G, D]."""
-        return (self.weight * rows[self.source]).sum(-1)
-
-    def after(self, first: Operator) -> Operator:
-        """Return the product that applies `first`, then this."""
-        elements, shape = np.arange(len(self.source))[:, None, None], (len(self.source), self.width, -1)
-        source, weight = first.source[elements, self.source], first.weight[elements, self.source]
-        return Operator(source.reshape(shape), (self.weight[..., None] * weight).reshape(shape))
-
-    def ordered(self, order: Indices) -> Operator:
-        """Return this operator followed by another order of its results: place k takes result order[g, k]."""
-        index = order[:, :, None]
-        return Operator(np.take_along_axis(self.source, index, 1), np.take_along_axis(self.weight, index, 1))
-
-    def repeated(self, count: int) -> Operator:
-        """Return the operator of `count` rows laid end to end, all with this one."""
-        return Operator.beside([self] * count, len(self.source))
-
-    def selected(self, index: Sequence[int]) -> Operator:
-        """Return the operators at some places of the stack."""
-        return Operator(self.source[index], self.weight[index])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Read transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`, `flip-x*hips-3-2-1-0`."""
+"""Reading of transforms and groups from text: `rot90,flip-x`, `d4`, `so2`, `d4*agents`, `flip-x*hips-3-2-1-0`."""
 
 from __future__ import annotations
 

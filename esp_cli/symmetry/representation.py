@@ -7,30 +7,103 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from esp_cli.symmetry.elements import Element, Geometry, Indices, Order
-from esp_cli.symmetry.maps import Operator
+from esp_cli.symmetry.elements import Element, Floats, Geometry, Indices, Order
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Field, Items, Layout, Spaces, others_of
 
 _MATCH_TOLERANCE = 1e-6
 
 
+@dataclass(frozen=True)
+class Operator:
+    """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]].
+
+    It is sparse, so that a permutation of the pixels of a picture is no matrix of their square.
+
+    Attributes:
+        source: [G, D, m] int64; a new number is made of m old ones.
+        weight: [G, D, m].
+    """
+
+    source: Indices
+    weight: Floats
+
+    @classmethod
+    def of_block(cls, block: Floats | Indices) -> Operator:
+        """Return the operator of one block, as `Geometry.block` gives it."""
+        if block.ndim == 1:
+            return cls.reordering(np.asarray(block, dtype=np.int64)[None])
+        most = max(1, np.count_nonzero(block, axis=1).max(initial=0))
+        source = np.argsort(block == 0, axis=1, kind="stable")[None, :, :most]
+        return cls(source, np.take_along_axis(np.asarray(block, dtype=np.float64)[None], source, 2))
+
+    @classmethod
+    def reordering(cls, order: Indices) -> Operator:
+        """Return the operator that puts old number order[g, k] at place k: [G, D]."""
+        return cls(order[:, :, None], np.ones((*order.shape, 1)))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Operator], num_elements: int) -> Operator:
+        """Return the operator of rows laid end to end, each with its own."""
+        starts = np.cumsum([0, *(part.width for part in parts)])
+        shape = (num_elements, starts[-1], max((part.terms for part in parts), default=1))
+        source, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+        for part, start in zip(parts, starts, strict=False):
+            where = np.s_[:, start : start + part.width, : part.terms]
+            source[where], weight[where] = part.source + start, part.weight
+        return cls(source, weight)
+
+    @property
+    def terms(self) -> int:
+        """m; 1 where numbers only change places and signs."""
+        return self.source.shape[2]
+
+    @property
+    def width(self) -> int:
+        """D."""
+        return self.source.shape[1]
+
+    @property
+    def matrix(self) -> Floats:
+        """The same as matrices [G, D, D]."""
+        out = np.zeros((len(self.source), self.width, self.width))
+        elements, rows = np.arange(len(self.source))[:, None, None], np.arange(self.width)[:, None]
+        np.add.at(out, (elements, rows, self.source), self.weight)
+        return out
+
+    def push(self, rows: Floats) -> Floats:
+        """Apply it to rows [D]: [G, D]."""
+        return (self.weight * rows[self.source]).sum(-1)
+
+    def after(self, first: Operator) -> Operator:
+        """Return the product that applies `first`, then this."""
+        elements, shape = np.arange(len(self.source))[:, None, None], (len(self.source), self.width, -1)
+        source, weight = first.source[elements, self.source], first.weight[elements, self.source]
+        return Operator(source.reshape(shape), (self.weight[..., None] * weight).reshape(shape))
+
+    def ordered(self, order: Indices) -> Operator:
+        """Return this operator followed by another order of its results: place k takes result order[g, k]."""
+        index = order[:, :, None]
+        return Operator(np.take_along_axis(self.source, index, 1), np.take_along_axis(self.weight, index, 1))
+
+    def repeated(self, count: int) -> Operator:
+        """Return the operator of `count` rows laid end to end, all with this one."""
+        return Operator.beside([self] * count, len(self.source))
+
+    def selected(self, index: Sequence[int]) -> Operator:
+        """Return the operators at some places of the stack."""
+        return Operator(self.source[index], self.weight[index])
+
+
 def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) -> Operator:
-    """Return L_g of an agent's row, or where agents move of all rows end to end: row i moves to row sigma(i).
+    """Return L_g of an agent's row of D numbers, or where agents move of all N rows end to end.
 
-    Inside a row, items that count over OTHERS or over AGENTS are reordered so that each keeps describing the agent
-    that it described before.
-
-    Args:
-        layout: one agent's row, D numbers.
-        elements: G of them.
-        num_agents: N.
-
-    Returns:
-        An operator on D or on N D numbers.
+    Row i moves to row sigma(i). Inside a row, items that count over OTHERS or over AGENTS are reordered so that each
+    keeps describing the agent that it described before.
     """
     row, places = layout_operator(layout, elements), agent_places(elements, num_agents)
     return row if places is None else row.repeated(num_agents).ordered(joint_sources(layout, places))
@@ -39,8 +112,7 @@ def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) 
 def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     """Return L_g of the global state of Ds numbers.
 
-    A state that is `joint_layout` of the observation moves like the joint observation; any other moves its AGENTS
-    items.
+    A joint state (`Spaces.is_joint`) moves like the joint observation; any other moves its AGENTS items.
 
     Raises:
         UserError: agents move, and a field's items cannot follow them.
@@ -92,11 +164,7 @@ def layout_operator(layout: Layout, elements: Sequence[Element]) -> Operator:
 
 
 def field_operator(field: Field, elements: Sequence[Element]) -> Operator:
-    """Return how a field transforms: each of its items, and their order.
-
-    Raises:
-        UserError: an element cannot transform it.
-    """
+    """Return how a field transforms: each of its items, and their order; refuse one that cannot."""
     items, places = item_operator(field, elements).repeated(field.count), item_places(field, elements)
     return items if places is None else items.ordered(numbers_of(np.argsort(places, axis=1), field.item_width))
 
@@ -171,11 +239,7 @@ def _order_array(orders: Sequence[Order | None], count: int) -> Indices | None:
 
 
 def require_items(elements: Sequence[Element], spaces: Spaces) -> None:
-    """Refuse orders of the items of fields that neither an observation nor an action has.
-
-    Raises:
-        UserError: there are some.
-    """
+    """Refuse orders of the items of fields that neither an observation nor an action has."""
     acted = () if isinstance(spaces.action, Discrete) else spaces.action.layout.fields
     known = list(dict.fromkeys(field.name for field in (*spaces.observation.fields, *acted)))
     for name in dict.fromkeys(name for element in elements for name, _ in element.items):
@@ -215,9 +279,7 @@ def _sources(layout: Layout, came_from: Indices) -> Indices:
 def _old_slots(field: Field, came_from: Indices) -> Indices:
     """Return [G, R, count]: for each new row and item, the item of the old row that holds the same thing.
 
-    Args:
-        field: of a row.
-        came_from: [G, R, N] who stood where each agent now stands, for each row; of OTHERS, row i is agent i's.
+    `came_from` [G, R, N] says who stood where each agent now stands, for each row; of OTHERS, row i is agent i's.
     """
     num_agents = came_from.shape[2]
     if field.items is Items.FIXED:

@@ -84,7 +84,7 @@ class Transform:
         return self.output_map.width // (1 if self.agents is None else self.agents.width)
 
     def select(self, indices: Sequence[int]) -> Transform:
-        """Return the transform made of the elements at these positions, one per seed."""
+        """Return the transform of the elements at these positions, one per seed."""
         index = torch.tensor(indices, dtype=torch.int64)
 
         def pick(tensor: Tensor) -> Tensor:
@@ -197,7 +197,7 @@ class TransformSet:
 
     Attributes:
         names: the elements' names; the group's name alone where it is sampled.
-        is_finite: whether the elements are listed; False for continuous groups and for more than `LISTED_LIMIT`.
+        is_finite: whether the elements are listed, see `parse_elements`.
         size: how many elements are listed, the identity not counted; 0 where the group is sampled.
     """
 
@@ -214,17 +214,15 @@ class TransformSet:
         self.is_finite = self._group is None
         self.size = len(self._elements)
         self.names = (self._group.name,) if self._group else tuple(e.name for e in self._elements)
-        # Built once where it fits, with the identity at the end: a draw is then a selection.
-        fits = 0 < self.size <= _STACK_LIMIT
+        fits = 0 < self.size <= _STACK_LIMIT  # then a draw is a selection; the identity is the last
         self._stack = self._build([*self._elements, Element()]) if fits else None
         self._singles: dict[int, Transform] = {}
 
     def draw(self, generators: Sequence[torch.Generator], keep: Sequence[float] = ()) -> Transform:
         """Draw one element per seed, uniformly among those that are not the identity.
 
-        The identity is left out because a copy of the batch that equals the batch adds nothing: a consistency loss of
-        zero and a second gradient on the same rows. Each seed draws from its own generator, so seed k draws the
-        same alone and among ten.
+        The identity is left out because a copy of the batch that equals the batch adds nothing. Each seed draws from
+        its own generator, so seed k draws the same alone and among ten.
 
         Args:
             generators: one per seed, on the CPU.
