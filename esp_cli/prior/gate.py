@@ -22,6 +22,7 @@ from torch import Tensor
 
 from esp_cli.prior.regression import inputs_of, moments, ridge
 from esp_cli.symmetry import Transform
+from esp_cli.symmetry.maps import Map
 from esp_envs.spec import Spaces
 
 if TYPE_CHECKING:  # a loop of one's own brings no environment of ours
@@ -62,8 +63,8 @@ class GatedTransform(Transform):
         """Apply K_g to actions."""
         return self._mixed(super().action(action), action)
 
-    def _move(self, x: Tensor, move, width: int, agent_axis: int | None = None) -> Tensor:  # type: ignore[no-untyped-def]
-        return self._mixed(super()._move(x, move, width, agent_axis), x)
+    def _move(self, x: Tensor, by: Map, agent_axis: int | None = None, back: bool = False) -> Tensor:
+        return self._mixed(super()._move(x, by, agent_axis, back), x)
 
     def _mixed(self, moved: Tensor, x: Tensor) -> Tensor:
         rows = self.open
