@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from typer.core import TyperGroup
@@ -109,18 +109,15 @@ def report(failure: Exception) -> int | None:
     if isinstance(failure, typer.Abort):
         console.note("aborted")
         return EXIT_MACHINE
-    if isinstance(failure, UserError) or _is_validation(failure):
-        console.error(_sentence(failure))
+    # of pydantic, told apart without importing it
+    refused = type(failure).__module__.startswith("pydantic") and hasattr(failure, "errors")
+    if isinstance(failure, UserError) or refused:
+        console.error(_sentence(cast("UserError | ValidationError", failure)))
         return EXIT_USER
     if isinstance(failure, OSError) and failure.errno is not None:
         console.error(failures.sentence(failure))
         return EXIT_USER if failures.is_correctable(failure) else EXIT_MACHINE
-    return _report_own_code(failure)
-
-
-def _report_own_code(failure: Exception) -> int | None:
-    """Print where code that the user brought along raised, and return the exit code; None where other code did."""
-    installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of others ran
+    installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of the user ran
     place = None if installed is None else installed.raised_in(failure)
     if installed is None or place is None:
         return None
@@ -136,27 +133,16 @@ def _report_usage(failure: typer.TyperException) -> int:
     return failure.exit_code
 
 
-def _is_validation(failure: Exception) -> TypeGuard[ValidationError]:
-    """Return whether pydantic refused settings; told apart without importing pydantic."""
-    return type(failure).__module__.startswith("pydantic") and hasattr(failure, "errors")
-
-
 def _sentence(failure: UserError | ValidationError) -> str:
     """Return the message in one line; what pydantic found wrong is listed by setting."""
     if isinstance(failure, UserError):
         return str(failure) or type(failure).__name__
-    return _validation_sentence(failure)
-
-
-def _validation_sentence(failure: ValidationError) -> str:
     found = []
     for item in failure.errors(include_url=False):
         where = ".".join(str(part) for part in item["loc"])
-        if item["type"] == "extra_forbidden":
-            found.append(f"there is no setting '{where}'")
-            continue
         message = failures.own_words(item["msg"])
-        found.append(f"setting '{where}': {message} (got {item['input']!r})" if where else message)
+        told = f"setting '{where}': {message} (got {item['input']!r})" if where else message
+        found.append(f"there is no setting '{where}'" if item["type"] == "extra_forbidden" else told)
     return f"{failure.title}: {'; '.join(found)}"
 
 

@@ -10,17 +10,10 @@ PriorKind = Literal["esp", "none", "augment", "consistency"]
 """What a prior consists of, in the order in which a task's bundled policies are preferred."""
 Mode = Literal["greedy", "stochastic"]
 """How a policy acts: by its most probable action, or by actions that it draws."""
-STEPS = 1_000_000
-"""Environment steps per seed of a run."""
-EPISODES = 320
-"""Episodes of an evaluation, per seed."""
-STUDY_SEEDS = tuple(range(10))
-"""Seeds of a study: as many as the paper has."""
-SLOWEST = 0.01
-"""Speed of a film, times real time, at least."""
-MAX_STEPS = 10**12
-"""Steps that one run may take; the fastest machine needs years for them."""
-MAX_SEED = 999_999_999
-"""Largest number of a seed on a command line."""
-MAX_SEEDS = 1000
-"""Most seeds of one run; more is a typing error."""
+STEPS = 1_000_000  # environment steps per seed of a run
+EPISODES = 320  # of an evaluation, per seed
+STUDY_SEEDS = tuple(range(10))  # as many as the paper has
+SLOWEST = 0.01  # speed of a film, times real time, at least
+MAX_STEPS = 10**12  # of one run; the fastest machine needs years for them
+MAX_SEED = 999_999_999  # on a command line
+MAX_SEEDS = 1000  # of one run; more is a typing error

@@ -185,8 +185,7 @@ def plan(
 ) -> tuple[RunConfig, dict[str, Tensor] | None]:
     """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
 
-    Nothing is written: what does not go together is refused before a run folder exists. Nothing is imported: what
-    the caller brings along is registered already.
+    What does not go together is refused here, before a run folder exists. What the caller brings along is registered.
     """
     if isinstance(seeds, int):
         raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
@@ -201,12 +200,10 @@ def plan(
 
 def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os.PathLike[str] | None) -> Run:
     """Make the folder of a new run, by default a new one in runs/."""
-    name = (
-        f"{file_name(config.task)}-{file_name(config.algorithm)}-{config.prior.kind}-{time.strftime('%Y%m%d-%H%M%S')}"
-    )
-    numbered = (Path("runs") / f"{name}-{k}" for k in itertools.count(2))
-    free = (path for path in itertools.chain([Path("runs") / name], numbered) if not path.exists())
-    path = next(free) if out is None else Path(out)
+    names = file_name(config.task), file_name(config.algorithm), config.prior.kind, time.strftime("%Y%m%d-%H%M%S")
+    first = Path("runs") / "-".join(names)
+    numbered = (first.with_name(f"{first.name}-{k}") for k in itertools.count(2))
+    path = next(path for path in itertools.chain([first], numbered) if not path.exists()) if out is None else Path(out)
     try:
         return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
     except RunFolderError:

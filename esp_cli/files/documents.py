@@ -46,19 +46,12 @@ class DocumentError(UserError):
 
 @dataclass(frozen=True)
 class DocumentFormat:
-    """A kind of JSON document: an object with the keys ``format`` and ``version`` beside its content.
+    """A kind of JSON document: an object with the keys ``format`` and ``version`` beside its content."""
 
-    Attributes:
-        name: value of ``format``.
-        version: newest value of ``version`` that this program reads.
-        noun: what it is for people, such as "the configuration of a run".
-        error: kind of exception for what the user can correct.
-    """
-
-    name: str
-    version: int
-    noun: str
-    error: type[UserError] = DocumentError
+    name: str  # value of ``format``
+    version: int  # newest value of ``version`` that this program reads
+    noun: str  # what it is for people, such as "the configuration of a run"
+    error: type[UserError] = DocumentError  # kind of exception for what the user can correct
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
         """Return the content of a document, without ``format`` and ``version``.
@@ -124,11 +117,7 @@ def validate(model: type[Model], content: object) -> Model:
 
 
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
-    """Build a model from settings that a user chose.
-
-    Raises:
-        UserError: an unknown name, or a value of another kind, out of range or not finite, in one sentence.
-    """
+    """Build a model from settings that a user chose; what is unknown, of another kind or not finite is a UserError."""
     try:
         built = model(**values)
     except ValidationError as error:
@@ -162,11 +151,7 @@ def encode(value: object, path: str | os.PathLike[str], error: type[UserError] =
 
 
 def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
-    """Parse strict JSON that is an object; the caller bounds its length.
-
-    Raises:
-        DocumentError: the text, called by a noun, is none; the message goes on where the name of its file ends.
-    """
+    """Parse strict JSON that is an object; the caller bounds its length, and puts the name of the file before errors."""
     try:
         value = parse_value(text.decode("utf-8") if isinstance(text, bytes) else text)
     except ValueError as error:
@@ -179,8 +164,7 @@ def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
 def parse_value(text: str) -> Any:
     """Parse strict JSON: no NaN, no infinity, no key twice, integers of 64 bits, nesting of at most `MAX_NESTING`.
 
-    Raises:
-        ValueError: it is not.
+    Anything else is a ValueError.
     """
     try:
         value = json.loads(
@@ -230,11 +214,7 @@ def _bounded(number: str) -> int:
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
     """Say what is wrong with the first bad setting of a model, and what could stand there.
 
-    Args:
-        error: of the validation.
-        model: that was asked for.
-        section: name that stands before that of the setting.
-        owner: of the settings; by default the section.
+    `section` stands before the name of a setting; `owner` is what has the settings, by default the section.
     """
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
@@ -259,11 +239,7 @@ def shortened(text: str) -> str:
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file that a person wrote: one JSON object, or TOML where its name ends in .toml.
-
-    Raises:
-        DocumentError: it is missing, too large, or neither.
-    """
+    """Read a file that a person wrote: one JSON object, or TOML where its name ends in .toml; else a DocumentError."""
     with attempting("read", path, DocumentError):
         text = read_regular(path, MAX_TABLE_BYTES)
     if text is None:

@@ -1,7 +1,8 @@
 """Opening of files in folders where something else may be by now: a link, a pipe, or the folder of another run.
 
 A process that holds a folder reaches what is in it through a descriptor of that folder. So it never writes to, or
-removes from, another folder that was moved to the same path meanwhile.
+removes from, another folder that was moved to the same path meanwhile: where a held folder was moved, replaced or
+deleted, every function raises a FolderLostError. An OSError says what else is wrong.
 """
 
 from __future__ import annotations
@@ -32,21 +33,13 @@ class LockError(UserError):
 
 @dataclass(frozen=True)
 class HeldFolder:
-    """A folder that a process holds by the lock on a file in it.
+    """A folder that a process holds by the lock on a file in it."""
 
-    Attributes:
-        path: absolute path at which it was taken.
-        lock: name of the locked file.
-        folder_fd: descriptor of the folder.
-        lock_fd: descriptor of the locked file.
-        process: that holds it; a fork of that process does not.
-    """
-
-    path: str
-    lock: str
-    folder_fd: int
-    lock_fd: int
-    process: int
+    path: str  # absolute, at which it was taken
+    lock: str  # name of the locked file
+    folder_fd: int  # descriptor of the folder
+    lock_fd: int  # descriptor of the locked file
+    process: int  # that holds it; a fork of that process does not
 
     def covers(self, path: str) -> bool:
         """Return whether this process holds it, and an absolute path is it or in it."""
@@ -82,7 +75,6 @@ def acquire(file: Path) -> int:
 
     Raises:
         LockError: another process, or this one, holds it already, or something else than a regular file is there.
-        FolderLostError: the folder was moved, replaced or deleted meanwhile.
         OSError: the file system cannot lock.
     """
     with attempting("lock", file, LockError):
@@ -134,11 +126,7 @@ def is_held(file: Path) -> bool:
 
 @contextmanager
 def taking_turns(folder: Path) -> Iterator[None]:
-    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none.
-
-    Raises:
-        LockError: the folder was moved, replaced or deleted while this process waited.
-    """
+    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):
@@ -165,11 +153,7 @@ def _absolute(path: str | os.PathLike[str]) -> str:
 
 
 def require_held(path: str | os.PathLike[str]) -> HeldFolder | None:
-    """Check the held folders that a path is in, before something is written there, and return the innermost.
-
-    Raises:
-        FolderLostError: one of them was moved, replaced or deleted.
-    """
+    """Check the held folders that a path is in, before something is written there, and return the innermost."""
     if not _held:
         return None
     absolute = _absolute(path)
@@ -180,12 +164,7 @@ def require_held(path: str | os.PathLike[str]) -> HeldFolder | None:
 
 
 def open_folder(path: str | os.PathLike[str]) -> int:
-    """Return a descriptor of a folder in which a file is written or removed; inside a held folder it leads there.
-
-    Raises:
-        FolderLostError: a held folder was moved, replaced or deleted.
-        OSError: the folder is missing or no folder.
-    """
+    """Return a descriptor of a folder in which a file is written or removed; inside a held folder it leads there."""
     held, flags = require_held(path), os.O_DIRECTORY | os.O_CLOEXEC | getattr(os, "O_PATH", os.O_RDONLY)
     if held is None:
         return os.open(path, flags)
@@ -193,12 +172,7 @@ def open_folder(path: str | os.PathLike[str]) -> int:
 
 
 def own_folder(path: Path) -> Path:
-    """Return the path of a folder that the program keeps, which need not exist yet; a link there is refused.
-
-    Raises:
-        FolderLostError: it is in a held folder that was moved, replaced or deleted.
-        OSError: a link is there.
-    """
+    """Return the path of a folder that the program keeps, which need not exist yet; a link there is refused."""
     require_held(path)
     if path.is_symlink():
         raise _irregular(path)
@@ -206,13 +180,9 @@ def own_folder(path: Path) -> Path:
 
 
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
-    """Return a descriptor of a file that the program keeps in a folder of its own; it is made if missing.
+    """Return a descriptor of a regular file that the program keeps in a folder of its own; it is made if missing.
 
-    A link is not followed, and a pipe does not block.
-
-    Raises:
-        FolderLostError: it is in a held folder that was moved, replaced or deleted.
-        OSError: a link or something else than a regular file is there, or it cannot be opened.
+    A link is refused, and a pipe does not block.
     """
     require_held(path)
     try:
@@ -232,11 +202,7 @@ def read_regular(path: str | os.PathLike[str], max_bytes: int) -> bytes | None:
 
 
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
-    """Open a regular file, which a link may name, for reading; a pipe does not block.
-
-    Raises:
-        OSError: it is missing, unreadable or no regular file.
-    """
+    """Open a regular file, which a link may name, for reading; a pipe is refused and does not block."""
     return os.fdopen(_regular(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), path), "rb")
 
 

@@ -1,7 +1,8 @@
 """Writing of whole files: a reader sees the old content or the new one, after a kill or a power cut too.
 
 A path that the user names may be a link, which is followed, or a device, which is written through. A name that the
-program chose inside a folder is its own: whatever link stands there is replaced and never followed.
+program chose inside a folder is its own: whatever link stands there is replaced and never followed. Errors are those of
+`esp_cli.files.opening`, and name the file.
 """
 
 from __future__ import annotations
@@ -23,12 +24,9 @@ TEMPORARY_PREFIX = ".esp-tmp-"  # of half-written files; what a killed process l
 
 
 def write_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file that the user named; missing folders are made.
+    """Write a file that the user named; missing folders are made, and a file that cannot be written is as it was.
 
     A link is followed and its target replaced as a whole. A device, a pipe or a socket is written through.
-
-    Raises:
-        OSError: it cannot be written; a regular file is as it was before.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -52,11 +50,8 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
 def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) -> None:
     """Remove what a kill left behind the last line break, so that the next line does not run into it.
 
-    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one.
-
-    Raises:
-        UserError: its last line is longer than any line can be.
-        OSError: a link or no regular file is there, or it cannot be written.
+    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one. A last line that is longer
+    than any line can be is a UserError.
     """
     if not path.exists():
         return
@@ -84,10 +79,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
 
     Yields:
         A function that takes the next part. After an exception the file is as it was before.
-
-    Raises:
-        FolderLostError: it is in a held folder that was moved, replaced or deleted.
-        OSError: the folder is missing or read-only, or the disk is full.
     """
     path = Path(path)
     temporary = f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
@@ -118,7 +109,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file if it is there; raises a FolderLostError as `replacing`, or an OSError where it cannot."""
+    """Remove a file if it is there."""
     with _named(path), contextlib.suppress(FileNotFoundError), _folder_of(path) as folder:
         os.unlink(path.name, dir_fd=folder)
 

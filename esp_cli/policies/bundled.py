@@ -78,14 +78,7 @@ def bundled_folder() -> Path:
 
 
 def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
-    """Return what the manifest lists; nothing where there is no manifest.
-
-    Args:
-        folder: of the manifest; by default that of this installation.
-
-    Raises:
-        UserError: the manifest is damaged or of a newer version.
-    """
+    """Return what the manifest in a folder, by default that of this installation, lists; nothing where there is none."""
     file = (folder or bundled_folder()) / MANIFEST
     if not file.is_file():
         return ()
@@ -102,23 +95,16 @@ def write_bundled(folder: Path, entries: tuple[Entry, ...]) -> None:
 
 
 def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
-    """Find a bundled policy.
+    """Find a bundled policy by its name, or by its task, algorithm and kind of prior ("none": the plain learner).
 
-    Args:
-        name: its own, or that of a task; of a task's policies MAPPO's and those with the prior come first.
-        algo: only those that this algorithm trained.
-        prior: only those that this kind of prior helped to train ("none": the plain learner).
-
-    Raises:
-        UserError: there is none.
+    Of a task's policies MAPPO's and those with the prior come first. Where none fits, a UserError says what there is.
     """
     entries = read_bundled()
     named = [e for e in entries if e.name == name] or [e for e in entries if e.task == name]
     fitting = [e for e in named if algo in (None, e.algorithm) and prior in (None, e.prior)]
     if fitting:
         return min(fitting, key=lambda entry: entry.rank)
-    options = {"--algo": algo, "--prior": prior}
-    wanted = " ".join([name, *(f"{option} {value}" for option, value in options.items() if value)])
+    wanted = " ".join([name, *([f"--algo {algo}"] if algo else []), *([f"--prior {prior}"] if prior else [])])
     names = ", ".join(e.name for e in named or entries)
     known = f"the bundled policies are {names}" if names else "no policy is bundled"
     raise UserError(f"no policy fits {wanted}; {known}; train one with esp train, and name its run folder")

@@ -64,8 +64,7 @@ def bundle(
         force: replace a policy of the same name.
 
     Raises:
-        UserError: an unknown seed, an invalid name or one that is taken, the folder of a run, a damaged manifest, or a
-            file that cannot be written.
+        UserError: an unknown seed, a name that is invalid or taken, the folder of a run, or a damaged manifest.
     """
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
@@ -103,11 +102,7 @@ def bundle(
 
 
 def _others(folder: Path, name: str, force: bool) -> tuple[Entry, ...]:
-    """Return what a folder lists besides the policy of this name.
-
-    Raises:
-        UserError: it is the folder of a run, has a policy or another file of that name, or its manifest is damaged.
-    """
+    """Return what a folder lists besides the policy of a name; refuse the folder of a run, or a name that is taken."""
     if os.path.lexists(folder / CONFIG):
         raise UserError(f"{folder} is the folder of a run, whose own policies have such names; choose another --out")
     entries = read_bundled(folder)

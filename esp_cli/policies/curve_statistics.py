@@ -1,4 +1,7 @@
-"""Statistics of learning curves over seeds: bands, first steps at a threshold, mean heights."""
+"""Statistics of learning curves over seeds: bands, first steps at a threshold, mean heights.
+
+A curve has ascending steps [K], env steps per seed, and values [K, S]; other shapes raise a UserError.
+"""
 
 from __future__ import annotations
 
@@ -18,31 +21,17 @@ _RESAMPLES = 2_000
 
 @dataclass(frozen=True)
 class Passing:
-    """Env steps per seed at which a learning curve first is at or above a threshold.
-
-    Attributes:
-        threshold: e.g. a return.
-        of_mean: by the mean over seeds, or None where it never is.
-        per_seed: by each seed, likewise.
-    """
+    """Env steps per seed at which a learning curve first is at or above a threshold; None where it never is."""
 
     threshold: float
-    of_mean: int | None
-    per_seed: tuple[int | None, ...]
+    of_mean: int | None  # by the mean over seeds
+    per_seed: tuple[int | None, ...]  # by each seed
 
 
 def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> Passing:
     """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
 
-    A value that is not finite, as of a seed that was stopped, reaches nothing.
-
-    Args:
-        steps: env steps per seed, ascending [K].
-        values: [K, S]; higher is better.
-        threshold: e.g. a return.
-
-    Raises:
-        UserError: shapes that do not fit, or steps that do not ascend.
+    Higher is better. A value that is not finite, as of a seed that was stopped, reaches nothing.
     """
     at, curves = _curves(steps, values)
     curves = np.where(np.isfinite(curves), curves, np.nan)
@@ -59,9 +48,6 @@ def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None
 
     The interval lies between two order statistics and holds for any distribution: of ten seeds it goes from the second
     to the ninth and holds the median with 97.9 %, at least 95 % being asked for. Fewer than six seeds have none.
-
-    Args:
-        per_seed: as in `Passing`, at least one.
     """
     ordered = sorted(np.inf if steps is None else float(steps) for steps in per_seed)
     rank = int(scipy.stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5))
@@ -69,14 +55,9 @@ def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None
 
 
 def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
-    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S].
+    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S], K > 1.
 
-    Args:
-        steps: env steps per seed, ascending [K], K > 1.
-        values: [K, S]; NaN gives that seed NaN.
-
-    Raises:
-        UserError: shapes that do not fit, steps that do not ascend, or fewer than two of them.
+    A value NaN gives that seed NaN.
     """
     at, curves = _curves(steps, values)
     if at.size < 2:
@@ -85,16 +66,10 @@ def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
 
 
 def curve_band(values: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Return mean, lower and upper edge of a learning curve over seeds, each [K].
+    """Return mean, lower and upper edge of a learning curve [K, S] over seeds, each [K].
 
     The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
     is not finite all three are NaN, so that a stopped seed leaves a gap instead of a mean over the survivors.
-
-    Args:
-        values: [K, S].
-
-    Raises:
-        UserError: values that are no [K, S].
     """
     curves = np.asarray(values, dtype=np.float64)
     if curves.ndim != 2 or curves.shape[1] == 0:

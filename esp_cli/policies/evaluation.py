@@ -19,60 +19,35 @@ from esp_cli.training.play import Controller, Episodes, PolicyController, Script
 from esp_cli.training.streams import generators
 from esp_envs.errors import UserError
 
-MAX_WORLDS = 4096
-"""Worlds played at once, over all seeds; more episodes are played one batch after the other."""
-_STREAM = "judgement"
-"""Names the worlds. The word decides the numbers of every final evaluation, so it stays as it is."""
+MAX_WORLDS = 4096  # played at once, over all seeds; more episodes are played one batch after the other
+_STREAM = "judgement"  # names the worlds; the word decides the numbers of every final evaluation, so it stays
 Metrics = dict[str, float | None]
 
 
 class FinalEvaluation(BaseModel):
-    """What a trained policy reaches on episodes of their own; files of older versions have fewer fields.
-
-    Attributes:
-        esp_version: of the program that played.
-        task: its name.
-        task_version: of its rules.
-        convention: of its returns.
-        task_settings: under which it was played.
-        source: where the policy was found.
-        step: environment steps per seed behind the policy.
-        seeds: of the run.
-        episodes: per seed, of each policy.
-        greedy: returns of the policy.
-        stochastic: returns of the policy with drawn actions.
-        anchors: mean return of the reference policies: "random", "heuristic", and other heuristics by name.
-        heuristics: names of the task's heuristics; the first is the one called "heuristic".
-        metrics: the task's measures of the greedy policy.
-        metrics_per_seed: the same by seed.
-        anchor_metrics: the same of each reference policy.
-        parameters: weights of one seed's networks by name, which is "policy".
-        flops_per_action: operations of the matrix products behind one agent's action.
-        over_episodes: error of the mean over episodes, of each reference policy, and of "greedy" and "stochastic" where
-            the run has one seed.
-    """
+    """What a trained policy reaches on episodes of their own; files of older versions have fewer fields."""
 
     model_config = ConfigDict(frozen=True)
 
-    esp_version: str | None = None
+    esp_version: str | None = None  # of the program that played
     task: str
     task_version: int
-    convention: str
-    task_settings: dict[str, Any] = {}
-    source: str = ""
-    step: int
+    convention: str  # of its returns
+    task_settings: dict[str, Any] = {}  # under which it was played
+    source: str = ""  # where the policy was found
+    step: int  # environment steps per seed behind the policy
     seeds: tuple[int, ...]
-    episodes: int
-    greedy: SeedSummary
-    stochastic: SeedSummary
-    anchors: dict[str, float]
-    heuristics: tuple[str, ...] = ()
-    metrics: Metrics
+    episodes: int  # per seed, of each policy
+    greedy: SeedSummary  # returns of the policy
+    stochastic: SeedSummary  # returns of the policy with drawn actions
+    anchors: dict[str, float]  # mean returns of reference policies: "random", "heuristic", other heuristics by name
+    heuristics: tuple[str, ...] = ()  # of the task; the first is the one called "heuristic"
+    metrics: Metrics  # the task's measures of the greedy policy
     metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
-    anchor_metrics: dict[str, Metrics] = {}
-    parameters: dict[str, int] = {}
-    flops_per_action: float | None = None
-    over_episodes: dict[str, EpisodeSpread] = {}
+    anchor_metrics: dict[str, Metrics] = {}  # of each reference policy
+    parameters: dict[str, int] = {}  # weights of one seed's networks by name, which is "policy"
+    flops_per_action: float | None = None  # of the matrix products behind one agent's action
+    over_episodes: dict[str, EpisodeSpread] = {}  # of each reference policy, and of one seed's greedy and stochastic
 
     def returns(self, mode: Mode) -> SeedSummary:
         """Return the returns of the policy that acts in this way."""
@@ -99,8 +74,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     one_world = build_environment(trained.config, 1, _STREAM, "shape")
     names = one_world.heuristics
     anchors = {"random": play_batches(trained, ScriptedController(methodcaller("random_action")), "random", episodes)}
-    for index, name in enumerate(names):
-        key = "heuristic" if index == 0 else name
+    for key, name in zip(("heuristic", *names[1:]), names, strict=False):
         anchors[key] = play_batches(trained, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
     spread = dict(anchors)
     if len(seeds) == 1 and not trained.stopped:
@@ -133,11 +107,7 @@ def flops_per_action(policy: Policy, obs: Tensor) -> float:
     """Count the floating-point operations of matrix products by which a policy chooses one agent's action.
 
     What is done once for any number of observations, such as putting constrained weights together, does not count; nor
-    does it count that equal pictures need to be encoded only once.
-
-    Args:
-        policy: S policies.
-        obs: of one world [S, 1, N, D].
+    does it count that equal pictures need to be encoded only once. `obs` is of one world [S, 1, N, D].
     """
     worlds, counts = 16, []  # many pictures, so that no odd number is rounded up
     for number in (worlds, 2 * worlds):
@@ -161,14 +131,7 @@ def _means(episodes: Episodes) -> Metrics:
 
 
 def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
-    """Play episodes in batches whose worlds depend on the seeds, the stream and the batch alone.
-
-    Args:
-        trained: the policy, and so the task.
-        controller: who acts.
-        stream: names the worlds.
-        episodes: per seed.
-    """
+    """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone."""
     parts = []
     batch = max(1, min(episodes, MAX_WORLDS // len(trained.config.seeds)))
     for begin in range(0, episodes, batch):

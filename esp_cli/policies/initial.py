@@ -21,27 +21,16 @@ from esp_envs.mpe.frozen_prey import digest
 
 @dataclass(frozen=True)
 class Start:
-    """Weights that a run may start from.
+    """Weights that a run may start from."""
 
-    Attributes:
-        source: the policy, as a configuration records it.
-        holder: the file or folder that holds the weights.
-        config: of the run that trained the policy, or that started from it.
-        weights: [S', ...]; one seed's serve all, as many seeds as a new run has serve one each.
-    """
-
-    source: str
-    holder: Path
-    config: RunConfig
-    weights: Mapping[str, Tensor]
+    source: str  # the policy, as a configuration records it
+    holder: Path  # the file or folder that holds the weights
+    config: RunConfig  # of the run that trained the policy, or that started from it
+    weights: Mapping[str, Tensor]  # [S', ...]; one seed's serve all, as many seeds as a new run has serve one each
 
     @classmethod
     def open(cls, source: str | os.PathLike[str]) -> Start:
-        """Open a run folder, a policy file or a bundled policy.
-
-        Raises:
-            UserError: nothing there, damaged, or of another version.
-        """
+        """Open a run folder, a policy file or a bundled policy, as `open_policy` does."""
         trained = open_policy(Path(source))
         return cls(os.fspath(source), trained.source, trained.config, trained.policy.state_dict())
 
@@ -60,9 +49,6 @@ class Start:
 
     def fit(self, policy: Policy) -> tuple[InitialPolicy, dict[str, Tensor]]:
         """Return what a new run's configuration records of this start, and the weights [S, ...] for its policy.
-
-        Args:
-            policy: of the new run, which says what fits.
 
         Raises:
             UserError: numbers of seeds, names or shapes differ.

@@ -1,4 +1,7 @@
-"""Trained policies, read from a run folder or a policy file or by a bundled one's name; loading never runs code."""
+"""Trained policies, read from a run folder or a policy file or by a bundled one's name; loading never runs code.
+
+What is missing, foreign, damaged or of another version of the task is a UserError.
+"""
 
 from __future__ import annotations
 
@@ -34,37 +37,19 @@ from esp_envs.spec import TaskSpec
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """A policy and what it was trained for.
+    """A policy and what it was trained for."""
 
-    Attributes:
-        config: of the run; its device is the CPU where there is no GPU.
-        policy: S policies, in evaluation mode.
-        spec: of the task it was trained on.
-        step: environment steps per seed behind it.
-        source: the run folder or file.
-        notes: sentences for the user (a damaged checkpoint was passed over).
-        stopped: places of the seeds that stopped on a number that is not finite; their policies are early ones.
-    """
-
-    config: RunConfig
-    policy: Policy
-    spec: TaskSpec
-    step: int
-    source: Path
-    notes: tuple[str, ...] = ()
-    stopped: tuple[int, ...] = ()
+    config: RunConfig  # of the run; its device is the CPU where there is no GPU
+    policy: Policy  # S policies, in evaluation mode
+    spec: TaskSpec  # of the task it was trained on
+    step: int  # environment steps per seed behind it
+    source: Path  # the run folder or file
+    notes: tuple[str, ...] = ()  # sentences for the user (a damaged checkpoint was passed over)
+    stopped: tuple[int, ...] = ()  # places of seeds that stopped on a number that is not finite; theirs are early ones
 
     @classmethod
     def read(cls, path: Path, sha256: str | None = None) -> TrainedPolicy:
-        """Read the policy of a run folder (its newest checkpoint, else its policy file) or of a policy file.
-
-        Args:
-            path: of the folder or file.
-            sha256: that a manifest states of the file.
-
-        Raises:
-            UserError: nothing there, not one of ours, damaged, or of another version of the task.
-        """
+        """Read a run folder (its newest checkpoint, else its policy file), or a file, whose SHA-256 may be stated."""
         if sha256 is not None or path.is_file():
             tensors, meta = read_policy(path, sha256)
             writer = meta.get("esp_version", __version__)
@@ -79,10 +64,7 @@ class TrainedPolicy:
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:
-        """Return the policy for its task under other settings: another physics, more noise, another reward.
-
-        Args:
-            settings: task settings that differ from those of its training.
+        """Return the policy for its task under changed settings: another physics, more noise, another reward.
 
         Raises:
             UserError: an unknown setting, or one under which the policy does not see or do the same things.
@@ -101,28 +83,17 @@ class TrainedPolicy:
                 )
         return replace(self, config=config, spec=spec)
 
-    def index_of(self, seed: int | None) -> int:
-        """Return the place of a seed, by default of the first.
-
-        Raises:
-            UserError: the run does not have this seed.
-        """
-        seeds = self.config.seeds
-        if seed is not None and seed not in seeds:
-            raise UserError(f"{self.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
-        return 0 if seed is None else seeds.index(seed)
-
     def single_seed(self, seed: int | None = None) -> TrainedPolicy:
         """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export.
 
         Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
-
-        Raises:
-            UserError: the run does not have this seed.
         """
-        index = self.index_of(seed)
+        seeds = self.config.seeds
+        if seed is not None and seed not in seeds:
+            raise UserError(f"{self.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
+        index = 0 if seed is None else seeds.index(seed)
         network = _at_default(self.config.network, "precision", "compiled")
-        choice = {"seeds": self.config.seeds[index : index + 1], "network": network, "device": "cpu"}
+        choice = {"seeds": seeds[index : index + 1], "network": network, "device": "cpu"}
         config = self.config.model_copy(update=choice)
         policy = _untrained(config, self.spec, network)
         policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in self.policy.state_dict().items()})
@@ -132,19 +103,11 @@ class TrainedPolicy:
 def open_policy(where: Path, algo: str | None = None, prior: str | None = None) -> TrainedPolicy:
     """Open a run folder, a policy file, or a bundled policy by its name or its task's.
 
-    An existing path goes before a bundled policy of that name, unless algorithm or prior is given.
-
-    Args:
-        where: path or name.
-        algo: of the bundled policies, only those that this algorithm trained; module:Class chooses none.
-        prior: likewise this kind of prior.
-
-    Raises:
-        UserError: nothing there, damaged, or of another version.
+    An existing path goes before a bundled policy of that name, unless algorithm or prior is given, which choose among
+    the bundled ones; an algorithm "module:Class" of the caller chooses none.
     """
     name = str(where)
-    if algo is not None and ":" in algo:  # an algorithm of the caller, which trained no bundled policy
-        algo = None
+    algo = None if algo is not None and ":" in algo else algo
     chosen = algo is not None or prior is not None
     try:
         exists = where.exists()
@@ -165,11 +128,7 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
 
 
 def load_entry(entry: bundled.Entry) -> TrainedPolicy:
-    """Load a bundled policy.
-
-    Raises:
-        UserError: its file is missing, another than the manifest names, or of another version.
-    """
+    """Load a bundled policy; raises a UserError where its file is missing, or another than the manifest names."""
     trained = TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
     described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
     if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):

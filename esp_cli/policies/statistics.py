@@ -1,11 +1,10 @@
 """Statistics over seeds: means with intervals, comparisons of two groups of seeds.
 
-A sample is one number per seed, never one per episode: episodes of one seed share its policy and say nothing about how
-another seed would turn out (`spread_over_episodes` is for a policy without other seeds). Intervals are 95 % percentile
-bootstrap intervals over seeds with a fixed generator, so that the same numbers give the same interval; with few seeds
-they are a little too narrow (of ten seeds drawn from a normal distribution, 90 % of the intervals hold its mean). They
-are None where the bootstrap cannot tell: one seed, or resamples that all agree. A sample without a value, or with one
-that is not finite, raises a UserError.
+A sample is one finite number per seed [S], or a UserError; never one per episode: episodes of one seed share its policy
+and say nothing about how another seed would turn out (`spread_over_episodes` is for a policy without other seeds).
+Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so that the same numbers give the
+same interval; with few seeds they are a little too narrow (of ten seeds drawn from a normal distribution, 90 % of the
+intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or resamples that all agree.
 
 Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
 (interquartile mean, stratified bootstrap, probability of improvement).
@@ -25,8 +24,7 @@ from esp_envs.errors import UserError
 
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-MOST_RESAMPLED = 512
-"""More episodes than this have the interval of the normal distribution, from which the bootstrap's hardly differs."""
+MOST_RESAMPLED = 512  # episodes; more have the interval of the normal distribution, which hardly differs
 
 Floats = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -34,12 +32,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and how far it can be trusted.
-
-    Attributes:
-        value: the number on the seeds at hand.
-        ci95: its 95 % bootstrap interval over seeds, or None where the bootstrap cannot tell.
-    """
+    """A number on the seeds at hand, and its 95 % interval."""
 
     value: float
     ci95: Interval | None
@@ -47,28 +40,19 @@ class Estimate:
 
 @dataclass(frozen=True)
 class SeedSummary:
-    """One number per seed, and what they say together; the numbers of seeds that stopped are left out.
+    """One number per seed, and what they say together; the numbers of seeds that stopped are left out."""
 
-    Attributes:
-        mean: over seeds; None where every seed stopped.
-        sem: standard error of the mean; None for one seed.
-        ci95: 95 % bootstrap interval of the mean, or None where the bootstrap cannot tell.
-        per_seed: the numbers [S]; None where a seed stopped.
-    """
-
-    mean: float | None
-    sem: float | None
-    ci95: Interval | None
-    per_seed: tuple[float | None, ...]
+    mean: float | None  # None where every seed stopped
+    sem: float | None  # standard error of the mean; None for one seed
+    ci95: Interval | None  # of the mean
+    per_seed: tuple[float | None, ...]  # [S]; None where a seed stopped
 
 
 @dataclass(frozen=True)
 class EpisodeSpread:
     """How far the mean return of one policy can be trusted by its episodes; other seeds are another question.
 
-    Attributes:
-        sem: standard error of the mean over episodes; None for one episode.
-        ci95: 95 % interval of the mean over episodes; None for one episode, or where all episodes are alike.
+    Both are None for one episode; there is no interval where all episodes are alike.
     """
 
     sem: float | None
@@ -97,43 +81,26 @@ def spread_over_episodes(returns: ArrayLike) -> EpisodeSpread:
 
 
 def mean_and_sem(values: ArrayLike) -> tuple[float, float | None]:
-    """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed.
-
-    Args:
-        values: one finite number per seed [S].
-    """
+    """Return the mean and its standard error, s / sqrt(S) with S - 1 in the variance; None for one seed."""
     sample = _sample(values)
     return float(sample.mean()), float(scipy.stats.sem(sample)) if sample.size > 1 else None
 
 
 def bootstrap_interval(values: ArrayLike) -> Interval | None:
-    """Return the 95 % bootstrap interval of the mean over seeds, or None where the bootstrap cannot tell.
-
-    Args:
-        values: one finite number per seed [S].
-    """
+    """Return the 95 % bootstrap interval of the mean over seeds."""
     return _interval((_sample(values),), np.mean)
 
 
 def interquartile_mean(values: ArrayLike) -> Estimate:
-    """Return the mean of the middle half: a quarter of the seeds, rounded down, is left out at either end.
-
-    Args:
-        values: one finite number per seed [S].
-    """
+    """Return the mean of the middle half: a quarter of the seeds, rounded down, is left out at either end."""
     sample = _sample(values)
     return Estimate(float(_iqm(sample)), _interval((sample,), _iqm))
 
 
 def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"] = "iqm") -> Estimate:
-    """Return one number over several tasks, with a bootstrap that is stratified: seeds are redrawn within each task.
+    """Return a statistic of all seeds of several tasks, whose scores normalise() makes comparable.
 
-    Args:
-        scores: by task, one finite number per seed [S]; normalise() makes tasks comparable.
-        statistic: of all seeds of all tasks together.
-
-    Raises:
-        UserError: no task.
+    The bootstrap is stratified: seeds are redrawn within each task.
     """
     if not scores:
         raise UserError("there is no task to aggregate over")
@@ -147,16 +114,7 @@ def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"]
 
 
 def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
-    """Return mean(x) - mean(y) with its interval.
-
-    Args:
-        x: one finite number per seed [S].
-        y: likewise [S'], of the group that x is compared with.
-        paired: seed k of x and seed k of y belong together (S = S'), as where they share their worlds.
-
-    Raises:
-        UserError: paired groups that differ in size.
-    """
+    """Return mean(x) - mean(y); paired, seed k of x and of y belong together (S = S'), as where they share worlds."""
     first, second = _pair(x, y, paired)
     value = float(first.mean() - second.mean())
     if paired:
@@ -168,14 +126,6 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
     """Return the probability that a seed of x beats a seed of y, P(X > Y) + P(X = Y) / 2.
 
     Unpaired, all S * S' pairs count: the Mann-Whitney U of x over S * S'. Paired, seed k meets seed k only.
-
-    Args:
-        x: one finite number per seed [S]; higher is better.
-        y: likewise [S'].
-        paired: as in difference().
-
-    Raises:
-        UserError: paired groups that differ in size.
     """
     first, second = _pair(x, y, paired)
     if paired:
@@ -186,15 +136,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
 
 
 def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Estimate:
-    """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap.
-
-    Args:
-        pairs: by task, one finite number per seed [S] of each of the two; the same S everywhere, so that tasks count
-            alike.
-
-    Raises:
-        UserError: no task, or groups that differ in size.
-    """
+    """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap."""
     wins = {task: _wins(*_pair(x, y, True)) for task, (x, y) in pairs.items()}
     if len({group.size for group in wins.values()}) > 1:
         raise UserError("the tasks have to have the same number of seeds, so that they count alike")
@@ -206,9 +148,7 @@ def leader(
 ) -> Literal["first", "second", "neither"] | None:
     """Return which of two published means is higher, by Welch's t-test at 5 %; None where an error is missing.
 
-    Args:
-        ours: mean, standard error of the mean, and number of seeds.
-        others: likewise.
+    Each is a mean, its standard error, and the number of seeds.
     """
     (mean, sem, count), (other_mean, other_sem, other_count) = ours, others
     if sem is None or other_sem is None or min(count, other_count) < 2:
@@ -225,12 +165,7 @@ def leader(
 
 
 def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
-    """Return (value - random) / (heuristic - random): 0 is the random policy, 1 the heuristic one.
-
-    Args:
-        values: returns of any shape.
-        random: return of the random policy under the same convention.
-        heuristic: return of the heuristic policy.
+    """Return (value - random) / (heuristic - random) of returns of any shape: 0 is the random policy, 1 the heuristic.
 
     Raises:
         UserError: the heuristic policy is not better than the random one, or an anchor is not finite.
@@ -243,7 +178,6 @@ def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
 
 
 def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Interval | None:
-    """Return the percentile bootstrap interval of a statistic of independent samples, or None where it cannot tell."""
     if any(sample.size < 2 for sample in samples):
         return None
     interval = bootstrap(samples, statistic)

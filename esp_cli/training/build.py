@@ -20,10 +20,8 @@ from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
 from esp_envs.spec import TaskSpec
 
-_LOOK_SECONDS = 2.0
-"""How long a task of others is looked at before it is trained on."""
-_GATE_WORLDS = 256
-"""In which the episodes are played that a gate's predictors are fitted to."""
+_LOOK_SECONDS = 2.0  # at a task of others before it is trained on
+_GATE_WORLDS = 256  # for the episodes that a gate's predictors are fitted to
 
 
 def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
@@ -39,19 +37,18 @@ def with_compass(env: Environment, prior: PriorConfig) -> Environment:
 
 
 def first_look(config: RunConfig) -> list[str]:
-    """Return what a short look finds broken in a task that is not built in; `esp check task` looks longer."""
+    """Return a sentence on what a short look at a task that is not built in finds; `esp check task` looks longer."""
     if TASKS.ships(config.task):
         return []
 
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(config.task, min(num_envs, 2), seeds, config.task_settings)
 
-    findings = check(Subject(make_worlds, deadline=time.monotonic() + _LOOK_SECONDS), QUICK)
-    return [
-        f"{config.task} breaks a promise: {finding.broken}; see 'esp check task'"
-        for finding in findings
-        if finding.broken
-    ]
+    findings = list(check(Subject(make_worlds, deadline=time.monotonic() + _LOOK_SECONDS), QUICK))
+    if broken := [finding.broken for finding in findings if finding.broken]:
+        return [f"{config.task} breaks a promise: {'; '.join(broken)}; see 'esp check task {config.task}'"]
+    kept = ", ".join(finding.promise for finding in findings if not finding.not_asked)
+    return [f"looked at {config.task}: {kept}; 'esp check task {config.task}' looks longer"]
 
 
 def spec_of(config: RunConfig) -> TaskSpec:
@@ -82,11 +79,7 @@ def build_learner(config: RunConfig) -> Learner:
 
 
 def _set_gate(learner: Learner, config: RunConfig) -> None:
-    """Give a learner the gate that its prior asks for; it is the same for all seeds, and for whatever seeds there are.
-
-    Raises:
-        UserError: the gate does not go with the rest of the configuration.
-    """
+    """Give a learner the gate that its prior asks for, which is the same whatever seeds there are."""
     prior = config.prior.effective()
     if prior.trust != "gate" or learner.prior.transforms is None:
         return

@@ -65,9 +65,6 @@ def save_checkpoint(
         tensors: dense tensors by name, on any device, float, integer or bool. Generator states are uint8 tensors.
         meta: JSON-able description. The keys ``format``, ``version`` and ``sha256`` are the container's own.
         format_name: kind of file, asked for again when it is loaded.
-
-    Raises:
-        CheckpointError: a tensor or the description cannot be stored, or the file cannot be written.
     """
     taken = [key for key in _RESERVED if key in meta]
     if taken:
@@ -101,9 +98,6 @@ def load_checkpoint(
 
     Returns:
         The tensors by name, on the CPU, and the description without the container's own keys.
-
-    Raises:
-        CheckpointError: the file is missing, unreadable, truncated, damaged, foreign or of another format.
     """
     with _naming(path):
         header, content = _read(Path(path))
@@ -124,11 +118,7 @@ def load_checkpoint(
 
 
 def read_description(path: str | os.PathLike[str], format_name: str = CHECKPOINT_FORMAT) -> dict[str, Any]:
-    """Read the description alone from the header of a file; its checksum is not verified.
-
-    Raises:
-        CheckpointError: the file is missing, unreadable, foreign or of another format, or its header is damaged.
-    """
+    """Read the description alone from the header of a file; its checksum is not verified."""
     with _naming(path):
         return _description(_read(Path(path), whole=False)[0], format_name)
 
@@ -252,11 +242,7 @@ def read_policy(path: str | os.PathLike[str], sha256: str | None = None) -> tupl
 def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
     """Return the description by which a policy file is used without its run folder.
 
-    Args:
-        config: of the run, or of the one seed of it that the file holds.
-        spec: of the task.
-        step: environment steps per seed behind it.
-        returns: of greedy episodes, one per seed; NaN where it stopped.
+    `returns` are of greedy episodes, one per seed, NaN where it stopped; `step` is per seed.
     """
     return {
         "task": config.task,
@@ -271,11 +257,7 @@ def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Seque
 
 
 def read_initial(path: Path, recorded: InitialPolicy) -> dict[str, Tensor]:
-    """Read the weights that a run starts from.
-
-    Raises:
-        CheckpointError: they are missing, damaged, or not those that its configuration records.
-    """
+    """Read the weights that a run starts from, and check that they are those which its configuration records."""
     tensors, _ = read_policy(path)
     if digest(tensors, {}) != recorded.sha256:
         raise CheckpointError(f"{path} does not hold the policy that the run started from; train anew")

@@ -22,19 +22,12 @@ CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from
 
 @dataclass(frozen=True)
 class ConfigFile:
-    """What a file says.
-
-    Attributes:
-        path: of the file.
-        choices: of `CHOICES`, those that it names; numbers of steps and seeds may be text, as 500k.
-        settings: dotted names to values, as `--set` takes them.
-        config: of the run, where it is the configuration of one, and so says everything.
-    """
+    """What a file says."""
 
     path: Path
-    choices: dict[str, Any]
-    settings: dict[str, Any]
-    config: RunConfig | None = None
+    choices: dict[str, Any]  # of `CHOICES`, those that it names; numbers of steps and seeds may be text, as 500k
+    settings: dict[str, Any]  # dotted names to values, as `--set` takes them
+    config: RunConfig | None = None  # of the run, where it is the configuration of one, and so says everything
 
 
 def read_config_file(path: Path) -> ConfigFile:
@@ -79,11 +72,7 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
 
 
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
-    """Validate a configuration that a run folder or file holds, as JSON gave it and a version of esp wrote it.
-
-    Raises:
-        UserError: it is damaged or of another version.
-    """
+    """Validate a configuration that a run folder or file holds, as JSON gave it and a version of esp wrote it."""
     try:
         config = validate(RunConfig, data)
     except ValidationError as error:

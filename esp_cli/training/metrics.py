@@ -2,7 +2,7 @@
 
 A row is ``{"step": 12800, "train/policy_loss": [0.1, 0.2], "time/steps_per_second": 51000.0}``: ``step`` counts env
 steps per seed, a list has one number per seed, a bare number belongs to the run as a whole. What is not finite is
-``null``.
+``null``. A file that is missing, damaged elsewhere than at its end, or not to be written is a MetricsError.
 """
 
 from __future__ import annotations
@@ -44,11 +44,7 @@ class NoMetricError(MetricsError):
 
 
 class MetricsWriter:
-    """Appends rows to a JSONL file, and hands each to sinks, which are closed with it; a torn last line is removed.
-
-    Raises:
-        MetricsError: the file cannot be opened.
-    """
+    """Appends rows to a JSONL file, and hands each to sinks, which are closed with it; a torn last line is removed."""
 
     def __init__(self, path: str | os.PathLike[str], sinks: Sequence[Sink] = ()) -> None:
         self._path = Path(path)
@@ -64,13 +60,7 @@ class MetricsWriter:
         self.close()
 
     def write(self, step: int, values: Mapping[str, Value]) -> None:
-        """Append one row at a step: by name (``train/...``, ``eval/...``, ``time/...``) a number, or one per seed [S].
-
-        Raises:
-            MetricsError: a value is neither a number nor a list of numbers.
-            FolderLostError: the folder of the run was moved, replaced or deleted.
-            OSError: the disk is full.
-        """
+        """Append one row at a step: by name (``train/...``, ``eval/...``, ``time/...``) a number, or one per seed [S]."""
         row: dict[str, Any] = {"step": int(step)}
         for name, value in values.items():
             if name == "step":
@@ -92,11 +82,7 @@ class MetricsWriter:
 
 
 def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Read the rows of a metrics file, leaving out a torn last line.
-
-    Raises:
-        MetricsError: the file is missing, or damaged elsewhere than at its end.
-    """
+    """Read the rows of a metrics file, leaving out a torn last line."""
     return [row for _, row in _rows(Path(path))]
 
 
@@ -116,13 +102,7 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
     """Rewrite a metrics file, or make it, without a torn last line and without the rows past the step of a checkpoint.
 
-    What remains is kept byte for byte.
-
-    Returns:
-        The number of whole rows removed.
-
-    Raises:
-        MetricsError: the file is damaged elsewhere than at its end, or cannot be written.
+    What remains is kept byte for byte. Return the number of whole rows removed.
     """
     path, removed = Path(path), 0
     with attempting("write", path, MetricsError):

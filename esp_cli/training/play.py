@@ -63,17 +63,11 @@ class ScriptedController:
 
 @dataclass(frozen=True)
 class Episodes:
-    """What one episode in every world brought.
+    """What one episode in every world brought."""
 
-    Attributes:
-        returns: [S, E] mean over agents of the sum of rewards over time.
-        lengths: [S, E] steps.
-        metrics: task measures, each [S, E], averaged over the episode's steps or added up, as the spec says.
-    """
-
-    returns: Tensor
-    lengths: Tensor
-    metrics: dict[str, Tensor]
+    returns: Tensor  # [S, E] mean over agents of the sum of rewards over time
+    lengths: Tensor  # [S, E] steps
+    metrics: dict[str, Tensor]  # task measures, each [S, E]: means over the episode's steps or sums, as the spec says
 
 
 @torch.no_grad()

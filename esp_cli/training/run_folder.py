@@ -11,7 +11,7 @@ Layout::
 
 Every file but the metrics is replaced as a whole, so that a process may be killed at any moment: the next one goes on
 from the newest checkpoint that is good. A checkpoint carries the identity of its run and a digest of its configuration;
-that of another run is neither resumed nor removed.
+that of another run is neither resumed nor removed. What the user can correct is a RunFolderError.
 """
 
 from __future__ import annotations
@@ -92,9 +92,6 @@ class RunFolder:
             path: a folder that is missing, empty, or left half-made by a killed process.
             config: resolved configuration, JSON-able; the keys ``format``, ``version`` and ``run_id`` are taken.
             initial: weights of the policy that the run starts from.
-
-        Raises:
-            RunFolderError: a run or something foreign is there, another process holds it, or it cannot be written.
         """
         path = Path(path)
         if taken := {"format", "version", RUN_ID} & set(config):
@@ -124,11 +121,7 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
-        """Open an existing run folder.
-
-        Raises:
-            RunFolderError: it is missing, no run folder, or its configuration is damaged, foreign or newer.
-        """
+        """Open an existing run folder."""
         path = Path(path)
         if (path / CONFIG).is_file():
             return cls(path, *read_run_config(path / CONFIG))
@@ -138,11 +131,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the folder, so that no second process writes to it; what a killed one left half-written is removed.
-
-        Raises:
-            RunFolderError: it is held already, it cannot be locked, or the folder of checkpoints is a link.
-        """
+        """Hold the folder, so that no second process writes to it; what a killed one left half-written is removed."""
         checkpoints = self.path / CHECKPOINTS
         if checkpoints.is_symlink():
             raise RunFolderError(f"{checkpoints} is a link, which is not followed; put the folder itself there")

@@ -39,27 +39,16 @@ Kind = Literal["algorithm", "task", "network", "prior", "evaluation"]
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting.
+    """One setting."""
 
-    Attributes:
-        name: as `--set` takes it, "mappo.learning_rate".
-        type: "integer", "number", "text", "flag", or "list of ...".
-        default: where neither preset, task, file nor command line says something else.
-        bounds: of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none.
-        unit: of its value; empty for a bare number.
-        description: what it does.
-        presets: values that a preset sets instead, by preset; "fast on navigation" on this task alone.
-        tasks: values that the preset default sets on a task instead, by task.
-    """
-
-    name: str
-    type: str
-    default: Any
-    bounds: str
-    unit: str
+    name: str  # as `--set` takes it, "mappo.learning_rate"
+    type: str  # "integer", "number", "text", "flag", or "list of ..."
+    default: Any  # where neither preset, task, file nor command line says something else
+    bounds: str  # of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none
+    unit: str  # of its value; empty for a bare number
     description: str
-    presets: Mapping[str, Any]
-    tasks: Mapping[str, Any]
+    presets: Mapping[str, Any]  # values that a preset sets instead; "fast on navigation" on this task alone
+    tasks: Mapping[str, Any]  # values that the preset default sets on a task instead
 
 
 @dataclass(frozen=True)
@@ -85,11 +74,7 @@ def task_section(name: str) -> Section:
 
 
 def own_section(name: str) -> Section:
-    """Import a task, an algorithm or a network of the caller, named as "module:Class", and return its settings.
-
-    Raises:
-        UserError: the module cannot be imported, or holds none of these by that name.
-    """
+    """Import a task, an algorithm or a network of the caller, named as "module:Class", and return its settings."""
     refusals = []
     for kind, (registry, _) in _KINDS.items():
         try:

@@ -25,19 +25,12 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TrackedRun:
-    """What a tracker knows of a run.
+    """What a tracker knows of a run."""
 
-    Attributes:
-        folder: of the run; a tracker writes below it and nowhere else.
-        seeds: of the run, in the order of the metrics.
-        config: the resolved configuration.
-        first_step: rows after this step are written again by a resumed run.
-    """
-
-    folder: Path
-    seeds: tuple[int, ...]
-    config: Mapping[str, Any]
-    first_step: int = 0
+    folder: Path  # a tracker writes below it and nowhere else
+    seeds: tuple[int, ...]  # in the order of the metrics
+    config: Mapping[str, Any]  # resolved
+    first_step: int = 0  # rows after it are written again by a resumed run
 
 
 class Sink(Protocol):
@@ -215,11 +208,7 @@ class Guarded:
 
 
 def require(names: Sequence[str]) -> None:
-    """Refuse unknown trackers, and those whose package is not installed.
-
-    Raises:
-        UserError: with what to install.
-    """
+    """Refuse unknown trackers, and those whose package is not installed, saying what to install."""
     for name in names:
         if name not in TRACKERS:
             raise UserError(f"there is no tracker '{name}'; the trackers are {', '.join(TRACKERS)}")
@@ -228,11 +217,7 @@ def require(names: Sequence[str]) -> None:
 
 
 def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:
-    """Open trackers for a run; one that cannot be opened is told and left out.
-
-    Raises:
-        UserError: as of `require`.
-    """
+    """Open trackers for a run; one that cannot be opened is told and left out."""
     require(names)
     return [Guarded(name, partial(TRACKERS[name], run), tell) for name in dict.fromkeys(names)]
 

@@ -28,11 +28,7 @@ from esp_envs.errors import UserError
 
 
 def checkpoint_seconds() -> float:
-    """Return what ESP_CHECKPOINT_SECONDS says, or its default.
-
-    Raises:
-        UserError: it is not a number of seconds.
-    """
+    """Return what ESP_CHECKPOINT_SECONDS says, or its default; raises a UserError where it is no number of seconds."""
     text = os.environ.get("ESP_CHECKPOINT_SECONDS", "30")
     if not re.fullmatch(r"\d{1,9}(\.\d{0,9})?", text):
         raise UserError(f"ESP_CHECKPOINT_SECONDS is '{text}'; set it to a number of seconds, such as 30")
@@ -85,13 +81,14 @@ class Trainer:
         config: what to train.
         folder: where results go; held by the caller's lock. A checkpoint found there is continued.
         track: names of trackers that get the metrics too.
+        look: take a short look at a task that is not built in before the first step, and note what it found.
 
     Raises:
         UserError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
             installed.
     """
 
-    def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = ()) -> None:
+    def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = (), look: bool = True) -> None:
         self.config, self.folder, self.track = config, folder, tuple(track)
         require(self.track)
         self.learner = build_learner(config)
@@ -99,7 +96,7 @@ class Trainer:
         self.stopped_seeds: dict[int, int] = {}
         self.elapsed_s = 0.0
         self.notes: list[str] = []
-        self._restore()
+        self._restore(look)
         self._good = self._snapshot()
         self.evaluation_worlds = build_environment(config, config.evaluation.episodes, "evaluation")
 
@@ -137,7 +134,7 @@ class Trainer:
         Raises:
             UserError: every seed stopped on a number that is not finite.
         """
-        self._require_a_seed_that_goes_on()
+        self._refuse_if_all_stopped()
         started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
         tracked = TrackedRun(self.folder.path, self.config.seeds, self.folder.config, self.step)
         sinks = open_trackers(self.track, tracked, self.notes.append)
@@ -146,30 +143,30 @@ class Trainer:
                 return False
             while not self.is_complete:
                 tick = time.monotonic()
-                row, seconds = self._iterate()
-                row["time/steps_per_second"] = self.learner.steps_per_iteration * len(self.config.seeds) / seconds
-                self.elapsed_s = time.monotonic() - started
-                row["time/elapsed_s"] = self.elapsed_s
+                row = self._iterate()
+                row["time/elapsed_s"] = self.elapsed_s = time.monotonic() - started
                 going = self._record(writer, row, listener)
                 if self.is_complete or not going or self.all_stopped or tick > due:
                     cost = self._checkpoint()
                     due = time.monotonic() + max(CHECKPOINT_SECONDS, CHECKPOINT_SPACING * cost)
-                self._require_a_seed_that_goes_on()
+                self._refuse_if_all_stopped()
                 if not going and not self.is_complete:
                     return False
             # before the trackers are closed: what another program does there must not keep a run from its policy
-            self.folder.write_policy(self.learner.policy.state_dict(), self._policy_meta())
+            returns = self.final_returns()["greedy"].tolist()
+            meta = describe_policy(self.config, self.learner.spec, self.step, returns)
+            self.folder.write_policy(self.learner.policy.state_dict(), meta)
         return True
 
-    def _require_a_seed_that_goes_on(self) -> None:
+    def _refuse_if_all_stopped(self) -> None:
         if self.all_stopped:
             raise UserError(
                 "every seed stopped on a number that is not finite; ask 'esp check task' whether the task has one, "
                 "or try a smaller learning rate"
             )
 
-    def _iterate(self) -> tuple[dict[str, Any], float]:
-        """Collect, learn, freeze broken seeds, evaluate where it is time; return metrics and seconds of learning."""
+    def _iterate(self) -> dict[str, Any]:
+        """Collect, learn, freeze broken seeds, evaluate where it is time; return the metrics."""
         begun = time.monotonic()
         before = self.step // self.config.evaluation.every_steps
         progress = self.iteration / self.total_iterations
@@ -178,10 +175,11 @@ class Trainer:
         self.iteration += 1
         row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}
         self._stop_broken_seeds(result.finite)
-        seconds = time.monotonic() - begun
+        steps = self.learner.steps_per_iteration * len(self.config.seeds)
+        row["time/steps_per_second"] = steps / (time.monotonic() - begun)  # of learning alone
         if self.step // self.config.evaluation.every_steps > before or self.is_complete or self.all_stopped:
             row |= self._evaluate()
-        return row, seconds
+        return row
 
     def _evaluate(self) -> dict[str, Tensor]:
         """Play greedy and stochastic episodes; every seed's worlds depend on its seed, the step and the mode."""
@@ -219,12 +217,10 @@ class Trainer:
 
     def _record(self, writer: MetricsWriter, row: dict[str, Any], listener: Listener) -> bool:
         """Write a metrics row, without the numbers of stopped seeds, and tell the listener."""
-        values: dict[str, Any] = {}
-        for name, value in row.items():
-            numbers = value.tolist() if isinstance(value, Tensor) else value
+        values = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in row.items()}
+        for name, numbers in values.items():
             if isinstance(numbers, list):
-                numbers = [None if k in self.stopped_seeds else x for k, x in enumerate(numbers)]
-            values[name] = numbers
+                values[name] = [None if k in self.stopped_seeds else x for k, x in enumerate(numbers)]
         writer.write(self.step, values)
         notes = tuple(self.notes)
         self.notes.clear()
@@ -239,38 +235,40 @@ class Trainer:
             "stopped_seeds": {str(index): step for index, step in self.stopped_seeds.items()},
             "task_version": self.learner.spec.version,
         }
-        complete = self.is_complete
-        self.folder.write_checkpoint(self.step, self.learner.state_dict(complete), meta, complete)
+        self.folder.write_checkpoint(self.step, self.learner.state_dict(self.is_complete), meta, self.is_complete)
         return time.monotonic() - begun
 
-    def _restore(self) -> None:
+    def _restore(self, look: bool) -> None:
         """Continue from the newest good checkpoint; without one, start from the beginning."""
         found = self.folder.latest_checkpoint(self.notes.append)
-        if found is None and self.folder.policy_path.is_file():
+        if found is not None:
+            self._load(found[0])
+            self._stand(found[1])
+        elif self.folder.policy_path.is_file():
             raise UserError(
                 f"{self.folder.path} is trained and has no checkpoint to go on from; train anew under another --out"
             )
-        if found is not None:
-            tensors, meta = found
-            self._load(tensors)
-            try:
-                stands = Standing.model_validate(meta)
-            except ValidationError:
-                raise UserError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
-            self.iteration, self.elapsed_s = stands.iteration, stands.elapsed_s
-            self.stopped_seeds = stands.stopped_seeds
-            if self.step != stands.step or not set(self.stopped_seeds) <= set(range(len(self.config.seeds))):
-                raise UserError(f"the checkpoint in {self.folder.path} is of another run; train anew")
-            version = self.learner.spec.version
-            if stands.task_version != version:
-                raise UserError(
-                    f"{self.folder.path} was trained on {self.config.task} version {stands.task_version}, but this is "
-                    f"version {version}; use the esp that it was begun with, or train anew"
-                )
         elif self.config.init_from is not None:
             self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
-        self.notes += first_look(self.config) if found is None else []
+        if found is None and look:
+            self.notes += first_look(self.config)
         truncate_metrics(self.folder.metrics_path, self.step if found else -1)
+
+    def _stand(self, meta: Mapping[str, Any]) -> None:
+        """Go to where the description of a checkpoint says that the run stands."""
+        try:
+            stands = Standing.model_validate(meta)
+        except ValidationError:
+            raise UserError(f"the checkpoint in {self.folder.path} does not say where its run stands") from None
+        self.iteration, self.elapsed_s = stands.iteration, stands.elapsed_s
+        self.stopped_seeds = stands.stopped_seeds
+        if self.step != stands.step or not set(self.stopped_seeds) <= set(range(len(self.config.seeds))):
+            raise UserError(f"the checkpoint in {self.folder.path} is of another run; train anew")
+        if stands.task_version != (version := self.learner.spec.version):
+            raise UserError(
+                f"{self.folder.path} was trained on {self.config.task} version {stands.task_version}, but this is "
+                f"version {version}; use the esp that it was begun with, or train anew"
+            )
 
     def _load(self, tensors: dict[str, Tensor]) -> None:
         """Load the state of the learner; refuse a checkpoint whose names, shapes or types are not the learner's."""
@@ -288,8 +286,3 @@ class Trainer:
                 fits = a.dtype == b.dtype and (a.shape == b.shape or name.startswith("replay."))
             if not fits:
                 raise UserError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")
-
-    def _policy_meta(self) -> dict[str, Any]:
-        """Describe the policy file so that it can be used without the run folder."""
-        returns = self.final_returns()["greedy"].tolist()
-        return describe_policy(self.config, self.learner.spec, self.step, returns)
