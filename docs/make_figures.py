@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from esp_cli.policies.curve_statistics import median_steps
+from esp_cli.policies.statistics import median_steps
 from esp_cli.reporting.figures import appearance, dots
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.study_figures import draw_over_setting

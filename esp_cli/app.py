@@ -22,7 +22,7 @@ from esp_cli.commands import COMMANDS
 from esp_cli.commands.help import arrange
 from esp_cli.defaults import __version__
 from esp_cli.files import failures
-from esp_cli.files.suggesting import did_you_mean
+from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, installed_tasks
-from esp_cli.files.suggesting import did_you_mean
+from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from esp_envs.errors import UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from esp_cli.policies.initial import Start
+    from esp_cli.policies.loading import Start
     from esp_cli.training.config import RunConfig
 
 _PARAMETERS = {"algorithm": "algo"}  # names of parameters that differ from those in a file
@@ -101,7 +101,7 @@ def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict
 
 def _start_of(path: Path, config: RunConfig, source: str) -> Start:
     """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same."""
-    from esp_cli.policies.initial import Start
+    from esp_cli.policies.loading import Start
 
     if path.is_dir() and (own := Start.find_copy(path, config)) is not None:
         return own

@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from esp_cli.files.failures import attempting, own_words
+from esp_cli.files.formatting import nearest
 from esp_cli.files.opening import read_regular
-from esp_cli.files.suggesting import nearest
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
 
@@ -151,7 +151,7 @@ def encode(value: object, path: str | os.PathLike[str], error: type[UserError] =
 
 
 def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
-    """Parse strict JSON that is an object; the caller bounds its length, and puts the name of the file before errors."""
+    """Parse strict JSON that is an object; the caller bounds it, and puts the name of a file before the error."""
     try:
         value = parse_value(text.decode("utf-8") if isinstance(text, bytes) else text)
     except ValueError as error:

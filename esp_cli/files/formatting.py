@@ -1,10 +1,11 @@
-"""How numbers are written for people, on the screen as on pages."""
+"""How numbers and names are written for people, on the screen as on pages."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from difflib import get_close_matches
 
 NOTHING = "-"
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
@@ -73,3 +74,23 @@ def format_duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def nearest(text: str, known: Iterable[str]) -> str | None:
+    """Return the known name that a mistyped or abbreviated name is likely to mean; None where none is near.
+
+    "learing_rate" and "lr" -> "learning_rate"; "clip" -> "clip_epsilon".
+    """
+    names = sorted(set(known))
+    close = get_close_matches(text, names, n=1)
+    if close or not text:
+        return close[0] if close else None
+    short = [name for name in names if text == "".join(word[0] for word in name.split("_") if word)]
+    part = [name for name in names if text in name.split("_")]
+    return next(iter(short + part), None)
+
+
+def did_you_mean(text: str, known: Iterable[str]) -> str:
+    """Return "; did you mean 'NAME'?", or nothing where no known name is near."""
+    name = nearest(text, known)
+    return f"; did you mean '{name}'?" if name else ""

@@ -50,8 +50,8 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
 def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) -> None:
     """Remove what a kill left behind the last line break, so that the next line does not run into it.
 
-    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one. A last line that is longer
-    than any line can be is a UserError.
+    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one. A last line longer than
+    any line can be is a UserError.
     """
     if not path.exists():
         return

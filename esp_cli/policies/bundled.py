@@ -78,7 +78,7 @@ def bundled_folder() -> Path:
 
 
 def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
-    """Return what the manifest in a folder, by default that of this installation, lists; nothing where there is none."""
+    """Return what the manifest in a folder lists, by default that of this installation; nothing where there is none."""
     file = (folder or bundled_folder()) / MANIFEST
     if not file.is_file():
         return ()

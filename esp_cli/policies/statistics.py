@@ -1,10 +1,11 @@
-"""Statistics over seeds: means with intervals, comparisons of two groups of seeds.
+"""Statistics over seeds: means with intervals, comparisons of two groups of seeds, learning curves.
 
 A sample is one finite number per seed [S], or a UserError; never one per episode: episodes of one seed share its policy
 and say nothing about how another seed would turn out (`spread_over_episodes` is for a policy without other seeds).
 Intervals are 95 % percentile bootstrap intervals over seeds with a fixed generator, so that the same numbers give the
 same interval; with few seeds they are a little too narrow (of ten seeds drawn from a normal distribution, 90 % of the
-intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or resamples that all agree.
+intervals hold its mean). They are None where the bootstrap cannot tell: one seed, or resamples that all agree. A curve
+has ascending steps [K], env steps per seed, and values [K, S], or a UserError.
 
 Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
 (interquartile mean, stratified bootstrap, probability of improvement).
@@ -12,7 +13,7 @@ Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statisti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -50,13 +51,10 @@ class SeedSummary:
 
 @dataclass(frozen=True)
 class EpisodeSpread:
-    """How far the mean return of one policy can be trusted by its episodes; other seeds are another question.
+    """How far the mean return of one policy can be trusted by its episodes; other seeds are another question."""
 
-    Both are None for one episode; there is no interval where all episodes are alike.
-    """
-
-    sem: float | None
-    ci95: Interval | None
+    sem: float | None  # None for one episode
+    ci95: Interval | None  # None for one episode, or where all are alike
 
 
 def summarise(values: ArrayLike) -> SeedSummary:
@@ -98,10 +96,7 @@ def interquartile_mean(values: ArrayLike) -> Estimate:
 
 
 def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"] = "iqm") -> Estimate:
-    """Return a statistic of all seeds of several tasks, whose scores normalise() makes comparable.
-
-    The bootstrap is stratified: seeds are redrawn within each task.
-    """
+    """Return a statistic of all seeds of tasks, which normalise() makes comparable; seeds are redrawn within a task."""
     if not scores:
         raise UserError("there is no task to aggregate over")
     samples = tuple(_sample(values, f"of {task}") for task, values in scores.items())
@@ -146,35 +141,104 @@ def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Est
 def leader(
     ours: tuple[float, float | None, int], others: tuple[float, float | None, int]
 ) -> Literal["first", "second", "neither"] | None:
-    """Return which of two published means is higher, by Welch's t-test at 5 %; None where an error is missing.
+    """Return which of two published (mean, s.e.m., number of seeds) is higher, by Welch's t-test at 5 %, if any.
 
-    Each is a mean, its standard error, and the number of seeds.
+    None where a standard error is missing.
     """
-    (mean, sem, count), (other_mean, other_sem, other_count) = ours, others
-    if sem is None or other_sem is None or min(count, other_count) < 2:
+    (mean, sem, count), (other, other_sem, other_count) = ours, others
+    if sem is None or other_sem is None or min(count, other_count) < 2 or sem == other_sem == 0:
         return None
     deviation, other_deviation = sem * np.sqrt(count), other_sem * np.sqrt(other_count)
-    if deviation == other_deviation == 0:
-        return None
     test = scipy.stats.ttest_ind_from_stats(
-        mean, deviation, count, other_mean, other_deviation, other_count, equal_var=False
+        mean, deviation, count, other, other_deviation, other_count, equal_var=False
     )
     if test.pvalue >= 1 - CONFIDENCE:
         return "neither"
-    return "first" if mean > other_mean else "second"
+    return "first" if mean > other else "second"
 
 
 def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
-    """Return (value - random) / (heuristic - random) of returns of any shape: 0 is the random policy, 1 the heuristic.
-
-    Raises:
-        UserError: the heuristic policy is not better than the random one, or an anchor is not finite.
-    """
+    """Return (value - random) / (heuristic - random) of returns of any shape: 0 is the random policy, 1 the heuristic."""
     if not np.isfinite([random, heuristic]).all() or random >= heuristic:
         raise UserError(
             f"the anchors random = {random} and heuristic = {heuristic} give no scale; the heuristic has to be better"
         )
     return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
+
+
+@dataclass(frozen=True)
+class Passing:
+    """Env steps per seed at which a learning curve first is at or above a threshold; None where it never is."""
+
+    threshold: float
+    of_mean: int | None  # by the mean over seeds
+    per_seed: tuple[int | None, ...]  # by each seed
+
+
+def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> Passing:
+    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
+
+    Higher is better. A value that is not finite, as of a seed that was stopped, reaches nothing.
+    """
+    at, curves = _curves(steps, values)
+    curves = np.where(np.isfinite(curves), curves, np.nan)
+
+    def first(reached: NDArray[np.bool_]) -> int | None:
+        return int(at[np.argmax(reached)]) if reached.any() else None
+
+    per_seed = tuple(first(curve >= threshold) for curve in curves.T)
+    return Passing(threshold, first(curves.mean(axis=1) >= threshold), per_seed)
+
+
+def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None]:
+    """Return the median over seeds of their first steps at a threshold, and its interval; infinite stands for never.
+
+    The interval lies between two order statistics and holds for any distribution: of ten seeds it goes from the second
+    to the ninth and holds the median with 97.9 %, at least 95 % being asked for. Fewer than six seeds have none.
+    """
+    ordered = sorted(np.inf if steps is None else float(steps) for steps in per_seed)
+    rank = int(scipy.stats.binom.ppf((1 - CONFIDENCE) / 2, len(ordered), 0.5))
+    return float(np.median(ordered)), (ordered[rank - 1], ordered[-rank]) if rank else None
+
+
+def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
+    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S], K > 1.
+
+    A value NaN gives that seed NaN.
+    """
+    at, curves = _curves(steps, values)
+    if at.size < 2:
+        raise UserError("the area under a curve needs two evaluations or more")
+    return np.asarray(scipy.integrate.trapezoid(curves, at, axis=0) / (at[-1] - at[0]), dtype=np.float64)
+
+
+def curve_band(values: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    """Return mean, lower and upper edge of a learning curve [K, S] over seeds, each [K].
+
+    The bootstrap redraws whole seeds: the same ones at every step. With one seed the edges are the curve; where a seed
+    is not finite all three are NaN, so that a stopped seed leaves a gap instead of a mean over the others.
+    """
+    curves = np.asarray(values, dtype=np.float64)
+    if curves.ndim != 2 or curves.shape[1] == 0:
+        raise UserError(f"learning curves are evaluations by seeds [K, S], not of shape {list(curves.shape)}")
+    whole = np.isfinite(curves).all(axis=1)
+    mean = np.full(len(curves), np.nan)
+    mean[whole] = curves[whole].mean(axis=1)
+    low, high = mean.copy(), mean.copy()
+    if curves.shape[1] > 1 and whole.any():
+        interval = bootstrap((curves[whole],), np.mean, 2000)
+        low[whole], high[whole] = interval.low, interval.high
+    return mean, low, high
+
+
+def _curves(steps: ArrayLike, values: ArrayLike) -> tuple[Floats, Floats]:
+    at, curves = np.asarray(steps, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    if at.ndim != 1 or curves.ndim != 2 or curves.shape[0] != at.size or curves.size == 0:
+        shapes = f"{list(at.shape)} and {list(curves.shape)}"
+        raise UserError(f"a learning curve is steps [K] and values [K, S], not {shapes}")
+    if not (np.diff(at) > 0).all():
+        raise UserError("the steps of a learning curve have to ascend")
+    return at, curves
 
 
 def _interval(samples: tuple[Floats, ...], statistic: Callable[..., Any]) -> Interval | None:

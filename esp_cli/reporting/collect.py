@@ -13,9 +13,8 @@ from pydantic import JsonValue
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
 from esp_cli.files.formatting import format_exactly
-from esp_cli.policies.curve_statistics import area_under_curve, steps_to_threshold
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.policies.statistics import summarise
+from esp_cli.policies.statistics import area_under_curve, steps_to_threshold, summarise
 from esp_cli.reporting.curves import RunCurve, curve_of
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.summary import returns_of, summarised

@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
-from esp_cli.policies.curve_statistics import curve_band
-from esp_cli.policies.statistics import Floats
+from esp_cli.policies.statistics import Floats, curve_band
 from esp_cli.reporting.figures import POINTS_PER_INCH, Picture, appearance, caption, written_figure
 from esp_envs.errors import UserError
 

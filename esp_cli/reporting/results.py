@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
-from esp_cli.policies.curve_statistics import Passing
-from esp_cli.policies.statistics import Estimate, SeedSummary
+from esp_cli.policies.statistics import Estimate, Passing, SeedSummary
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
 Numbers = tuple[float | None, ...]  # one number per seed; None where the seed stopped

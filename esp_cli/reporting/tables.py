@@ -11,8 +11,7 @@ from typing import TypeVar
 from pydantic import JsonValue
 
 from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.policies.curve_statistics import median_steps
-from esp_cli.policies.statistics import Estimate, SeedSummary, summarise
+from esp_cli.policies.statistics import Estimate, SeedSummary, median_steps, summarise
 from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results
 from esp_cli.reporting.summary import floats
 from esp_cli.studies.kinds import kind_of

@@ -27,10 +27,9 @@ from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import sentence
 from esp_cli.files.opening import is_held
 from esp_cli.studies.engine import Job, LocalEngine
-from esp_cli.training.build import spec_of
+from esp_cli.training.build import process_bytes, spec_of
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import LOCK
-from esp_cli.training.memory import process_bytes
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores

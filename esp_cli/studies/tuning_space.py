@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import JsonValue, field_validator, model_validator
 
 from esp_cli.files.documents import Strict, flat, read_table, validated
-from esp_cli.files.suggesting import did_you_mean
+from esp_cli.files.formatting import did_you_mean
 from esp_cli.prior.config import of_no_use_to
 from esp_envs.errors import UserError
 

@@ -60,7 +60,7 @@ class MetricsWriter:
         self.close()
 
     def write(self, step: int, values: Mapping[str, Value]) -> None:
-        """Append one row at a step: by name (``train/...``, ``eval/...``, ``time/...``) a number, or one per seed [S]."""
+        """Append one row at a step: by name ("train/...", "eval/...", "time/...") a number, or one per seed [S]."""
         row: dict[str, Any] = {"step": int(step)}
         for name, value in values.items():
             if name == "step":

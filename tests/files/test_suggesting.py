@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from esp_cli.files.suggesting import did_you_mean, nearest
+from esp_cli.files.formatting import did_you_mean, nearest
 
 NAMES = ("learning_rate", "clip_epsilon", "gamma", "num_envs")
 

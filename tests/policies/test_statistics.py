@@ -9,25 +9,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from esp_cli.policies.curve_statistics import (
-    Passing,
-    area_under_curve,
-    curve_band,
-    median_steps,
-    steps_to_threshold,
-)
 from esp_cli.policies.statistics import (
     MOST_RESAMPLED,
     EpisodeSpread,
     Estimate,
+    Passing,
     aggregate,
+    area_under_curve,
     bootstrap_interval,
+    curve_band,
     difference,
     interquartile_mean,
     mean_and_sem,
+    median_steps,
     normalise,
     probability_of_improvement,
     spread_over_episodes,
+    steps_to_threshold,
 )
 
 TEN = [-125.0, -121.0, -123.0, -119.0, -130.0, -122.0, -124.0, -118.0, -126.0, -120.0]

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from esp_cli.policies.curve_statistics import curve_band
+from esp_cli.policies.statistics import curve_band
 from esp_cli.reporting.figures import PALETTE, dots, over_setting
 from esp_cli.reporting.learning_curves import Curve, Panel, _draw_levels, learning_curves
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from esp_cli.policies.curve_statistics import Passing
-from esp_cli.policies.statistics import average_improvement, leader
+from esp_cli.policies.statistics import Passing, average_improvement, leader
 from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.results import read_results
 from esp_cli.reporting.summary import aggregates, summarise_cell, summarised

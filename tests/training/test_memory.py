@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.training import memory
+from esp_cli.training import build as memory
 from esp_cli.training.build import build_learner, spec_of
 from esp_cli.training.config import resolve_config
 
