@@ -36,7 +36,7 @@ from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import Metrics, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_cli.training.trackers import require
-from esp_cli.training.trainer import Listener, Progress, Trainer
+from esp_cli.training.trainer import Listener, Trainer
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.registry import register
@@ -94,34 +94,33 @@ class Run:
         return self.folder.policy_path.is_file()
 
     @contextmanager
-    def trainer(self, track: Sequence[str] = ()) -> Iterator[Trainer]:
+    def trainer(self, track: Sequence[str] = (), check: bool = True) -> Iterator[Trainer]:
         """Hold the folder against other processes, and yield what trains it from its newest checkpoint on.
 
         Args:
             track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
+            check: take a short look at a task that is not built in before a new run begins.
 
         Raises:
             UserError: another process trains it, or its device or a tracker is not there.
         """
         resolve_device(self.config.device)
         with self.folder.lock():
-            yield Trainer(self.config, self.folder, track)
+            yield Trainer(self.config, self.folder, track, check)
 
-    def train(self, listener: Listener | None = None, track: Sequence[str] = ()) -> bool:
-        """Train on from the newest checkpoint, bit for bit as without a break.
+    def train(self, listener: Listener | None = None, track: Sequence[str] = (), check: bool = True) -> bool:
+        """Train on from the newest checkpoint, bit for bit as without a break, and return whether the run is complete.
 
         Args:
             listener: told of progress after every update; False asks for a clean stop.
             track: as of `trainer`.
-
-        Returns:
-            Whether the run is complete.
+            check: as of `trainer`.
 
         Raises:
             UserError: another process trains it, or no seed has finite numbers any more.
         """
-        with self.trainer(track) as trainer:
-            return (trainer.is_complete and self.is_complete) or trainer.run(listener or _go_on)
+        with self.trainer(track, check) as trainer:
+            return (trainer.is_complete and self.is_complete) or trainer.run(listener or (lambda _: True))
 
     def evaluate(self, episodes: int = EPISODES, settings: Mapping[str, object] | None = None) -> FinalEvaluation:
         """Play episodes with the newest policies, and with the reference policies of the task.
@@ -253,7 +252,3 @@ def train(
     run = begin(config, weights, out)
     run.train(listener, track)
     return run
-
-
-def _go_on(_: Progress) -> bool:
-    return True

@@ -87,40 +87,27 @@ class LoadedPolicy:
         rng: np.random.Generator | None = None,
         action_mask: ArrayLike | None = None,
     ) -> tuple[Action, Floats]:
-        """Return what each agent does, and its next memory.
+        """Return what each agent does, and its next memory [..., H]; the arguments stay as they are.
 
-        Args:
-            obs: [..., D] as `spec.observation` lays it out.
-            memory: [..., H] of `initial_memory`, or of the step before.
-            rng: draws the actions; without it the policy is greedy.
-            action_mask: as of `act`.
-
-        Returns:
-            Actions as of `act`, and memory [..., H]; the arguments stay as they are.
-
-        Raises:
-            UserError: another shape, or numbers that are not finite.
+        `memory` [..., H] is that of `initial_memory`, or of the step before; all else is as of `act`.
         """
         rows = self._checked_obs(obs)
         carried = self._checked(memory, self.memory_width, "memory", "as policy.initial_memory gives it")
-        lead = rows.shape[:-1]
+        lead, policy, space, noise = rows.shape[:-1], self.trained.policy, self.spec.action, None
         if carried.shape[:-1] != lead:
             raise UserError(
                 f"the memory has shape {carried.shape}, but observations of shape {rows.shape} need "
                 f"{(*lead, self.memory_width)}: one row for each agent"
             )
         mask = self._checked_mask(action_mask, lead)
-        space = self.spec.action
         shape = (*lead, space.width) if isinstance(space, Continuous) else lead
         count = math.prod(lead)  # reshape cannot infer it where a width is 0
         if not count:
             return np.zeros(shape, np.float32 if isinstance(space, Continuous) else np.int64), carried
-        policy, noise = self.trained.policy, None
         if rng is not None:
             if not isinstance(rng, np.random.Generator):
                 raise UserError(f"rng is {rng!r}; give a generator, as numpy.random.default_rng makes it")
-            generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-            noise = policy.head.noise((1, count), [generator])
+            noise = policy.head.noise((1, count), [torch.Generator().manual_seed(int(rng.integers(2**63)))])
         inputs = torch.tensor(rows.reshape(1, 1, count, rows.shape[-1]))
         action, after = policy.act(inputs, torch.tensor(carried.reshape(1, count, self.memory_width)), noise, mask)
         return action.numpy().reshape(shape), after.numpy().reshape((*lead, self.memory_width))

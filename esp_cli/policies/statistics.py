@@ -158,7 +158,7 @@ def leader(
 
 
 def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
-    """Return (value - random) / (heuristic - random) of returns of any shape: 0 is the random policy, 1 the heuristic."""
+    """Return (value - random) / (heuristic - random), of any shape: 0 is the random policy, 1 the heuristic one."""
     if not np.isfinite([random, heuristic]).all() or random >= heuristic:
         raise UserError(
             f"the anchors random = {random} and heuristic = {heuristic} give no scale; the heuristic has to be better"

@@ -81,14 +81,14 @@ class Trainer:
         config: what to train.
         folder: where results go; held by the caller's lock. A checkpoint found there is continued.
         track: names of trackers that get the metrics too.
-        look: take a short look at a task that is not built in before the first step, and note what it found.
+        check: take a short look at a task that is not built in before the first step, and note what it found.
 
     Raises:
         UserError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
             installed.
     """
 
-    def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = (), look: bool = True) -> None:
+    def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = (), check: bool = True) -> None:
         self.config, self.folder, self.track = config, folder, tuple(track)
         require(self.track)
         self.learner = build_learner(config)
@@ -96,7 +96,7 @@ class Trainer:
         self.stopped_seeds: dict[int, int] = {}
         self.elapsed_s = 0.0
         self.notes: list[str] = []
-        self._restore(look)
+        self._restore(check)
         self._good = self._snapshot()
         self.evaluation_worlds = build_environment(config, config.evaluation.episodes, "evaluation")
 
@@ -238,7 +238,7 @@ class Trainer:
         self.folder.write_checkpoint(self.step, self.learner.state_dict(self.is_complete), meta, self.is_complete)
         return time.monotonic() - begun
 
-    def _restore(self, look: bool) -> None:
+    def _restore(self, check: bool) -> None:
         """Continue from the newest good checkpoint; without one, start from the beginning."""
         found = self.folder.latest_checkpoint(self.notes.append)
         if found is not None:
@@ -250,7 +250,7 @@ class Trainer:
             )
         elif self.config.init_from is not None:
             self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
-        if found is None and look:
+        if found is None and check:
             self.notes += first_look(self.config)
         truncate_metrics(self.folder.metrics_path, self.step if found else -1)
 
