@@ -223,6 +223,7 @@ def train(
     init_from: str | os.PathLike[str] | None = None,
     listener: Listener | None = None,
     track: Sequence[str] = (),
+    check: bool = True,
 ) -> Run:
     """Train S seeds at once, as `esp train` does, and return the run.
 
@@ -238,6 +239,7 @@ def train(
         init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
         listener: told of progress after every update; where it returns False the run stops, and `Run.train` goes on.
         track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
+        check: take a short look, of 2 s, at a task that is not built in; a note tells what it found.
 
     Raises:
         UserError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
@@ -250,5 +252,5 @@ def train(
     )
     require(track)
     run = begin(config, weights, out)
-    run.train(listener, track)
+    run.train(listener, track, check)
     return run

@@ -15,7 +15,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
     _SEARCHED: ("budget", "space", "goal", "reach", "trial_seeds"),
     _PRIOR: ("transforms", "consistency_coef"),
     _SETTINGS: ("settings", "config", "print_config", "init_from"),
-    _RUN: ("resume", "device", "jobs", "dry_run", "reuse", "engine", "address", "gpu_share"),
+    _RUN: ("resume", "device", "jobs", "dry_run", "reuse", "engine", "address", "gpu_share", "no_check"),
     _POLICY: ("episodes", "seed", "stochastic", "physics", "policy", "at", "mode", "threshold"),
     _PICTURE: ("view", "size", "speed", "fps", "y_limits", "reference", "plot", "films"),
     _OUTPUT: ("out", "force", "json", "csv", "results", "fill", "track", "formats", "name"),

@@ -220,6 +220,9 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
     ]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
 Device = Literal["auto", "cpu", "cuda"]
+NoCheckOption = Annotated[
+    bool, typer.Option("--no-check", help="Leave out the short look, of 2 s, at a task that is not built in.")
+]
 DeviceOption = Annotated[
     Device,
     typer.Option("--device", help="cpu, cuda, or auto: a GPU if there is one."),

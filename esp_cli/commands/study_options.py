@@ -18,6 +18,7 @@ from esp_cli.commands.options import (
     DeviceOption,
     EpisodesOption,
     JsonOption,
+    NoCheckOption,
     PresetOption,
     SeedListOption,
     SeedsOption,
@@ -152,6 +153,7 @@ class StudyChoices:
     gpu_share: GpuShareOption = 1.0
     dry_run: DryRunOption = False
     reuse: ReuseOption = None
+    no_check: NoCheckOption = False
     json: JsonOption = None
 
     @property
@@ -170,6 +172,7 @@ class StudyChoices:
         words += [] if self.engine == "local" else ["--engine", self.engine]
         words += ["--address", self.address] if self.address is not None else []
         words += ["--gpu-share", f"{self.gpu_share:g}"] if self.gpu_share != 1.0 else []
+        words += ["--no-check"] if self.no_check else []
         return "".join(f" {word}" for word in map(shlex.quote, words))
 
     def device_of_runs(self) -> str:

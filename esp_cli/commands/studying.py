@@ -42,6 +42,7 @@ class Resources:
     engine: Engine  # starts its runs
     jobs: int  # at once
     reused: Sequence[StudyFolder]  # studies whose finished runs are taken over
+    check: bool  # whether runs take a short look at a task that is not built in
 
 
 @contextmanager
@@ -57,7 +58,7 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
 
     reused = [StudyFolder.open(path) for path in choices.reuse or ()]
     with _open_engine(choices, out) as engine:
-        yield Resources(engine, choices.jobs or engine.places(device), reused)
+        yield Resources(engine, choices.jobs or engine.places(device), reused, not choices.no_check)
 
 
 @contextmanager
@@ -182,7 +183,7 @@ def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests:
     """
     from esp_cli.studies.scheduler import Scheduler
 
-    cells = folder.cells_of(study)
+    folder.check, cells = resources.check, folder.cells_of(study)
     for cell, twin in folder.adopt_finished(cells, resources.reused):
         console.note(f"taking over {twin} as {cell.name}")
     runs = folder.unlike(cells)

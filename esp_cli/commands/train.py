@@ -15,6 +15,7 @@ from esp_cli.commands.counts import chosen_seeds
 from esp_cli.commands.options import (
     AlgoOption,
     DeviceOption,
+    NoCheckOption,
     PhysicsOption,
     PresetOption,
     SeedListOption,
@@ -110,6 +111,7 @@ def train(
             metavar="TRACKER",
         ),
     ] = None,
+    no_check: NoCheckOption = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     named = parse_assignments(settings or [])
@@ -126,7 +128,7 @@ def train(
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
-        _train(runs.Run(resume), trackers)
+        _train(runs.Run(resume), trackers, not no_check)
         return
     require(trackers)
     short = {
@@ -151,7 +153,7 @@ def train(
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    _train(runs.begin(resolved, weights, out), trackers)
+    _train(runs.begin(resolved, weights, out), trackers, not no_check)
 
 
 def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> None:
@@ -159,7 +161,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", *allowed) and was_given(context, parameter.name)
+        if parameter.name not in ("resume", "track", "no_check", *allowed) and was_given(context, parameter.name)
     ]
     if given:
         raise UserError(
@@ -167,9 +169,9 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
         )
 
 
-def _train(run: Run, trackers: Sequence[str]) -> None:
+def _train(run: Run, trackers: Sequence[str], check: bool) -> None:
     """Train until the end or an interrupt, then print the result and the next command."""
-    with run.trainer(trackers) as trainer, stop_requests("stopping after this iteration") as requests:
+    with run.trainer(trackers, check) as trainer, stop_requests("stopping after this iteration") as requests:
         if trainer.is_complete and run.is_complete:
             console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
             return

@@ -164,6 +164,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
             StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
         search = Search.create(out, tuning)
+        search.check = resources.check
         failed = follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
         outcomes = [search.outcome(prior) for prior in tuning.priors]
         best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}

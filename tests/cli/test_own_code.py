@@ -125,8 +125,8 @@ def test_a_run_whose_task_raised_goes_on_from_its_checkpoint(folder, monkeypatch
     """The task raises after 130 steps of all worlds; then, put right, it is trained to the end."""
     for name in ("CHECKPOINT_SECONDS", "CHECKPOINT_SPACING"):
         monkeypatch.setattr(f"esp_cli.training.trainer.{name}", 0.0)
-    monkeypatch.setattr("esp_cli.training.trainer.first_look", lambda config: [])  # it takes steps, too
     options = ["--set", "mappo.num_envs=4", "--set", "evaluation.episodes=2", "--set", "evaluation.every_steps=100"]
+    options.append("--no-check")  # the look takes steps, too
     told = esp("train", "--task", "wrong:Raises", "--steps", 400, *options, "--out", "run", code=2).stderr
     assert "'lost'" in told.splitlines()[-1]
     kept = sorted(path.name for path in (folder / "run" / "checkpoints").glob("*.safetensors"))
@@ -134,6 +134,23 @@ def test_a_run_whose_task_raised_goes_on_from_its_checkpoint(folder, monkeypatch
     TASKS["wrong:Raises"].steps = -1000
     esp("train", "--resume", "run", "--task", "wrong:Raises")
     assert "after 400 steps" in esp("eval", "run", "--task", "wrong:Raises", "--episodes", 2).stdout
+
+
+def test_a_training_begins_with_a_line_on_what_a_look_at_the_task_found_unless_it_is_left_out(folder):
+    def looks(*words):
+        lines = esp("train", "--task", "rendezvous:Rendezvous", *words).stderr.splitlines()
+        return [line for line in lines if "esp check task" in line]
+
+    assert looks(*SHORT, "--out", "run") == [
+        "looked at rendezvous:Rendezvous: observations rewards and metrics fit the spec, the same seed gives the same "
+        "run; 'esp check task rendezvous:Rendezvous' looks longer"
+    ]
+    assert looks(*SHORT, "--out", "unseen", "--no-check") == []
+    (folder / "run" / "policy.safetensors").unlink()
+    assert looks("--resume", "run") == [], "it goes on from a checkpoint"
+    for file in [*(folder / "run" / "checkpoints").iterdir(), folder / "run" / "policy.safetensors"]:
+        file.unlink()
+    assert looks("--resume", "run", "--no-check") == []
 
 
 def test_what_esp_itself_does_wrong_is_no_fault_of_the_users_code(monkeypatch):

@@ -7,6 +7,8 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,13 +17,15 @@ from esp_cli import app, console
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
+from esp_cli.commands.studying import open_resources, run_cells
 from esp_cli.files.opening import acquire, release
-from esp_cli.studies.engine import LocalEngine
+from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
 from esp_cli.training.metrics import read_metrics
+from esp_envs.errors import UserError
 from esp_envs.installed import install
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
 from tests.forks import fork, said, wait
@@ -200,6 +204,30 @@ def test_the_command_that_goes_on_says_how_and_a_gpu_may_be_elsewhere() -> None:
     assert chosen.device_of_runs() == "cuda"
     chosen = StudyChoices(jobs=3, reuse=[Path("a b"), Path("c")])
     assert chosen.running_words() == " --jobs 3 --reuse 'a b' --reuse c"
+    assert StudyChoices(no_check=True).running_words() == " --no-check"
+
+
+class RefusingEngine:
+    """Starts nothing, and keeps what it was asked to start."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[str]] = []
+
+    def places(self, device: str) -> int:
+        return 1
+
+    def start(self, arguments: Sequence[str], log: Path) -> Job:
+        self.asked.append(list(arguments))
+        raise UserError("nothing is started here")
+
+
+@pytest.mark.parametrize("no_check", [False, True])
+def test_a_study_hands_on_whether_its_runs_look_at_the_task(tmp_path: Path, no_check: bool) -> None:
+    engine, study = RefusingEngine(), small_study()
+    with open_resources(StudyChoices(no_check=no_check), tmp_path, "cpu") as resources:
+        run_cells(StudyFolder.create(tmp_path / "s", study), study, replace(resources, engine=engine), [])
+    assert engine.asked
+    assert all(("--no-check" in words) == no_check for words in engine.asked if words[0] == "train")
 
 
 def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, finished: Path) -> None:
