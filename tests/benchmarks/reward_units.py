@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from concurrent.futures import ProcessPoolExecutor
+import statistics
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from fnmatch import fnmatch
 from itertools import product
 from multiprocessing import get_context
@@ -75,28 +76,32 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--cases", nargs="+", default=["*"], metavar="PATTERN", help="as 'mappo navigation' or 'qmix*'")
     parser.add_argument("--jobs", type=int, default=1, help="trainings side by side, each with one thread")
-    parser.add_argument("--json", type=Path, help="also write every seed's return to this file")
+    parser.add_argument("--json", type=Path, help="write every seed's return to this file, and go on from it")
     args = parser.parse_args()
     names = [f"{algorithm} {task}" for algorithm, task in product(ALGORITHMS, TASKS)]
     names = [name for name in names if any(fnmatch(name, pattern) for pattern in args.cases)]
     cells = [(algorithm, task, unit) for (algorithm, task), unit in product(map(str.split, names), UNITS)]
+    size = {"steps": args.steps, "seeds": args.seeds, "episodes": EPISODES}
+    document = json.loads(args.json.read_text()) if args.json and args.json.exists() else size | {"returns": {}}
+    if {name: document[name] for name in size} != size:
+        parser.error(f"{args.json} is of other steps or seeds")
+    returns: dict[str, list[float]] = document["returns"]
     with ProcessPoolExecutor(args.jobs, mp_context=get_context("spawn")) as pool:
-        runs = {cell: pool.submit(train, cell, args.steps, args.seeds) for cell in cells}
-        returns = {cell: run.result() for cell, run in runs.items()}
-    table, records = Table("learner and task", *UNITS), []
-    for algorithm, task in map(str.split, names):
-        row, own = [], returns[algorithm, task, "r"]
+        missing = {" ".join(cell): cell for cell in cells if " ".join(cell) not in returns}
+        runs = {pool.submit(train, cell, args.steps, args.seeds): name for name, cell in missing.items()}
+        for run in as_completed(runs):
+            returns[runs[run]] = run.result()
+            if args.json:
+                args.json.write_text(json.dumps(document, indent=2, sort_keys=True) + "\n")
+    table = Table("learner and task", *UNITS)
+    for name in names:
+        own, row = returns[f"{name} r"], []
         for unit in UNITS:
-            found = returns[algorithm, task, unit]
-            p = float(ttest_ind(found, own, equal_var=False).pvalue) if unit != "r" else 1.0
-            apart = p < 0.05 / (len(UNITS) - 1)
-            records.append({"algorithm": algorithm, "task": task, "reward": unit, "returns": found, "p": p})
-            row.append(f"{torch.tensor(found).mean():.2f}{' !' if apart else ''}")
-        table.add_row(f"{algorithm} {task}", *row)
+            found = returns[f"{name} {unit}"]
+            apart = unit != "r" and ttest_ind(found, own, equal_var=False).pvalue < 0.05 / (len(UNITS) - 1)
+            row.append(f"{statistics.fmean(found):.2f}{' !' if apart else ''}")
+        table.add_row(name, *row)
     Console(width=110).print(table, "! told apart from r")
-    if args.json:
-        document = {"steps": args.steps, "seeds": args.seeds, "episodes": EPISODES, "records": records}
-        args.json.write_text(json.dumps(document, indent=2) + "\n")
 
 
 if __name__ == "__main__":
