@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from esp_cli.bodies import Body
     from esp_cli.checking import Transitions
     from esp_cli.defaults import __version__
     from esp_cli.loop.symmetry import Symmetry
@@ -13,9 +14,22 @@ if TYPE_CHECKING:
     from esp_cli.training.trainer import Progress
     from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, discrete_moves, layout
 
-__all__ = ["Continuous", "Discrete", "Field", "Items", "Kind", "Layout", "LoadedPolicy", "Metrics", "Progress", "Run"]
+__all__ = [
+    "Body",
+    "Continuous",
+    "Discrete",
+    "Field",
+    "Items",
+    "Kind",
+    "Layout",
+    "LoadedPolicy",
+    "Metrics",
+    "Progress",
+    "Run",
+]
 __all__ += ["Symmetry", "Transitions", "__version__", "discrete_moves", "layout", "load_policy", "train"]
 _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
+    "Body": "esp_cli.bodies",
     "LoadedPolicy": "esp_cli.policies.loaded",
     "Metrics": "esp_cli.training.metrics",
     "Progress": "esp_cli.training.trainer",

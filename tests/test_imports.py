@@ -32,6 +32,7 @@ RANKS = {
     "policies": 5,
     "checking": 6,
     "loop": 6.5,
+    "bodies": 6.7,
     "drawing": 6,
     "studies": 6.5,
     "export": 7,
@@ -49,7 +50,7 @@ CONTRACT = ("esp_envs.spec.", "esp_envs.base.", "esp_envs.installed.", "esp_envs
 PRINTING = {"app", "commands", "console"}
 STUDIES = {"studies", "reporting"}
 ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING, "ray": STUDIES, "optuna": STUDIES}
-SIMULATORS = {"mujoco", "pymunk"}
+SIMULATORS = {"mujoco": ("esp_envs.epuck", "esp_cli.bodies"), "pymunk": ("esp_envs.epuck",)}
 CODE_IN_DATA = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "torch.load", "torch.save"}
 _TARGET = re.compile(r"(esp_(?:cli|envs)[\w.]*):\w+")
 
@@ -80,8 +81,8 @@ def forbidden(module: str, imported: str) -> str | None:
     part, top = rest.partition(".")[0], imported.partition(".")[0]
     if top in CODE_IN_DATA or imported in CODE_IN_DATA:
         return "loading a file must never run code"
-    if top in SIMULATORS and not module.startswith("esp_envs.epuck"):
-        return f"{top} belongs in esp_envs.epuck"
+    if not module.startswith(SIMULATORS.get(top, "")):
+        return f"{top} belongs in {' and '.join(SIMULATORS[top])}"
     if package == "esp_envs":
         kept_out = {"esp_cli": "esp_envs knows nothing of esp_cli", "typer": "esp_envs does not print"}
         return kept_out.get("typer" if top == "rich" else top)

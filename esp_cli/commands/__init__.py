@@ -20,6 +20,7 @@ COMMANDS: dict[str, str] = {
     "tune": "esp_cli.commands.tune:tune",
     "check": "esp_cli.commands.check:check",
     "discover": "esp_cli.commands.discover:discover",
+    "mirror": "esp_cli.commands.mirror:mirror",
     "tasks": "esp_cli.commands.tasks:tasks",
     "settings": "esp_cli.commands.settings:settings",
 }

@@ -1,0 +1,171 @@
+"""Mirrors derived from models: by hand on small robots, and every planted mistake is found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from esp_cli.bodies import Body
+from esp_cli.bodies.deriving import Frame, derive
+from esp_cli.bodies.proof import prove
+from esp_cli.symmetry.plane import PlaneElement
+from esp_envs.errors import UserError
+from tests.bodies.models import BIPED_JOINTS, QUADRUPED, biped, legged
+
+LEFT_RIGHT, FRONT_BACK = PlaneElement(mirrored=True), PlaneElement(Fraction(1, 2), mirrored=True)
+GYMNASIUM = Path(pytest.importorskip("gymnasium").__file__).parent / "envs" / "mujoco" / "assets"
+
+
+def body_of(text: str) -> Body:
+    return Body.from_mjcf(mujoco.MjModel.from_xml_string(text))
+
+
+def signed(body: Body, element: str) -> dict[str, str]:
+    return {name: ("-" if sign < 0 else "") + image for name, image, sign, *_ in body.rows(element)}
+
+
+def test_the_joints_of_a_biped_go_where_hand_work_says():
+    body = body_of(biped())
+    assert body.group == "flip-x"
+    assert signed(body, "flip-x") == BIPED_JOINTS
+    # actuators: the gears of the pitch motors differ in sign, and so do their joints: +1
+    ctrl = body.found["flip-x"].match.ctrl
+    assert ctrl.tolist() == [[-1, 0, 0, 0, 0], [0, 0, 1, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 1, 0]]
+
+
+def test_the_proof_of_a_biped_is_exact_and_would_have_seen_each_mistake():
+    proof = body_of(biped()).found["flip-x"].proof
+    assert proof.verdict == "exact"
+    assert proof.gap < 1e-12
+    assert proof.constraints < 1e-9
+    assert proof.contacts is not None
+    assert proof.contacts < 1e-5
+    assert proof.planted.min() > 0.3
+
+
+@pytest.mark.parametrize("joint", [j for j in BIPED_JOINTS if not j.startswith("right")])
+def test_one_wrong_sign_is_broken(joint):
+    frame = Frame(mujoco.MjModel.from_xml_string(biped()))
+    match = derive(frame, LEFT_RIGHT)
+    number = mujoco.mj_name2id(frame.model, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    row_q, row_v = frame.model.jnt_qposadr[number], frame.model.jnt_dofadr[number]
+    for part, row in (("qpos", row_q), ("qvel", row_v)):
+        matrix = getattr(match, part).copy()
+        matrix[row] *= -1
+        assert prove(frame, replace(match, **{part: matrix})).verdict == "broken"
+
+
+def test_a_wrong_pair_of_actuators_is_broken():
+    frame = Frame(mujoco.MjModel.from_xml_string(biped()))
+    match = derive(frame, LEFT_RIGHT)
+    assert prove(frame, match).verdict == "exact"
+    for wrong in (match.ctrl[[0, 3, 4, 1, 2]], match.ctrl * [1, -1, -1, 1, 1]):
+        assert prove(frame, replace(match, ctrl=wrong)).verdict == "broken"
+
+
+def test_an_asymmetric_joint_is_named_with_what_differs():
+    text = biped().replace('name="right_knee" axis="0 1 0" range="0 120" damping="0.1"',
+                           'name="right_knee" axis="0 1 0" range="0 120" damping="0.11"')  # fmt: skip
+    body = body_of(text)
+    rows = {name: difference for name, *_, difference in body.rows("flip-x")}
+    assert rows["right_knee"].what == rows["left_knee"].what == "damping"
+    assert rows["right_knee"].share == pytest.approx(1 / 11)
+    assert rows["left_yaw"].what == ""
+    assert body.found["flip-x"].proof.verdict == "nearly"
+
+
+def test_a_robot_with_one_leg_moved_has_no_mirror():
+    body = body_of(biped(right_y=-0.2))
+    assert (body.group, body.found) == ("c1", {})
+
+
+def test_a_heavy_backpack_on_one_side_is_refused_with_its_gap():
+    body = body_of(biped(extra='<geom type="box" size="0.05 0.05 0.05" pos="0 0.2 0.2"/>'))
+    assert body.group == "c1"
+    assert "accelerations of" in body.refused["flip-x"]
+
+
+def test_a_quadruped_has_both_mirrors_and_their_product():
+    body = body_of(QUADRUPED)
+    assert body.group == "d2"
+    assert signed(body, "flip-x")["hip0"] == "-hip1"
+    assert signed(body, "flip-x")["knee0"] == "knee1"
+    assert signed(body, "flip-y")["hip0"] == "-hip2"
+    # knees turn about the legs' own left, which a mirror sends to their own right, and reverses
+    assert signed(body, "flip-y")["knee0"] == "knee2"
+    assert signed(body, "rot180")["hip0"] == "hip3"
+
+
+@pytest.mark.parametrize("count", [3, 5, 6])
+def test_legs_around_a_trunk_turn_by_their_angle(count):
+    places = [(0.2 * math.cos(a), 0.2 * math.sin(a), math.degrees(a)) for a in np.arange(count) * 2 * math.pi / count]
+    body = body_of(legged(places))
+    assert body.group == f"d{count}"
+    assert signed(body, f"rot{Fraction(360, count)}")["knee1"] == "knee2"
+
+
+def test_gymnasiums_ant_turns_by_quarters():
+    body = Body.from_mjcf(GYMNASIUM / "ant.xml")
+    assert body.group == "d4"
+    # the front ankles turn about (-1, 1, 0) and (1, 1, 0)
+    assert signed(body, "rot90")["ankle_1"] == "-ankle_2"
+    assert signed(body, "flip-x")["hip_1"] == "-hip_4"
+    assert all(found.proof.verdict == "exact" for found in body.found.values())
+
+
+def test_gymnasiums_humanoid_is_a_little_asymmetric_and_says_where():
+    body = Body.from_mjcf(GYMNASIUM / "humanoid.xml")
+    found = body.found["flip-x"]
+    assert found.proof.verdict == "nearly"
+    assert 0.01 < found.proof.gap < 0.05
+    rows = {name: difference.what for name, *_, difference in body.rows("flip-x")}
+    assert (rows["right_hip_y"], rows["right_knee"], rows["right_elbow"]) == ("armature", "stiffness", "")
+
+
+def test_planar_robots_exchange_legs_that_lie_on_one_line():
+    body = Body.from_mjcf(GYMNASIUM / "walker2d.xml")
+    assert body.group == "flip-x"
+    assert signed(body, "flip-x")["thigh_joint"] == "thigh_left_joint"
+    assert Body.from_mjcf(GYMNASIUM / "half_cheetah.xml").group == "c1"
+    assert signed(Body.from_mjcf(GYMNASIUM / "swimmer.xml"), "flip-x")["motor1_rot"] == "-motor1_rot"
+
+
+def test_a_ball_joint_a_closed_loop_and_tendons_are_right():
+    arms = """
+    <body name="{0}" pos="0 {1} 0.3"><joint name="{0}_ball" type="ball" range="0 60"/>
+      <geom type="capsule" fromto="0 0 0 0.1 {2} 0" size="0.02"/><site name="{0}_end" pos="0.1 {2} 0"/>
+      <body pos="0.1 {2} 0"><joint name="{0}_elbow" axis="0 0 1"/><geom size="0.03" pos="0 {2} 0"/></body></body>"""
+    text = biped(extra=arms.format("left_arm", 0.2, 0.1) + arms.format("right_arm", -0.2, -0.1)).replace(
+        "</mujoco>",
+        '<tendon><fixed name="t_l"><joint joint="left_arm_elbow" coef="2"/></fixed>'
+        '<fixed name="t_r"><joint joint="right_arm_elbow" coef="2"/></fixed></tendon>'
+        '<equality><connect body1="left_arm" body2="right_arm" anchor="0.1 -0.2 0"/></equality>'
+        '<actuator><motor tendon="t_l"/><motor tendon="t_r"/></actuator></mujoco>',
+    )
+    body = body_of(text)
+    found = body.found["flip-x"]
+    assert found.proof.verdict == "exact"
+    assert [row[1:3] for row in body.rows("flip-x") if row[0] == "left_arm_ball"] == [("right_arm_ball", 0)]
+    # tendons of both elbows turn them about z, which the mirror reverses
+    assert found.match.ctrl[5:, 5:].tolist() == [[0, -1], [-1, 0]]
+    # a quaternion's axis (x, y, z) goes to (-x, y, -z)
+    assert body.positions(["left_arm_ball", "right_arm_ball"]).kind.matrix(LEFT_RIGHT.matrix)[4:, :4].tolist() == [
+        [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]]  # fmt: skip
+
+
+def test_a_site_that_pushes_is_refused_where_no_image_pushes():
+    text = biped(extra='<site name="jet" pos="0.1 0.2 0"/>').replace(
+        "</actuator>", '<motor name="thruster" site="jet" gear="0 0 1 0 0 0"/></actuator>'
+    )
+    assert body_of(text).refused["flip-x"] == "no image was found of the actuators thruster"
+
+
+def test_models_without_a_joint_are_refused():
+    with pytest.raises(UserError, match="no joint"):
+        body_of("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")

@@ -1,0 +1,119 @@
+"""Model files of strangers: nothing outside their folder is read, and what is wrong ends in one sentence."""
+
+from __future__ import annotations
+
+import pytest
+
+from esp_cli.bodies import Body, read_model
+from esp_envs.errors import UserError
+from tests.bodies.models import biped
+from tests.cli.running import esp, refused
+
+BOX = '<mujoco><worldbody><body><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+LINK = (
+    '<link name="{0}"><inertial><origin xyz="0 0 -.1"/><mass value="1"/>'
+    '<inertia ixx=".1" iyy=".2" izz=".3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+JOINT = (
+    '<joint name="{0}_joint" type="revolute"><parent link="base"/><child link="{0}"/><origin xyz="0 {1} 0"/>'
+    '<axis xyz="{2}"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{3}</joint>'
+)
+URDF = (
+    '<robot name="two">' + "".join(map(LINK.format, ("base", "left", "right")))
+    + JOINT.format("left", 0.1, "1 0 0", "") + JOINT.format("right", -0.1, "1 0 0", "{}") + "</robot>"
+)  # fmt: skip
+
+
+def sentence(path, **choice) -> str:
+    with pytest.raises(UserError) as error:
+        read_model(path, **choice)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('<!DOCTYPE m [<!ENTITY a "b"><!ENTITY c "&a;&a;&a;">]><mujoco>&c;</mujoco>', "document type"),
+        ("<mujoco>", "not an XML file"),
+        ("\0\1", "not an XML file"),
+        ("<a/>", "neither MJCF nor URDF"),
+        ("<mujoco/>", "no joint"),
+        ("<b>" * 200 + "</b>" * 200, "neither"),
+        ("<mujoco>" + "<b>" * 200 + "</b>" * 200 + "</mujoco>", "too deep"),
+        ('<mujoco><replicate count="999"><replicate count="999"><geom/></replicate></replicate></mujoco>', "more than"),
+        ('<mujoco><asset><hfield name="h" nrow="70000" ncol="70000" size="1 1 1 1"/></asset></mujoco>', "nrow"),
+        ('<mujoco><size memory="100G"/></mujoco>', "memory"),
+        ('<mujoco><include file="../secret.xml"/></mujoco>', "outside"),
+        ('<mujoco><asset><mesh file="../secret.xml"/></asset></mujoco>', "outside"),
+        ('<mujoco><compiler meshdir=".."/><asset><mesh file="secret.xml"/></asset></mujoco>', "outside"),
+        ('<mujoco><asset><mesh file="link.xml"/></asset></mujoco>', "outside"),
+        ('<mujoco><include file="inner/more.xml"/></mujoco>', "outside"),
+        ('<mujoco><asset><mesh file="missing.stl"/></asset></mujoco>', "cannot read"),
+        ('<mujoco><worldbody><body><joint/></body></worldbody></mujoco>', "mass and inertia"),
+        ('<mujoco><worldbody><body name="&#10;\'*/"><joint type="a&#10;b"/></body></worldbody></mujoco>', "keyword"),
+    ],
+)  # fmt: skip
+def test_bad_files_end_in_one_sentence(tmp_path, text, words):
+    folder = tmp_path / "robot"
+    (folder / "inner").mkdir(parents=True)
+    (tmp_path / "secret.xml").write_text(BOX)
+    (folder / "link.xml").symlink_to(tmp_path / "secret.xml")
+    (folder / "inner" / "more.xml").write_text('<mujocoinclude><include file="../../secret.xml"/></mujocoinclude>')
+    path = folder / "robot.xml"
+    path.write_text(text)
+    assert words in sentence(path)
+
+
+def test_files_within_the_named_root_are_read(tmp_path):
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "shared.xml").write_text(BOX)
+    path = tmp_path / "robot" / "robot.xml"
+    path.write_text('<mujoco><include file="../shared.xml"/></mujoco>')
+    assert "--root" in sentence(path)
+    assert read_model(path, root=tmp_path).njnt == 1
+
+
+def test_missing_and_huge_files_are_refused(tmp_path):
+    assert "no model file" in sentence(tmp_path / "none.xml")
+    (tmp_path / "huge.xml").write_bytes(b"<mujoco>" + b" " * (17 * 2**20) + b"</mujoco>")
+    assert "MiB" in sentence(tmp_path / "huge.xml")
+
+
+def test_a_urdf_moves_freely_and_keeps_its_mimic_joint(tmp_path):
+    path = tmp_path / "two.urdf"
+    path.write_text(URDF.format('<mimic joint="left_joint" multiplier="-1"/>'))
+    body = Body.from_urdf(path)
+    assert body.group == "d2"
+    assert body.rows("flip-x")[0][:3] == ("left_joint", "right_joint", -1)
+    assert body.found["flip-x"].proof.verdict == "exact"
+    path.write_text(URDF.format('<mimic joint="left_joint"/>'))  # both swing to one side, as they do in the mirror
+    assert Body.from_urdf(path).found["flip-x"].proof.verdict == "exact"
+    path.write_text(URDF.format('<mimic joint="left_joint" multiplier="2"/>'))
+    assert Body.from_urdf(path).found["flip-x"].proof.constraints > 0.1
+
+
+def test_a_urdf_without_inertia_is_refused(tmp_path):
+    path = tmp_path / "none.urdf"
+    path.write_text('<robot name="r"><link name="a"/><link name="b"/>' + JOINT.format("b", 1, "1 0 0", "")
+                    .replace('parent link="base"', 'parent link="a"') + "</robot>")  # fmt: skip
+    assert "mass and inertia" in sentence(path)
+
+
+def test_odd_names_are_quoted_in_tables_and_messages(tmp_path):
+    path = tmp_path / "odd.xml"
+    path.write_text(biped().replace("left_knee", "left&#10;&quot;'*/knee"))
+    result = esp("mirror", path)
+    assert "-waist" in result.stdout
+    assert "left\n" not in result.stdout
+
+
+def test_the_command_answers_first_and_says_why_not(tmp_path):
+    path = tmp_path / "biped.xml"
+    path.write_text(biped())
+    lines = esp("mirror", path, "--json", tmp_path / "mirror.json").stdout.splitlines()
+    assert lines[0] == "biped.xml is symmetric under flip-x, exactly; 9 joints"
+    assert "left_roll" in "".join(lines)
+    path.write_text(biped(right_y=-0.2))
+    assert "no mirror or turn" in esp("mirror", path, code=1).stdout
+    assert "no model file" in refused("mirror", tmp_path / "none.xml")
