@@ -167,7 +167,7 @@ def test_without_graphics_the_view_is_from_above_and_a_note_says_why(
     with Image.open(tmp_path / "film.gif") as film:
         assert film.size == (64, 64)
     sentence = refused("render", robots, "-o", tmp_path / "space.gif", "--view", "3d")
-    assert sentence.startswith("nothing here can draw a view in space (OSMesa: not installed; EGL: not installed)")
+    assert sentence.startswith("nothing here can draw a view in space (osmesa: not installed; egl: not installed)")
     assert not (tmp_path / "space.gif").exists()
 
 

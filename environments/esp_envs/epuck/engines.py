@@ -9,9 +9,9 @@ from esp_envs.errors import UserError
 from esp_envs.installed import load
 
 ENGINES = {
-    "mujoco": "esp_envs.epuck.mujoco_planar:MujocoPlanar",
-    "mujoco-3d": "esp_envs.epuck.mujoco_spatial:MujocoSpatial",
-    "pymunk": "esp_envs.epuck.pymunk_planar:PymunkPlanar",
+    "mujoco": "esp_envs.epuck.mujoco_engines:MujocoPlanar",
+    "mujoco-3d": "esp_envs.epuck.mujoco_engines:MujocoSpatial",
+    "pymunk": "esp_envs.epuck.pymunk_engine:PymunkPlanar",
 }
 
 

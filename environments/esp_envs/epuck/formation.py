@@ -12,14 +12,12 @@ import torch
 from torch import Tensor
 
 from esp_envs.batched import BatchedTask, Outcome, World
-from esp_envs.epuck import steering
+from esp_envs.epuck import formation_rules as rules
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
 from esp_envs.epuck.gl import open_painter
-from esp_envs.epuck.measures import CONTACT_GAP_M, step_metrics, step_reward
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
-from esp_envs.epuck.sight import FADING_M, formation_scene, in_sector, length, nearest, nearness, within
 from esp_envs.scene import Painter, Scene
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import TaskSpec
@@ -83,7 +81,7 @@ class Formation(BatchedTask):
     Settings: ClassVar[type[TaskSettings]] = FormationSettings
     heuristics = ("avoid", "straight")
     makes_new_tensors = True
-    robot: ClassVar[Mapping[str, float]] = {**DIMENSIONS, "fading_m": FADING_M}
+    robot: ClassVar[Mapping[str, float]] = {**DIMENSIONS, "fading_m": rules.FADING_M}
     settings: FormationSettings
 
     def __init__(self, settings: FormationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -105,7 +103,7 @@ class Formation(BatchedTask):
         self._own = np.eye(settings.num_agents, bodies, dtype=bool)
         radii = [BODY_RADIUS_M] * settings.num_agents + [settings.obstacle_radius_m] * settings.num_obstacles
         self._reach = np.array(radii) + BODY_RADIUS_M
-        self._contact = self._reach + CONTACT_GAP_M
+        self._contact = self._reach + rules.CONTACT_GAP_M
         pose = np.concatenate([self._posts, np.zeros((*robots, 1))], -1)
         self._place(pose, np.zeros_like(pose))
 
@@ -150,9 +148,9 @@ class Formation(BatchedTask):
         before, distance_before = self._position, self._distance
         self.physics.advance(self._wheel_speeds(action))
         self._look()
-        reward = step_reward(self.settings, distance_before - self._distance, self._apart)
+        reward = rules.step_reward(self.settings, distance_before - self._distance, self._apart)
         ended = self._time + 1 == self.spec.horizon
-        metrics = self._measure(length(self._position - before), ended)
+        metrics = self._measure(rules.length(self._position - before), ended)
         values = torch.from_numpy(np.array([*metrics.values()], np.float32))
         values = values.view(-1, self.num_seeds, self.num_envs).to(self.device)
         return self._per_world(reward), dict(zip(metrics, values, strict=True))
@@ -177,30 +175,38 @@ class Formation(BatchedTask):
         self._position, self._heading = pose[..., :2], pose[..., 2]
         self._direction = _direction(self._heading)
         self._to_goal = self._goals - self._position
-        self._distance = length(self._to_goal)
+        self._distance = rules.length(self._to_goal)
         self._ways = np.concatenate([self._position, self._pillars], 1)[:, None] - self._position[:, :, None]
-        self._apart = length(self._ways)
+        self._apart = rules.length(self._ways)
         self._apart[:, self._own] = np.inf
 
     def _measure(self, way: Array, ended: bool) -> dict[str, Array]:
         """Return the metrics of the step just made, each [W]; `way` [W, N] is what every robot drove in it, m."""
-        here = self._distance < self.settings.arrival_radius_m
+        robots, here = self.settings.num_agents, self._distance < self.settings.arrival_radius_m
         new, self._arrived = here & ~self._arrived, here | self._arrived
         touching = self._apart < self._contact
         begun, self._touching = touching & ~self._touching, touching
-        final_distance = self._distance * ended
-        return step_metrics(self.settings, new, self._arrived, begun, self._apart, way, final_distance)
+        risky = self._apart[..., :robots] < rules.RISKY_GAP_M + 2 * BODY_RADIUS_M
+        return {
+            "arrival_rate": new.mean(-1),
+            "time_to_arrival_s": (~self._arrived).mean(-1) * self.settings.control_period_s,
+            "collisions": begun[..., :robots].sum((1, 2)) / 2 + begun[..., robots:].sum((1, 2)),
+            "risky_rate": risky.any((1, 2)),
+            "path_length_m": way.mean(-1),
+            "final_distance_m": (self._distance * ended).mean(-1),
+        }
 
     def _observe(self, world: World) -> Tensor:
         robots, pillars = self.settings.num_agents, self.settings.num_obstacles
         offsets = [self._to_goal[:, :, None]]
         if pillars:
-            offsets.append(nearest(self._apart[..., robots:], self._ways[:, :, robots:], 1))
+            offsets.append(rules.nearest(self._apart[..., robots:], self._ways[:, :, robots:], 1))
         if self.settings.seen_robots:
-            offsets.append(nearest(self._apart[..., :robots], self._ways[:, :, :robots], self.settings.seen_robots))
+            apart, ways = self._apart[..., :robots], self._ways[:, :, :robots]
+            offsets.append(rules.nearest(apart, ways, self.settings.seen_robots))
         seen, heading = np.concatenate(offsets, 2), self._heading
         blind = self.settings.blind_sector_rad
-        hidden = in_sector(seen[:, :, 1:], blind) if blind else None
+        hidden = rules.in_sector(seen[:, :, 1:], blind) if blind else None
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(seen)
         if hidden is not None:
@@ -210,10 +216,10 @@ class Formation(BatchedTask):
         direction = self._direction if heading is self._heading else _direction(heading)
         goal, pillar, others = np.split(seen, [1, 1 + min(pillars, 1)], 2)
         if self.settings.goal_sight_m is not None:
-            goal = within(goal, self.settings.goal_sight_m)
+            goal = rules.within(goal, self.settings.goal_sight_m)
         if self.settings.seen_as == "nearness":
-            pillar = nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
-            others = nearness(others, 2 * BODY_RADIUS_M)
+            pillar = rules.nearness(pillar, self.settings.obstacle_radius_m + BODY_RADIUS_M)
+            others = rules.nearness(others, 2 * BODY_RADIUS_M)
         obs = np.concatenate([direction[:, :, None], pillar, goal, others], 2)
         return self._per_world(obs)
 
@@ -270,8 +276,8 @@ class Formation(BatchedTask):
         name = self.named_heuristic(name)
         wish = self._to_goal
         if name == "avoid":
-            wish = steering.give_way(wish, self._ways, self._apart - self._reach)
-        wheels = steering.towards(wish, self._heading, self.settings.control_period_s)
+            wish = rules.give_way(wish, self._ways, self._apart - self._reach)
+        wheels = rules.towards(wish, self._heading, self.settings.control_period_s)
         lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
         if self.settings.actions == "discrete":
             return nearest_pair(torch.from_numpy(wheels)).view(lead).to(self.device)
@@ -280,7 +286,8 @@ class Formation(BatchedTask):
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         """Return goals, pillars and robots of one world (seed index, world index)."""
         w = world[0] * self.num_envs + world[1]
-        return formation_scene(self.settings, self._goals[w], self._pillars[w], self._position[w], self._heading[w])
+        places = (self._goals[w], self._pillars[w], self._position[w], self._heading[w])
+        return rules.formation_scene(self.settings, *places)
 
     def painter(self, size: int) -> AbstractContextManager[Painter]:
         """Open the view in space, with pictures `size` pixels wide."""

@@ -17,14 +17,13 @@ from esp_envs.errors import UserError
 from esp_envs.scene import Painter
 
 _LIBRARIES = {
-    "osmesa": ("OSMesa", ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")),
-    "egl": ("EGL", ("libEGL.so.1", "libEGL.so")),
+    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
+    "egl": ("libEGL.so.1", "libEGL.so"),
 }
-"""MuJoCo's name of each library, preferred first: OSMesa draws on any processor, EGL asks for a working driver."""
+"""Files of each library that MuJoCo names, preferred first: OSMesa draws anywhere, EGL asks for a working driver."""
 _OF_SYSTEM = {"linux": ("osmesa", "egl", "glx"), "win32": ("wgl",), "darwin": ("cgl",)}
 _ANYWHERE = ("glfw", "enable", "enabled", "on", "true", "1", "disable", "disabled", "off", "false", "0")
 """What else MuJoCo takes as MUJOCO_GL."""
-_VARIABLE = "MUJOCO_GL"
 _MISSING = "not installed"
 _ADVICE = "to draw in software, install OSMesa: apt-get install libosmesa6 (Fedora: dnf install mesa-libOSMesa)"
 
@@ -35,7 +34,7 @@ class NoGraphicsError(UserError):
 
 def is_installed(backend: str) -> bool:
     """Say whether the library of "osmesa" or "egl" can be loaded; MuJoCo's own message does not name the library."""
-    for name in _LIBRARIES[backend][1]:
+    for name in _LIBRARIES[backend]:
         with suppress(OSError):
             ctypes.CDLL(name)
             return True
@@ -51,12 +50,12 @@ def forget_missing_backend() -> None:
     Raises:
         UserError: it names what MuJoCo refuses on this system.
     """
-    named = os.environ.get(_VARIABLE, "").strip().lower()
+    named = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = _OF_SYSTEM.get(sys.platform, ())
     if named in _LIBRARIES and not is_installed(named):
-        del os.environ[_VARIABLE]
+        del os.environ["MUJOCO_GL"]
     elif named and named not in (*known, *_ANYWHERE):
-        raise UserError(f"{_VARIABLE} is {named!r}; set it to {', '.join(known)}, glfw or disable, or unset it")
+        raise UserError(f"MUJOCO_GL is {named!r}; set it to {', '.join(known)}, glfw or disable, or unset it")
 
 
 @contextmanager
@@ -72,33 +71,29 @@ def open_painter(size: int) -> Iterator[Painter]:
         from esp_envs.epuck.view import SpacePainter  # noqa: PLC0415
     except ImportError as error:
         raise NoGraphicsError(f"a view in space needs the package {error.name}; pip install {error.name}") from None
-    painter = SpacePainter(size, _first_that_draws())
+    painter = SpacePainter(size)
+    _choose_library()
     try:
         yield painter
     finally:
         painter.close()
 
 
-def _first_that_draws() -> str | None:
-    """Let `mujoco.Renderer` draw with the first library that can; return a note where a better one cannot.
-
-    Raises:
-        NoGraphicsError: nothing here can draw.
-    """
-    wished = os.environ.get(_VARIABLE, os.environ.get("PYOPENGL_PLATFORM", "")).strip().lower()
-    reasons: dict[str, str] = {}
+def _choose_library() -> None:
+    """Let `mujoco.Renderer` draw with the first library that can."""
+    wished = os.environ.get("MUJOCO_GL", os.environ.get("PYOPENGL_PLATFORM", "")).strip().lower()
+    reasons: list[str] = []
     for backend in sorted(_LIBRARIES, key=lambda name: name != wished):
-        label = _LIBRARIES[backend][0]
-        if not is_installed(backend):
-            reasons[label] = _MISSING
-            continue
-        try:
-            _draw_with(backend)
-        except Exception as error:  # drivers fail in ways of their own
-            reasons[label] = " ".join(f"{error}".split()) or type(error).__name__
-            continue
-        return f"{label} draws{_told(reasons)}" if reasons else None
-    raise NoGraphicsError(f"nothing here can draw a view in space{_told(reasons)}")
+        reason = _MISSING
+        if is_installed(backend):
+            try:
+                _draw_with(backend)
+                return
+            except Exception as error:  # drivers fail in ways of their own
+                reason = " ".join(f"{error}".split()) or type(error).__name__
+        reasons.append(f"{backend}: {reason}")
+    advice = f"; {_ADVICE}" if any(reason.endswith(_MISSING) for reason in reasons) else ""
+    raise NoGraphicsError(f"nothing here can draw a view in space ({'; '.join(reasons)}){advice}")
 
 
 def _draw_with(backend: str) -> None:
@@ -107,9 +102,3 @@ def _draw_with(backend: str) -> None:
     chosen = import_module(mujoco.Renderer.__module__).gl_context  # by default what MUJOCO_GL named at the import
     chosen.GLContext = import_module(f"mujoco.{backend}").GLContext
     mujoco.Renderer(mujoco.MjSpec().compile(), 16, 16).close()
-
-
-def _told(reasons: dict[str, str]) -> str:
-    """Return why libraries cannot draw, and what to do where that is known."""
-    listed = "; ".join(f"{label}: {reason}" for label, reason in reasons.items())
-    return f" ({listed})" + (f"; {_ADVICE}" if _MISSING in reasons.values() else "")

@@ -12,6 +12,8 @@ from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.robot import Array
 from esp_envs.errors import UserError
 
+TIMESTEP_S = 0.01
+
 
 @dataclass(frozen=True)
 class Bodies:
@@ -39,6 +41,9 @@ class Physics(ABC):
         num_worlds: W.
         control_period_s: simulated time of one `advance`.
         num_threads: threads to step with, where the engine can.
+
+    Raises:
+        UserError: the period is not a multiple of the time step.
     """
 
     remembered: ClassVar[tuple[str, ...]]
@@ -46,6 +51,11 @@ class Physics(ABC):
 
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
         self.arena, self.num_worlds, self.control_period_s = arena, num_worlds, control_period_s
+        self._substeps = round(control_period_s / TIMESTEP_S)
+        if self._substeps < 1 or not np.isclose(self._substeps * TIMESTEP_S, control_period_s, rtol=1e-9):
+            raise UserError(
+                f"a control period of {control_period_s:g} s is not a multiple of {TIMESTEP_S:g} s; choose a multiple"
+            )
 
     @abstractmethod
     def place(self, bodies: Bodies) -> None:
@@ -76,17 +86,3 @@ class Physics(ABC):
     @abstractmethod
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
         """Restore what `state_dict` of an engine of the same size returned."""
-
-
-def num_substeps(control_period_s: float, timestep_s: float) -> int:
-    """Return how many time steps make up a control period.
-
-    Raises:
-        UserError: the period is not a multiple of the time step.
-    """
-    count = round(control_period_s / timestep_s)
-    if count < 1 or not np.isclose(count * timestep_s, control_period_s, rtol=1e-9):
-        raise UserError(
-            f"a control period of {control_period_s:g} s is not a multiple of {timestep_s:g} s; choose a multiple"
-        )
-    return count

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from esp_envs import make
-from esp_envs.epuck import formation_spec, sight, steering
+from esp_envs.epuck import formation_rules as rules
+from esp_envs.epuck import formation_spec
 from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.formation import Formation
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S
@@ -121,7 +122,7 @@ def test_observation_by_hand() -> None:
 
 def test_nearness_by_hand() -> None:
     # touching bodies have length 1; a gap of 0.2 m has 1/e; the direction stays
-    seen = sight.nearness(np.array([[0.074, 0.0], [0.0, -0.274]]), 2 * BODY_RADIUS_M)
+    seen = rules.nearness(np.array([[0.074, 0.0], [0.0, -0.274]]), 2 * BODY_RADIUS_M)
     np.testing.assert_allclose(seen, [[1.0, 0.0], [0.0, -math.exp(-1)]], atol=1e-9)
     env = world([(0.0, 0.0), (0.0, 0.274)], [(0.9, 0.0)] * 2, sight="nearness")
     obs = env.step(torch.zeros(1, 1, 2, 2)).next.obs[0, 0, 0]
@@ -327,17 +328,17 @@ def test_steering_by_hand() -> None:
     turn = MAX_SPIN_RAD_S * PERIOD_S
     heading = np.zeros((1, 4))
     angles = np.array([[0.0, turn / 2, -turn / 2, 3.0]])
-    driven = steering.towards(np.stack([np.cos(angles), np.sin(angles)], -1), heading, PERIOD_S)[0]
+    driven = rules.towards(np.stack([np.cos(angles), np.sin(angles)], -1), heading, PERIOD_S)[0]
     part = math.cos(turn / 2) * 0.5
     expected = [[1.0, 1.0], [part - 0.5, part + 0.5], [part + 0.5, part - 0.5], [-1.0, 1.0]]
     np.testing.assert_allclose(driven, expected, atol=1e-9)
-    assert not steering.towards(np.zeros((1, 4, 2)), heading, PERIOD_S).any(), "rests at its goal"
+    assert not rules.towards(np.zeros((1, 4, 2)), heading, PERIOD_S).any(), "rests at its goal"
 
 
 def test_a_robot_drives_slowly_to_a_goal_that_is_nearer_than_a_step() -> None:
     reach = MAX_SPEED_M_S * PERIOD_S
     wish = np.array([[[0.5 * reach, 0.0], [0.2 * reach, 0.0], [0.09 * reach, 0.0]]])
-    driven = steering.towards(wish, np.zeros((1, 3)), PERIOD_S)[0]
+    driven = rules.towards(wish, np.zeros((1, 3)), PERIOD_S)[0]
     np.testing.assert_allclose(driven, [[0.5, 0.5], [0.2, 0.2], [0.0, 0.0]], atol=1e-9)
 
 
@@ -354,19 +355,19 @@ def test_the_way_round_a_pillar_begins_at_its_rim() -> None:
     away = 0.2 + 0.1 + BODY_RADIUS_M
     env = world([(pillar - away, pillar)], [(0.9, pillar)], num_obstacles=2, obstacle_radius_m=0.1)
     # 20 cm of air, of 25 at which one gives way: nearness 0.2, so 0.2^2 back and 1.5 x 0.2 to the right
-    expected = steering.towards(np.array([[[1 - 0.04, -0.3]]]), np.zeros((1, 1)), PERIOD_S)
+    expected = rules.towards(np.array([[[1 - 0.04, -0.3]]]), np.zeros((1, 1)), PERIOD_S)
     assert env.heuristic("avoid").flatten().tolist() == pytest.approx(expected.flatten().tolist(), abs=1e-5)
 
 
 def test_giving_way_passes_on_the_right() -> None:
     to_goal, ahead = np.array([[[1.0, 0.0]]]), np.array([[[[0.15, 0.0]]]])
-    wish = steering.give_way(to_goal, ahead, np.full((1, 1, 1), 0.076))[0, 0]
+    wish = rules.give_way(to_goal, ahead, np.full((1, 1, 1), 0.076))[0, 0]
     assert wish[1] < -0.5 * abs(wish[0]), "to the right of the way along x"
-    behind = steering.give_way(to_goal, -ahead, np.full((1, 1, 1), 0.076))[0, 0]
+    behind = rules.give_way(to_goal, -ahead, np.full((1, 1, 1), 0.076))[0, 0]
     assert behind[1] == 0
     assert behind[0] > 0
-    far = steering.give_way(to_goal, ahead, np.full((1, 1, 1), np.inf))[0, 0]
-    np.testing.assert_allclose(far, [steering.SIGHT_M, 0.0])
+    far = rules.give_way(to_goal, ahead, np.full((1, 1, 1), np.inf))[0, 0]
+    np.testing.assert_allclose(far, [rules.SIGHT_M, 0.0])
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,9 @@ import pymunk
 from pymunk.batch import BodyFields, Buffer, get_space_bodies, set_space_bodies
 
 from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.physics import Bodies, Physics, num_substeps
+from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
 from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, MASS_KG, Array, chord
 
-TIMESTEP_S = 0.01
 ITERATIONS = 100
 """Iterations of the solver, which treats contacts in turn; with these many their order does not matter."""
 CONTACT_SLOP_M = 1e-4
@@ -45,7 +44,6 @@ class PymunkPlanar(Physics):
 
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
         super().__init__(arena, num_worlds, control_period_s, num_threads)
-        self._substeps = num_substeps(control_period_s, TIMESTEP_S)
         self._robots: list[list[pymunk.Body]] = []
         self._spaces = [self._space() for _ in range(num_worlds)]
         # The space's own static body, which bears the walls, comes last in all that is read and written.

@@ -1,0 +1,131 @@
+"""What robots of the formation see, what a step is worth, how hand-written policies steer, and the picture of it all.
+
+Everything works on all worlds at once. Vectors are in metres in the world frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from esp_envs.epuck.formation_spec import FormationSettings
+from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array, Flags
+from esp_envs.scene import COLORS, Body, Scene
+
+FADING_M = 0.2
+"""Gap over which the sight `nearness` of a body fades to 1/e."""
+RISKY_GAP_M = 0.05
+"""Gap between two robots below which a state is risky (supplement of the paper)."""
+CONTACT_GAP_M = 0.001
+"""Gap below which two bodies count as touching."""
+SIGHT_M = 0.25
+"""Gap between bodies below which one gives way to the other; this and the weights below were found by search."""
+PUSH = 1.0
+"""Weight of moving away from a near body, against 1 for moving to the goal."""
+SWERVE = 1.5
+"""Weight of passing a near body on the right."""
+_PILLAR_COLOR = "#707070"
+
+
+def length(offset: Array) -> Array:
+    """Return the lengths [...] of offsets [..., 2]."""
+    return np.hypot(offset[..., 0], offset[..., 1])
+
+
+def nearest(apart: Array, ways: Array, count: int) -> Array:
+    """Return the offsets [W, N, count, 2] of the nearest bodies, nearest first.
+
+    Args:
+        apart: [W, N, B] distances of the centres, m.
+        ways: [W, N, B, 2] offsets of the centres, m.
+        count: of bodies.
+    """
+    index = apart.argmin(-1)[..., None] if count == 1 else np.argsort(apart, -1, kind="stable")[..., :count]
+    worlds, robots = np.arange(len(apart))[:, None, None], np.arange(apart.shape[1])[:, None]
+    return ways[worlds, robots, index]
+
+
+def nearness(offset: Array, reach_m: float) -> Array:
+    """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
+
+    Args:
+        offset: [..., 2] between the centres, m.
+        reach_m: distance of the centres where the bodies touch.
+    """
+    distance = np.maximum(length(offset), 1e-9)[..., None]
+    return offset / distance * np.exp(-np.maximum(distance - reach_m, 0) / FADING_M)
+
+
+def in_sector(offset: Array, width_rad: float) -> Flags:
+    """Return which offsets [..., 2] lie in the sector of this width around the direction of x, [...]."""
+    return np.abs(np.arctan2(offset[..., 1], offset[..., 0])) < width_rad / 2
+
+
+def within(offset: Array, unit_m: float) -> Array:
+    """Return offsets [..., 2] in a unit of length, those that are longer than one cut to one."""
+    return offset / np.maximum(length(offset), unit_m)[..., None]
+
+
+def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> Array:
+    """Return g_i + c_i [W, N] of robots that came nearer to their goals by `progress` [W, N] m.
+
+    `apart` [W, N, N + M] are the distances of the centres to all robots and pillars, m.
+    """
+    near = apart < settings.radius
+    count = near.any(-1) if settings.penalty_counts == "any" else near.sum(-1)
+    return settings.progress_weight * progress - settings.penalty * count
+
+
+def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
+    """Return wheel speeds, [W, N, 2] in [-1, 1], that turn to a wished way and drive along it.
+
+    Args:
+        wish: [W, N, 2] m; shorter ones than a control period's full speed are driven more slowly.
+        heading: [W, N] rad.
+        control_period_s: time until the next choice.
+    """
+    error = np.arctan2(wish[..., 1], wish[..., 0]) - heading
+    error = np.remainder(error + math.pi, 2 * math.pi) - math.pi
+    reach = length(wish) / (MAX_SPEED_M_S * control_period_s)
+    moves = reach > 0.1
+    turn = np.clip(error / (MAX_SPIN_RAD_S * control_period_s), -1, 1) * moves
+    speed = np.minimum(reach, 1) * np.maximum(np.cos(error), 0) * (1 - np.abs(turn)) * moves
+    return np.stack([speed - turn, speed + turn], -1)
+
+
+def give_way(to_goal: Array, to_bodies: Array, gaps: Array) -> Array:
+    """Return the way [W, N, 2] that keeps clear of near bodies: away from them, and past them on the right.
+
+    Args:
+        to_goal: [W, N, 2] m.
+        to_bodies: [W, N, B, 2] from each robot's centre to the centre of every other body, m.
+        gaps: [W, N, B] between their surfaces, m; infinite for a robot and itself.
+    """
+    near = np.maximum(1 - np.maximum(gaps, 0) / SIGHT_M, 0)
+    away = -to_bodies / np.maximum(length(to_bodies), 1e-9)[..., None]
+    distance = length(to_goal)[..., None]
+    ahead = to_goal / np.maximum(distance, 1e-9)
+    # Only what lies ahead has to be passed; what lies behind is left by driving on.
+    facing = np.maximum(-(away * ahead[:, :, None]).sum(-1), 0)
+    right = np.stack([-away[..., 1], away[..., 0]], -1)
+    push = PUSH * (np.square(near)[..., None] * away).sum(-2)
+    swerve = SWERVE * ((near * facing)[..., None] * right).sum(-2)
+    here = np.minimum(distance / SIGHT_M, 1)
+    return (ahead * here + push + swerve * here) * SIGHT_M
+
+
+def formation_scene(
+    settings: FormationSettings, goals: Array, pillars: Array, position: Array, heading: Array
+) -> Scene:
+    """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
+    bodies = []
+    for i, goal in enumerate(goals.tolist()):
+        bodies.append(Body(tuple(goal), BODY_RADIUS_M, COLORS[i % len(COLORS)], "ring", model="goal", label="goal"))
+    radius = settings.obstacle_radius_m
+    bodies += [Body(tuple(place), radius, _PILLAR_COLOR, model="pillar", label="pillar") for place in pillars.tolist()]
+    for i, (place, turn) in enumerate(zip(position.tolist(), heading.tolist(), strict=True)):
+        color = COLORS[i % len(COLORS)]
+        bodies.append(Body(tuple(place), BODY_RADIUS_M, color, "disc", turn, trail=True, model="robot", label="robot"))
+    half = settings.arena.side_m / 2
+    return Scene(tuple(bodies), (-half, half, -half, half), unit="m")
