@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from esp_envs.errors import UserError
-from esp_envs.fields import Field, Items, Kind, Layout, filled_layout, joint_layout, layout, others_of
+from esp_envs.fields import Family, Field, Items, Kind, Layout, filled_layout, joint_layout, layout, others_of
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,6 +21,7 @@ __all__ = [
     "ActionSpace",
     "Continuous",
     "Discrete",
+    "Family",
     "Field",
     "Items",
     "Kind",

@@ -29,6 +29,7 @@ NETWORKS: Registry[NetworkConfig] = Registry(
         "gru": "esp_cli.networks.plain:GruConfig",
         "mpn": "esp_cli.networks.message_passing:MpnConfig",
         "empn": "esp_cli.networks.message_passing:EmpnConfig",
+        "set": "esp_cli.networks.sets:SetConfig",
         "equivariant": "esp_cli.networks.constrained:EquivariantConfig",
     },
     base="esp_cli.networks.contract:NetworkConfig",

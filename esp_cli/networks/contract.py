@@ -29,9 +29,11 @@ class NetworkConfig(Strict, ABC):
     Attributes:
         name: by which the user chose the network.
         recurrent: whether the network carries memory from step to step.
+        free_of_counts: whether the weights are the same for any number of agents and of things.
     """
 
     recurrent: ClassVar[bool] = False
+    free_of_counts: ClassVar[bool] = False
 
     name: str = Field("", max_length=100)
     hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(

@@ -22,16 +22,33 @@ WORTH_COMPILING = 100_000
 """Steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed."""
 
 
-class PlainConfig(NetworkConfig):
-    """The settings of both plain networks."""
+class CompiledConfig(NetworkConfig):
+    """The settings of networks that consist of perceptrons."""
 
     activation: ActivationName = Field("tanh", description="of the actor; MAPPO paper: relu")
-    precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     compiled: Literal["auto"] | bool = Field(
         "auto",
         description="kernels compiled for this processor: faster, other rounding; auto: on for 100k steps and more on "
         "the CPU where there is a C++ compiler",
     )
+
+    def decided(self, steps: int, device: str) -> CompiledConfig:
+        """Return these settings with `compiled` decided: on where the run gains more than compiling takes."""
+        if self.compiled != "auto":
+            return self
+        fits = device == "cpu" and self.can_compile
+        return self.model_copy(update={"compiled": fits and steps >= WORTH_COMPILING and has_compiler()})
+
+    @property
+    def can_compile(self) -> bool:
+        """Whether kernels compute what the other settings ask for."""
+        return True
+
+
+class PlainConfig(CompiledConfig):
+    """The settings of both plain networks."""
+
+    precision: Literal["float32", "bfloat16"] = Field("float32", description="of the perceptron's matrix products")
     layer_norm: bool = Field(False, description="paper: on; ours off, it slows learning on the particle tasks")
     separate_parts: bool = Field(
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
@@ -50,12 +67,10 @@ class PlainConfig(NetworkConfig):
             raise UserError("compiled perceptrons compute in float32; leave compiled off, or precision as it is")
         return self
 
-    def decided(self, steps: int, device: str) -> PlainConfig:
-        """Return these settings with `compiled` decided: on where the run gains more than compiling takes."""
-        if self.compiled != "auto":
-            return self
-        fits = device == "cpu" and self.precision == "float32" and not self.layer_norm
-        return self.model_copy(update={"compiled": fits and steps >= WORTH_COMPILING and has_compiler()})
+    @property
+    def can_compile(self) -> bool:
+        """Whether kernels compute what the other settings ask for."""
+        return self.precision == "float32" and not self.layer_norm
 
     def without_effect(self) -> frozenset[str]:
         """Return what concerns networks without layer normalisation where there is one."""

@@ -1,0 +1,102 @@
+// Distances among the things of a row, and mean and maximum over the things of a set.
+
+#include "vectors.h"
+
+#include <cmath>
+
+namespace {
+
+constexpr int64_t ROWS = 64;  // of a task
+
+template <class Work>
+void each_rows(int64_t rows, int64_t threads, int64_t room, Work work) {
+    const Shares shares(1, rows, ROWS, threads);
+    share_out(
+        shares, 0, room, [](int64_t) {}, [&](int64_t task, float *own) { work(shares.of(task), own); }, [](int64_t) {});
+}
+
+Vec root(Vec x) {
+    for (int i = 0; i < LANES; i++) x[i] = std::sqrt(x[i]);
+    return x;
+}
+
+}  // namespace
+
+extern "C" {
+
+// Describe things by their distance and by that to the nearest other one of each family.
+// places: [rows, things, 2]; sizes: things of each family; to: [rows, things, 1 + families].
+void distances(const int64_t *shape, const int64_t *sizes, const float *places, float *to) {
+    const int64_t rows = shape[0], things = shape[1], families = shape[2], columns = families + 1;
+    // LANES rows at a time, a vector for each coordinate of each thing
+    each_rows(rows, shape[3], 2 * things * LANES, [&](Span span, float *own) {
+        for (int64_t begin = span.begin; begin < span.end; begin += LANES) {
+            int64_t count = std::min<int64_t>(LANES, span.end - begin);
+            for (int64_t k = 0; k < 2 * things; k++)
+                for (int64_t r = 0; r < LANES; r++)
+                    own[k * LANES + r] = places[(begin + std::min(r, count - 1)) * 2 * things + k];
+            auto write = [&](int64_t thing, int64_t column, Vec value) {
+                for (int64_t r = 0; r < count; r++) to[((begin + r) * things + thing) * columns + column] = value[r];
+            };
+            Vec farthest = {};
+            for (int64_t i = 0; i < things; i++) {
+                Vec x = vec(own + 2 * i * LANES), y = vec(own + (2 * i + 1) * LANES), square = x * x + y * y;
+                farthest = square > farthest ? square : farthest;
+            }
+            for (int64_t i = 0; i < things; i++) {
+                Vec x = vec(own + 2 * i * LANES), y = vec(own + (2 * i + 1) * LANES);
+                write(i, 0, root(x * x + y * y));
+                for (int64_t family = 0, first = 0; family < families; first += sizes[family++]) {
+                    bool alone = sizes[family] == 1 && i == first;
+                    Vec least = alone ? 4.0f * farthest : Vec{} + INFINITY;
+                    for (int64_t j = first; j < first + sizes[family]; j++) {
+                        Vec dx = x - vec(own + 2 * j * LANES), dy = y - vec(own + (2 * j + 1) * LANES);
+                        Vec square = dx * dx + dy * dy;
+                        if (i != j) least = square < least ? square : least;
+                    }
+                    write(i, 1 + family, root(least));
+                }
+            }
+        }
+    });
+}
+
+// Mean and maximum over things: from [rows, things, width] to [rows, 2 width].
+void pool(const int64_t *shape, const float *from, float *to) {
+    const int64_t rows = shape[0], things = shape[1], width = shape[2];
+    each_rows(rows, shape[3], 0, [&](Span span, float *) {
+        for (int64_t r = span.begin; r < span.end; r++)
+            for (int64_t c = 0; c < width; c += LANES) {
+                const float *at = from + r * things * width + c;
+                Vec sum = load(at, width - c), most = sum;
+                for (int64_t k = 1; k < things; k++) {
+                    Vec x = load(at + k * width, width - c);
+                    sum += x;
+                    most = x > most ? x : most;
+                }
+                store(sum * (1.0f / things), to + 2 * r * width + c, width - c);
+                store(most, to + (2 * r + 1) * width + c, width - c);
+            }
+    });
+}
+
+// The gradient by what `pool` reads, from that by what it gives; the first of equal maxima takes all of its share.
+void pool_backward(const int64_t *shape, const float *from, const float *given, const float *grad, float *to) {
+    const int64_t rows = shape[0], things = shape[1], width = shape[2];
+    each_rows(rows, shape[3], 0, [&](Span span, float *) {
+        for (int64_t r = span.begin; r < span.end; r++)
+            for (int64_t c = 0; c < width; c += LANES) {
+                Vec share = load(grad + 2 * r * width + c, width - c) * (1.0f / things);
+                Vec rest = load(grad + (2 * r + 1) * width + c, width - c);
+                const Vec most = load(given + (2 * r + 1) * width + c, width - c);
+                for (int64_t k = 0; k < things; k++) {
+                    int64_t at = (r * things + k) * width + c;
+                    auto here = load(from + at, width - c) == most;
+                    store(share + (here ? rest : Vec{}), to + at, width - c);
+                    rest = here ? Vec{} : rest;
+                }
+            }
+    });
+}
+
+}

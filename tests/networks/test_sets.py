@@ -1,0 +1,193 @@
+"""Networks over sets: neither order nor number of like things matters, by torch and by kernels."""
+
+import math
+
+import pytest
+import torch
+
+from esp_cli.networks.build import build_network
+from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
+from esp_cli.networks.plain import MlpConfig
+from esp_cli.networks.sets import Rows, SetConfig, distances_among
+from esp_cli.training.streams import generators
+from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout, make
+from tests.networks.gradients import assert_same_gradients
+from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
+
+CLOSE = {"atol": 1e-5, "rtol": 1e-5}
+
+
+def scene(worlds=6, **settings):
+    env = make("navigation", worlds, [0, 1], settings)
+    observation = env.reset()
+    for _ in range(3):
+        observation = env.step(env.random_action()).next
+    return env.spec, observation
+
+
+def network(spec, reads="own", config=None, seeds=(0, 1)):
+    values = None if reads == "own" else (1 if spec.shared_reward else spec.num_agents)
+    io = IoSpec(spec, reads, values)
+    outputs = spec.action.count if values is None else values
+    built = build_network(generators(seeds, "x"), io.layout.width, outputs, config or SetConfig(), 1.0, io)
+    rng = torch.Generator().manual_seed(5)
+    with torch.no_grad():  # so that nothing holds by the way it begins
+        for p in built.parameters():
+            p.add_(torch.randn(p.shape, generator=rng) * 0.1)
+    return built
+
+
+def test_distances_by_hand():
+    """Landmarks at (3, 4) and (0, 1), one other agent at (0, -1)."""
+    landmarks, others = torch.tensor([[[[3.0, 4.0], [0.0, 1.0]]]]), torch.tensor([[[[0.0, -1.0]]]])
+    of_landmarks, of_others = distances_among([landmarks, others])
+    apart = math.sqrt(18)  # (3, 4) to (0, 1)
+    expected = [[5.0, apart, math.sqrt(34)], [1.0, apart, 2.0]]
+    torch.testing.assert_close(of_landmarks[0, 0], torch.tensor(expected))
+    # there is no other other: twice the largest distance
+    torch.testing.assert_close(of_others[0, 0], torch.tensor([[1.0, 2.0, 10.0]]))
+
+
+@needs_compiler
+def test_kernels_equal_torch():
+    rng = torch.Generator().manual_seed(0)
+    for sizes in ((3, 2), (1, 1), (1, 5, 4)):
+        places = [torch.randn(2, 37, size, 2, generator=rng) for size in sizes]
+        for ours, theirs in zip(compiled_distances(places), distances_among(places), strict=True):
+            torch.testing.assert_close(ours, theirs, **CLOSE)
+    things = torch.randn(2, 19, 5, 33, generator=rng, requires_grad=True)
+    ours, theirs = compiled_pool(things), torch.cat([things.mean(2), things.amax(2)], -1)
+    torch.testing.assert_close(ours, theirs, **CLOSE)
+    assert_same_gradients(ours, theirs, torch.randn(2, 19, 66, generator=rng), [things], **CLOSE)
+
+
+@needs_compiler
+def test_a_pool_by_hand_and_the_first_of_equal_maxima_takes_the_gradient():
+    things = torch.tensor([[[[1.0, 4.0], [3.0, 4.0]]]], requires_grad=True)
+    pooled = compiled_pool(things)
+    assert pooled.flatten().tolist() == [2.0, 4.0, 3.0, 4.0]
+    pooled.backward(torch.tensor([[[10.0, 20.0, 1.0, 2.0]]]))
+    assert things.grad.flatten().tolist() == [5.0, 12.0, 6.0, 10.0]
+
+
+@needs_compiler
+@pytest.mark.parametrize("reads", ["own", "state", "observations"])
+@pytest.mark.parametrize("settings", [{}, {"convention": "pettingzoo"}])
+def test_compiled_networks_equal_those_by_torch(reads, settings):
+    spec, _ = scene(**settings)
+    kernel, plain = network(spec, reads, SetConfig(compiled=True)), network(spec, reads, SetConfig(compiled=False))
+    x = torch.randn(2, 40, IoSpec(spec, reads).layout.width, generator=torch.Generator().manual_seed(1))
+    ours, theirs = kernel(x), plain(x)
+    torch.testing.assert_close(ours, theirs, **CLOSE)
+    slope = torch.randn_like(ours)
+    by_ours = torch.autograd.grad(ours, list(kernel.parameters()), slope)
+    by_theirs = torch.autograd.grad(theirs, list(plain.parameters()), slope)
+    for here, there in zip(by_ours, by_theirs, strict=True):
+        torch.testing.assert_close(here, there, atol=1e-4, rtol=1e-4)
+
+
+def reordered(spec, obs, name, order):
+    """Return observations in which the items of one field have changed places."""
+    where, out = spec.observation.slices()[name], obs.clone()
+    out[..., where] = obs[..., where].unflatten(-1, (len(order), -1))[..., order, :].flatten(-2)
+    return out
+
+
+@pytest.mark.parametrize(("config", "holds"), [(SetConfig(), True), (MlpConfig(), False)])
+@pytest.mark.parametrize(("field", "order"), [("landmarks", [2, 0, 1]), ("others", [1, 0])])
+def test_the_order_of_like_things_changes_nothing(config, holds, field, order):
+    spec, seen = scene()
+    policy = network(spec, config=config)
+    rows = seen.obs.flatten(1, 2)
+    gap = (policy(rows) - policy(reordered(spec, rows, field, order))).abs().amax()
+    assert bool(gap < 1e-5) is holds
+
+
+def test_fields_of_a_family_change_places_together_or_not_at_all():
+    seen = layout(
+        Field("others", Kind.VECTOR, 2, items=Items.OTHERS), Field("load", Kind.SCALAR, 2, items=Items.OTHERS)
+    )
+    moves = Discrete(Kind.VECTOR, ((1.0, 0.0), (-1.0, 0.0)), ("right", "left"))
+    spec = Spaces(num_agents=3, observation=seen, state=seen, action=moves, symmetry="d1")
+    policy = network(spec)
+    x = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).expand(2, 1, -1)
+    together = torch.tensor([3.0, 4.0, 1.0, 2.0, 6.0, 5.0]).expand(2, 1, -1)
+    places_alone = torch.tensor([3.0, 4.0, 1.0, 2.0, 5.0, 6.0]).expand(2, 1, -1)
+    torch.testing.assert_close(policy(x), policy(together), **CLOSE)
+    assert (policy(x) - policy(places_alone)).abs().amax() > 1e-3
+
+
+@pytest.mark.parametrize(("settings", "holds"), [({}, True), ({"mud": 0.5}, False)])
+@pytest.mark.parametrize("reads", ["own", "state"])
+def test_places_are_no_input_where_a_task_does_not_change_when_it_is_shifted(reads, settings, holds):
+    spec, seen = scene(**settings)
+    built = network(spec, reads)
+    row = seen.obs.flatten(1, 2) if reads == "own" else seen.state
+    moved = row.clone()
+    for part in (spec.observation if reads == "own" else spec.state).fields:
+        if part.is_point:
+            where = IoSpec(spec, reads).layout.slices()[part.name]
+            moved[..., where] += torch.tensor([0.5, -2.0]).repeat(part.count)
+    assert bool((built(row) - built(moved)).abs().amax() < 1e-4) is holds
+
+
+@pytest.mark.parametrize("reads", ["state", "observations"])
+def test_values_of_agents_with_rewards_of_their_own_change_places_with_them(reads):
+    spec, seen = scene(convention="pettingzoo")
+    critic, order = network(spec, reads), [2, 0, 1]
+    agents = lambda x: x.unflatten(-1, (3, -1))[..., order, :].flatten(-2)  # noqa: E731
+    if reads == "state":
+        row, moved = seen.state, seen.state.clone()
+        for name in ("velocity", "position"):
+            where = spec.state.slices()[name]
+            moved[..., where] = agents(seen.state[..., where])
+    else:  # the others of each agent have another order then, which changes nothing
+        row, moved = seen.obs.flatten(2), agents(seen.obs.flatten(2))
+    values = critic(row)
+    assert values.shape[-1] == 3
+    assert (values - values[..., :1]).abs().amax() > 1e-3
+    torch.testing.assert_close(critic(moved), values[..., order], **CLOSE)
+
+
+@pytest.mark.parametrize("reads", ["own", "state", "observations"])
+def test_weights_know_no_count(reads):
+    few, many = network(scene()[0], reads), network(scene(num_agents=6, num_landmarks=4)[0], reads)
+    assert {n: p.shape for n, p in few.named_parameters()} == {n: p.shape for n, p in many.named_parameters()}
+
+
+def test_one_looks_at_the_nearest_alone():
+    spec, seen = scene(num_agents=5)
+    near, all_of_them = network(spec, config=SetConfig(near=2)), network(spec)
+    rows = seen.obs.flatten(1, 2)
+    landmarks = rows[..., spec.observation.slices()["landmarks"]].unflatten(-1, (5, 2))
+    farthest = landmarks.norm(dim=-1).argmax(-1)
+    other = rows.clone()
+    where = spec.observation.slices()["landmarks"].start + 2 * farthest
+    for k in (0, 1):
+        other.scatter_(-1, (where + k).unsqueeze(-1), rows.gather(-1, (where + k).unsqueeze(-1)) * 1.5)
+    torch.testing.assert_close(near(rows), near(other), **CLOSE)
+    assert (all_of_them(rows) - all_of_them(other)).abs().amax() > 1e-3
+    torch.testing.assert_close(network(spec, config=SetConfig(near=5))(rows), all_of_them(rows), **CLOSE)
+
+
+def test_an_observation_without_like_things_is_refused():
+    spec = scene()[0]
+    own = layout(*(f for f in spec.observation.fields if not f.family_name))
+    lonely = Spaces(num_agents=1, observation=own, state=spec.state, action=spec.action, symmetry="d4")
+    with pytest.raises(UserError, match="the task shows none; say which fields are some"):
+        network(lonely)
+
+
+def test_wide_own_numbers_are_embedded_once():
+    spec = make("wildlife", 2, [0]).spec
+    assert Rows(spec.observation, False, 0, False).num_own > 32
+    assert network(spec).encoder.num_own == 32
+
+
+@needs_compiler
+def test_a_seed_gets_the_same_bits_alone_and_with_any_number_of_threads():
+    places, things = [torch.randn(3, 700, 4, 2), torch.randn(3, 700, 2, 2)], torch.randn(3, 700, 4, 16)
+    assert_same_bits_alone_and_for_any_threads(
+        lambda seeds: [*compiled_distances([p[seeds] for p in places]), compiled_pool(things[seeds])], 3
+    )
