@@ -192,7 +192,7 @@ def plan(
     if init_from is None:
         return config, None
     start = init_from if isinstance(init_from, Start) else Start.open(init_from)
-    initial, weights = start.fit(learner.policy)
+    initial, weights = start.fit(learner)
     return config.model_copy(update={"init_from": initial}), weights
 
 

@@ -241,6 +241,11 @@ class Layout:
         return tuple(Family(name, parts[0].field.count, tuple(parts)) for name, parts in joined.items())
 
     @property
+    def without_counts(self) -> Layout:
+        """The same with one thing in each family, which tells layouts apart up to how many there are."""
+        return Layout(tuple(replace(f, count=1) if f.family_name and f.count else f for f in self.fields))
+
+    @property
     def _placed(self) -> Iterator[tuple[Field, slice]]:
         return zip(self.fields, self.slices().values(), strict=True)
 

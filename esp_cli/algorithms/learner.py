@@ -184,8 +184,21 @@ class Learner(ABC):
             reason = str(error).split("\n")[0]
             raise UserError(f"the checkpoint does not fit this configuration ({reason})") from None
 
-    def start_from(self, policy: Mapping[str, Tensor]) -> None:
-        """Give the policy, and the target policy where there is one, these weights."""
+    def further_weights(self) -> dict[str, dict[str, Tensor]]:
+        """Return the tensors of every module beside the policy, as `state_dict` names them, by the module's name."""
+        others = {name: module for name, module in self.modules.items() if name not in ("policy", "target_policy")}
+        return {
+            name: {f"{name}.{key}": tensor for key, tensor in module.state_dict().items()}
+            for name, module in others.items()
+        }
+
+    def start_from(self, weights: Mapping[str, Tensor]) -> None:
+        """Give these weights to the policy and its target, and to the modules whose names they bear."""
+        policy = dict(weights)
+        for name in self.further_weights():
+            own = below({key: policy.pop(key) for key in [*policy] if key.startswith(f"{name}.")}, name)
+            if own:
+                self.modules[name].load_state_dict(own)
         for name in ("policy", "target_policy"):
             if name in self.modules:
                 self.modules[name].load_state_dict(policy)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,7 @@ def load_policy(
     seed: int | None = None,
     task: str | type[Environment] | None = None,
     network: str | type[NetworkConfig] | None = None,
+    settings: Mapping[str, object] | None = None,
 ) -> LoadedPolicy:
     """Load a trained policy; loading runs no code but that of a task, algorithm or network which you name.
 
@@ -168,10 +170,11 @@ def load_policy(
         seed: which seed of a run acts; by default its first.
         task: the task that the policy is of, as "module:Class" or as the class, where it is not installed.
         network: the settings class of its network, likewise.
+        settings: of the task, where they are others than in training: {"num_agents": 100} for a network over sets.
 
     Raises:
         UserError: nothing there, damaged, of another version, no such seed, or no such task.
     """
     register_own(task, algo, network)
     name = algo if isinstance(algo, str) else None
-    return LoadedPolicy(open_policy(Path(where), name, prior), seed)
+    return LoadedPolicy(open_policy(Path(where), name, prior).transfer(settings or {}), seed)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -36,6 +36,9 @@ from esp_envs.mpe.frozen_prey import digest
 from esp_envs.registry import register, task_names
 from esp_envs.spec import TaskSpec
 
+_FURTHER = ("critic.", "target_critic.", "mixer.", "target_mixer.", "normaliser.", "reward_scale.")
+"""Modules beside the policy that a run may start from."""
+
 
 @dataclass(frozen=True)
 class TrainedPolicy:
@@ -48,6 +51,7 @@ class TrainedPolicy:
     source: Path  # the run folder or file
     notes: tuple[str, ...] = ()  # sentences for the user (a damaged checkpoint was passed over)
     stopped: tuple[int, ...] = ()  # places of seeds that stopped on a number that is not finite; theirs are early ones
+    further: Mapping[str, Tensor] = field(default_factory=dict)  # weights beside it: "critic...."
 
     @classmethod
     def read(cls, path: Path, sha256: str | None = None) -> TrainedPolicy:
@@ -60,13 +64,17 @@ class TrainedPolicy:
         config, checkpoint = parse_config(folder.config, path), folder.latest_checkpoint(notes.append)
         if checkpoint is not None:
             tensors, meta = checkpoint
-            return _build(path, config, below(tensors, "policy"), meta, tuple(notes))
+            found = _build(path, config, below(tensors, "policy"), meta, tuple(notes))
+            further = _FURTHER if config.network.free_of_counts else ()
+            return replace(found, further={name: t for name, t in tensors.items() if name.startswith(further)})
         if folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
             return _build(path, config, *read_policy(folder.policy_path))
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:
         """Return the policy for its task under changed settings: another physics, more noise, another reward.
+
+        Where the network's weights are free of counts, numbers of agents and of things may change too.
 
         Raises:
             UserError: an unknown setting, or one under which the policy does not see or do the same things.
@@ -76,14 +84,29 @@ class TrainedPolicy:
         changed = resolve_task_settings(self.config.task, {**self.config.task_settings, **settings})
         config = self.config.model_copy(update={"task_settings": changed})
         spec = spec_of(config)
-        for part in ("num_agents", "observation", "action", "masks"):
-            if getattr(spec, part) != getattr(self.spec, part):
-                names = ", ".join(f"task.{name}" for name in settings)
-                raise UserError(
-                    f"{self.source} was trained with other {part.replace('num_', '')} than the task has with {names} "
-                    "changed; change only what a policy neither sees nor does"
-                )
-        return replace(self, config=config, spec=spec)
+        free = config.network.free_of_counts
+        seen = [one.observation.without_counts if free else one.observation for one in (spec, self.spec)]
+        numbers = spec.num_agents != self.spec.num_agents
+        differs = {
+            "agents": numbers and (seen[0] != seen[1] or self.policy.actor.team > 1),
+            "observation": seen[0] != seen[1],
+            "action": spec.action != self.spec.action,
+            "masks": spec.masks != self.spec.masks,
+        }
+        if part := next((part for part, other in differs.items() if other), None):
+            names = ", ".join(f"task.{name}" for name in settings)
+            known = (
+                numbers and not free and "; the weights of its network are made for a number of agents, of set for any"
+            )
+            raise UserError(
+                f"{self.source} was trained with other {part} than the task has with {names} "
+                f"changed; change only what a policy neither sees nor does{known or ''}"
+            )
+        if spec.observation == self.spec.observation and not numbers:
+            return replace(self, config=config, spec=spec)
+        policy = _untrained(config, spec, _at_default(config.network, "compiled")).to(config.device)
+        policy.load_state_dict(self.policy.state_dict())
+        return replace(self, config=config, spec=spec, policy=policy)
 
     def single_seed(self, seed: int | None = None) -> TrainedPolicy:
         """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export.
@@ -140,7 +163,7 @@ def load_entry(entry: bundled.Entry) -> TrainedPolicy:
 
 @dataclass(frozen=True)
 class Start:
-    """Weights that a run may start from."""
+    """Weights that a run may start from: those of a policy, and where a network is free of counts all that fits."""
 
     source: str  # the policy, as a configuration records it
     holder: Path  # the file or folder that holds the weights
@@ -151,7 +174,8 @@ class Start:
     def open(cls, source: str | os.PathLike[str]) -> Start:
         """Open a run folder, a policy file or a bundled policy, as `open_policy` does."""
         trained = open_policy(Path(source))
-        return cls(os.fspath(source), trained.source, trained.config, trained.policy.state_dict())
+        weights = {**trained.policy.state_dict(), **trained.further}
+        return cls(os.fspath(source), trained.source, trained.config, weights)
 
     @classmethod
     def find_copy(cls, folder: Path, config: RunConfig) -> Start | None:
@@ -166,13 +190,20 @@ class Start:
             weights = {name: tensor[:1] for name, tensor in weights.items()}
         return cls(config.init_from.source, folder, config, weights)
 
-    def fit(self, policy: Policy) -> tuple[InitialPolicy, dict[str, Tensor]]:
-        """Return what a new run's configuration records of this start, and the weights [S, ...] for its policy.
+    def fit(self, learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
+        """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner.
+
+        Those of a policy have to fit; those of another module are left out where they do not.
 
         Raises:
             UserError: numbers of seeds, names or shapes differ.
         """
-        seeds, own = policy.num_seeds, policy.state_dict()
+        seeds, own, given = learner.policy.num_seeds, learner.policy.state_dict(), dict(self.weights)
+        fitting: dict[str, Tensor] = {}
+        for name, tensors in learner.further_weights().items():
+            theirs = {key: given.pop(key) for key in [*given] if key.startswith(f"{name}.")}
+            if {key: t.shape[1:] for key, t in theirs.items()} == {key: t.shape[1:] for key, t in tensors.items()}:
+                fitting |= theirs
         if self._num_seeds not in (1, seeds):
             raise UserError(
                 f"cannot start {seeds} seed(s) from {self.holder}, which holds {self._num_seeds}; train "
@@ -180,8 +211,8 @@ class Start:
                 "policy' writes it"
             )
         # names before shapes: those that differ are of another algorithm or network
-        for name in [*sorted(own.keys() ^ self.weights.keys()), *sorted(own.keys() & self.weights.keys())]:
-            here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, self.weights))
+        for name in [*sorted(own.keys() ^ given.keys()), *sorted(own.keys() & given.keys())]:
+            here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, given))
             if here != there:
                 of_it = f"'{name}' is {'missing' if there is None else there} there"
                 of_this = "missing" if here is None else here
@@ -191,7 +222,7 @@ class Start:
                     f"with the network {self.config.network.name}, and {of_it} but {of_this} in this run; "
                     f"choose {algorithm}the task settings and the network of that policy"
                 )
-        weights = self._repeated(seeds)
+        weights = _repeated({**given, **fitting}, seeds)
         return InitialPolicy(source=self.source, sha256=digest(weights, {})), weights
 
     def matches(self, config: RunConfig) -> bool:
@@ -199,14 +230,15 @@ class Start:
         seeds = len(config.seeds)
         if config.init_from is None or self._num_seeds not in (1, seeds):
             return False
-        return digest(self._repeated(seeds), {}) == config.init_from.sha256
+        return digest(_repeated(self.weights, seeds), {}) == config.init_from.sha256
 
     @property
     def _num_seeds(self) -> int:
         return len(next(iter(self.weights.values())))
 
-    def _repeated(self, seeds: int) -> dict[str, Tensor]:
-        return {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in self.weights.items()}
+
+def _repeated(weights: Mapping[str, Tensor], seeds: int) -> dict[str, Tensor]:
+    return {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in weights.items()}
 
 
 def register_own(

@@ -1,0 +1,85 @@
+"""A policy whose weights know no number of agents acts with any: evaluated, drawn, loaded and trained on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from esp_cli import load_policy
+from esp_cli.policies.loading import TrainedPolicy
+from esp_envs import UserError
+from tests.cli.running import esp, refused, train_tiny
+
+SETS = ("--network", "set", "--set", "mappo.critic_input=state", "--set", "network.width=4")
+
+
+@pytest.fixture(scope="module")
+def three(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_tiny(tmp_path_factory.mktemp("sets") / "three", *SETS, "--seeds", 2)
+
+
+@pytest.fixture(scope="module")
+def perceptron(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_tiny(tmp_path_factory.mktemp("sets") / "perceptron")
+
+
+def test_it_is_evaluated_and_drawn_with_other_numbers(three: Path, tmp_path: Path) -> None:
+    many = ("--set", "task.num_agents=5", "--set", "task.num_landmarks=4")
+    result = json.loads(esp("eval", three, "--episodes", 2, *many, "--json", "-").stdout)
+    assert result["task_settings"]["num_agents"] == 5
+    assert len(result["greedy"]["per_seed"]) == 2
+    esp("render", three, "--out", tmp_path / "five.png", *many)
+    assert (tmp_path / "five.png").stat().st_size > 1000
+
+
+def test_loaded_it_acts_on_any_number_and_as_it_was_trained_on_the_first(three: Path) -> None:
+    one, many = load_policy(three), load_policy(three, settings={"num_agents": 7})
+    assert (one.spec.num_agents, many.spec.num_agents) == (3, 7)
+    rows = np.random.default_rng(0).normal(size=(7, many.spec.observation.width))
+    assert many.act(rows).shape == (7,)
+    before, after = (policy.trained.policy.state_dict() for policy in (one, many))
+    assert all(torch.equal(tensor, after[name]) for name, tensor in before.items())
+    with pytest.raises(UserError, match=r"needs \(\.\.\., 14\)"):
+        one.act(rows)
+
+
+def test_a_run_with_another_number_starts_from_actor_critic_and_statistics(three: Path, tmp_path: Path) -> None:
+    still = ("--set", "mappo.learning_rate=1e-12", "--set", "mappo.value_decay=0.999999")
+    run = train_tiny(
+        tmp_path / "five", *SETS, "--seeds", 2, "--set", "task.num_agents=5", *still, "--init-from", three, steps=50
+    )
+    first, then = (TrainedPolicy.read(path) for path in (three, run))
+    for name, tensor in first.policy.state_dict().items():
+        torch.testing.assert_close(then.policy.state_dict()[name], tensor)
+    critic = [name for name in first.further if name.startswith("critic.")]
+    assert critic
+    for name in critic:
+        torch.testing.assert_close(then.further[name], first.further[name])
+    fresh = train_tiny(tmp_path / "fresh", *SETS, "--seeds", 2, "--set", "task.num_agents=5", *still, steps=50)
+    assert any(not torch.equal(TrainedPolicy.read(fresh).further[name], first.further[name]) for name in critic)
+
+
+def test_a_critic_that_does_not_fit_is_left_out(three: Path, tmp_path: Path) -> None:
+    others = ("--network", "set", "--set", "mappo.critic_input=own", "--set", "network.width=4")
+    still = ("--set", "mappo.learning_rate=1e-12")
+    run = train_tiny(tmp_path / "own", *others, *still, "--seeds", 2, "--init-from", three, steps=50)
+    first, then = (TrainedPolicy.read(path) for path in (three, run))
+    for name, tensor in first.policy.state_dict().items():
+        torch.testing.assert_close(then.policy.state_dict()[name], tensor)
+
+
+def test_a_network_with_a_count_says_so(perceptron: Path, tmp_path: Path) -> None:
+    sentence = refused("eval", perceptron, "--set", "task.num_agents=5")
+    assert sentence.endswith("the weights of its network are made for a number of agents, of set for any")
+    assert "there but" in refused(
+        "train", "--set", "task.num_agents=5", "--set", "network.hidden=[8]", "--init-from", perceptron
+    )
+
+
+def test_other_things_are_still_refused(three: Path) -> None:
+    assert "with other action than" in refused("eval", three, "--set", "task.actions=continuous")
+    assert "with other agents than" in refused("eval", three, "--set", "task.num_agents=1")  # no others to see
