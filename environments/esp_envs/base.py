@@ -73,11 +73,9 @@ class Step:
 
 
 def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
-    """Return an allowed action, each with the same probability.
+    """Return an allowed action, each equally likely, by numbers [...] uniform in [0, 1).
 
-    Args:
-        allowed: [..., A] bool; a row that allows nothing allows all.
-        number: [...] uniform in [0, 1).
+    `allowed` is [..., A] bool; a row that allows nothing allows all.
     """
     allowed = allowed | ~allowed.any(-1, keepdim=True)
     count = allowed.sum(-1)
@@ -86,11 +84,7 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
 
 
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...], dtype: torch.dtype | None = None) -> None:
-    """Refuse a tensor of another shape, or of another type where one is given.
-
-    Raises:
-        UserError: names both.
-    """
+    """Raise a UserError for a tensor of another shape, or of another type where one is given."""
     if tuple(tensor.shape) != expected:
         raise UserError(f"the {what} has shape {tuple(tensor.shape)}, expected {expected}")
     if dtype is not None and tensor.dtype != dtype:
@@ -98,7 +92,6 @@ def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...], dtype: t
 
 
 OTHER_SIZE = "the saved environment has other seeds, worlds or bodies than this one; use its settings"
-"""What every task answers to the saved state of an environment of another size."""
 
 
 def generators_for(seeds: Sequence[int], device: torch.device | str = "cpu") -> list[torch.Generator]:
@@ -112,11 +105,7 @@ def generator_states(generators: Sequence[torch.Generator]) -> Tensor:
 
 
 def restore_generators(generators: Sequence[torch.Generator], states: Tensor) -> None:
-    """Put generators into the states that `generator_states` returned.
-
-    Raises:
-        UserError: another number of generators, or no states.
-    """
+    """Put generators into the states that `generator_states` returned; a UserError refuses another number of them."""
     if len(states) != len(generators):
         raise UserError(f"{len(states)} generator states are given for {len(generators)} generators")
     for generator, state in zip(generators, states, strict=True):
@@ -125,12 +114,7 @@ def restore_generators(generators: Sequence[torch.Generator], states: Tensor) ->
 
 
 def put_back(env: Environment, observation: Observation) -> None:
-    """Put worlds that have reset themselves back to how their episodes ended, for a picture; draws no numbers.
-
-    Args:
-        env: with `set_state`.
-        observation: the last of the episodes.
-    """
+    """Put worlds back to the last observation of their episodes, for a picture; draws no random numbers."""
     states = generator_states(env.generators)
     env.set_state(observation.state)
     restore_generators(env.generators, states)
@@ -223,11 +207,7 @@ class Environment(ABC):
         raise UserError(f"task {self.spec.name} has no hand-written policy; its class has no 'heuristic'")
 
     def named_heuristic(self, name: str | None) -> str:
-        """Return a heuristic's name with its default filled in.
-
-        Raises:
-            UserError: the task has no heuristic of this name.
-        """
+        """Return a heuristic's name with its default filled in; a UserError refuses unknown ones."""
         name = name or self.heuristics[0]
         if name not in self.heuristics:
             raise UserError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
@@ -246,12 +226,9 @@ class Environment(ABC):
         return getattr(type(self), method) is not getattr(Environment, method)
 
     def painter(self, size: int) -> AbstractContextManager[Painter] | None:
-        """Return a view of this task's own to open, or None where the view from above is all there is.
+        """Return a view of this task's own, pictures `size` pixels wide, or None where it has none.
 
-        Opening it raises a ValueError where this machine cannot draw it.
-
-        Args:
-            size: of the longer side of a picture, pixels.
+        Opening it raises a UserError where this machine cannot draw it.
         """
         return None
 
@@ -276,17 +253,17 @@ class Environment(ABC):
         Allowed discrete actions are equally likely. Numbers of a continuous action are uniform in [-1, 1]. So a vector
         is uniform in a square, not in the disc: it prefers diagonals, and the task scales back what is longer than 1.
         """
-        shape = self.action_shape[1:]
-        mask = self.action_mask()
+        shape, action, mask = self.action_shape[1:], self.spec.action, self.action_mask()
+
+        def draw(generator: torch.Generator) -> Tensor:
+            if mask is None and not isinstance(action, Continuous):
+                return torch.randint(action.count, shape, generator=generator, device=self.device)
+            return torch.rand(shape, generator=generator, device=self.device)
+
+        drawn = torch.stack([draw(generator) for generator in self.generators])
         if mask is not None:
-            numbers = torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self.generators])
-            return random_choice(mask, numbers)
-        if isinstance(self.spec.action, Continuous):
-            draws = [torch.rand(shape, generator=g, device=self.device) * 2 - 1 for g in self.generators]
-        else:
-            count = self.spec.action.count
-            draws = [torch.randint(count, shape, generator=g, device=self.device) for g in self.generators]
-        return torch.stack(draws)
+            return random_choice(mask, drawn)
+        return drawn * 2 - 1 if isinstance(action, Continuous) else drawn
 
     def half_by_heuristic(self, action: Tensor) -> Tensor:
         """Return a joint action whose first half of the worlds follows the main heuristic, if the task has one."""

@@ -18,8 +18,7 @@ World = dict[str, Tensor]
 """The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
 Outcome = tuple[Tensor, dict[str, Tensor]]
 """The reward [S, E] or [S, E, N] of a step and its metrics [S, E]."""
-_FURTHER = "world."
-"""What the names of saved tensors begin with that are no fields of the state."""
+_FURTHER = "world."  # what the names of saved tensors begin with that are no fields of the state
 
 
 class BatchedTask(Environment):

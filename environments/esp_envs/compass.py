@@ -19,11 +19,7 @@ from esp_envs.spec import Field, Items, Kind, TaskSpec, joint_layout, layout
 
 def _of_the_worlds(method: str) -> Any:
     """Return a method that hands on to that of the worlds; the frame changes nothing for it."""
-
-    def call(self: Compass, *given: Any, **named: Any) -> Any:
-        return getattr(self.inner, method)(*given, **named)
-
-    return call
+    return lambda self, *given, **named: getattr(self.inner, method)(*given, **named)
 
 
 class Compass(Environment):

@@ -12,16 +12,13 @@ from PIL import Image, ImageColor, ImageDraw
 from esp_envs.errors import UserError
 from esp_envs.scene import Body, Scene
 
-_OVERSAMPLING = 3
-"""Everything is drawn this much larger and averaged down, which smooths the edges."""
+_OVERSAMPLING = 3  # everything is drawn this much larger and averaged down, which smooths the edges
 BACKGROUND = "#fafaf7"
 GRID = "#e4e4de"
 FRAME = "#c8c8c0"
 _RIM_DARKENING = 0.7
-TRAIL_WIDTH = 0.3
-"""Width of a trail against the body's radius."""
-_TRAIL_STRENGTH = 0.8
-"""How much of the body's colour the newest end of a trail has; the oldest has almost none."""
+TRAIL_WIDTH = 0.3  # width of a trail against the body's radius
+_TRAIL_STRENGTH = 0.8  # how much of the body's colour the newest end of a trail has; the oldest has almost none
 _SHAPES = ("disc", "ring", "cross", "square")
 
 _Color = tuple[int, ...]
@@ -29,15 +26,12 @@ Point = tuple[float, float]
 
 
 def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-    """Draw one scene.
+    """Draw one scene as a picture [H, W, 3] uint8, red, green and blue; the first row is the top.
 
     Args:
         scene: what to draw.
         size: pixels of the longer side; the other follows from the scene's window.
         trail: earlier scenes of the same world, oldest first; bodies that leave a trail get one.
-
-    Shape:
-        [H, W, 3] uint8, red, green and blue; the first row is the top.
 
     Raises:
         UserError: the size is below 16 pixels, the window is empty, or a body has an unknown shape.
@@ -55,12 +49,7 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
 
 
 class TopPainter:
-    """Draws scenes from above.
-
-    Args:
-        size: pixels of the longer side of a picture.
-        note: a sentence for the user about why it draws, or None.
-    """
+    """Draws scenes from above, `size` pixels on the longer side; `note` tells the user why it draws."""
 
     def __init__(self, size: int, note: str | None = None) -> None:
         self._size, self.note = size, note
@@ -79,15 +68,7 @@ def trails(scene: Scene, earlier: Sequence[Scene]) -> Iterator[tuple[Body, list[
 
 
 def fade(color: str, share: float) -> tuple[int, ...]:
-    """Return the colour of a piece of trail.
-
-    Args:
-        color: of the body, "#rrggbb".
-        share: where the piece lies: 0 is the oldest end of the trail, 1 the newest.
-
-    Returns:
-        Red, green and blue from 0 to 255.
-    """
+    """Return red, green and blue, 0 to 255, of a piece of trail: `share` is 0 at its oldest end, 1 at its newest."""
     return _mix(ImageColor.getrgb(BACKGROUND), ImageColor.getrgb(color), _TRAIL_STRENGTH * share)
 
 
@@ -107,10 +88,9 @@ class _Canvas:
     def grid(self, spacing: float, offset: float) -> None:
         """Draw grid lines and a frame."""
         x_min, x_max, y_min, y_max = self._window
-        for x in _lines(x_min, x_max, spacing, offset):
-            self._line([(x, y_min), (x, y_max)], GRID, _OVERSAMPLING)
-        for y in _lines(y_min, y_max, spacing, offset):
-            self._line([(x_min, y), (x_max, y)], GRID, _OVERSAMPLING)
+        lines = [((x, y_min), (x, y_max)) for x in _lines(x_min, x_max, spacing, offset)]
+        for line in (*lines, *(((x_min, y), (x_max, y)) for y in _lines(y_min, y_max, spacing, offset))):
+            self._line(line, GRID, _OVERSAMPLING)
         width, height = self._image.size
         self._draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME, width=_OVERSAMPLING)
 

@@ -22,8 +22,7 @@ from typing import Any, TypeVar
 from esp_envs.errors import UserError
 
 T = TypeVar("T")
-_FOREIGN: set[str] = set()
-"""Top-level modules of the classes that are registered or installed."""
+_FOREIGN: set[str] = set()  # top-level modules of the classes that are registered or installed
 
 _MODULE_AND_CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
@@ -92,11 +91,9 @@ class Registry(Mapping[str, type[T]]):
         raise UserError(f"unknown {self.noun} '{name[:80]}'; {hint}; name your own as module:Class")
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is a class of this name."""
         return name in list(self)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: built-in ones, installed ones, those that the caller registered."""
         return iter(dict.fromkeys((*self._built_in, *self._installed(), *self._registered)))
 
     def ships(self, name: str) -> bool:
@@ -104,7 +101,6 @@ class Registry(Mapping[str, type[T]]):
         return name in self._built_in
 
     def __len__(self) -> int:
-        """Return the number of names."""
         return sum(1 for _ in self)
 
     def _installed(self) -> dict[str, EntryPoint]:
@@ -115,8 +111,7 @@ class Registry(Mapping[str, type[T]]):
             raise UserError(f"'{name[:80]}' names no {self.noun}; write module:Class, as in {self.example}")
         module_name, class_name = name.split(":")
         here = str(Path.cwd())
-        # First while the module is found, as for a script; last afterwards, so that no other import meets the user's
-        # files.
+        # first while the module is found, as for a script; last afterwards: no other import meets the user's files
         sys.path.insert(0, here)
         invalidate_caches()  # the user may have written the file a moment ago
         try:
@@ -138,11 +133,8 @@ class Registry(Mapping[str, type[T]]):
     def _checked(self, cls: object, name: str) -> type[T]:
         base: type[T] = load(self._base)
         if not (isinstance(cls, type) and issubclass(cls, base)):
-            article = "an" if self.noun[0] in "aeiou" else "a"
-            raise UserError(
-                f"'{name}' is not {article} {self.noun}; {article} {self.noun} is a subclass of "
-                f"{self._base.replace(':', '.')}"
-            )
+            noun = f"{'an' if self.noun[0] in 'aeiou' else 'a'} {self.noun}"
+            raise UserError(f"'{name}' is not {noun}; {noun} is a subclass of {self._base.replace(':', '.')}")
         if isabstract(cls):
             missing = ", ".join(sorted(vars(cls)["__abstractmethods__"]))
             raise UserError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")

@@ -67,10 +67,14 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         self.state_space = spaces.Box(-np.inf, np.inf, (spec.state.width,), np.float32)
         self._state = np.zeros(spec.state.width, np.float32)
         # one space object per agent: each has its own random generator
-        self.observation_spaces = {
-            agent: spaces.Box(-np.inf, np.inf, (spec.observation.width,), np.float32) for agent in self.possible_agents
-        }
-        self.action_spaces = {agent: self._new_action_space() for agent in self.possible_agents}
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {}
+        self.action_spaces: dict[str, spaces.Space[Any]] = {}
+        for agent in self.possible_agents:
+            self.observation_spaces[agent] = spaces.Box(-np.inf, np.inf, (spec.observation.width,), np.float32)
+            if isinstance(spec.action, Continuous):
+                self.action_spaces[agent] = spaces.Box(-1.0, 1.0, (spec.action.width,), np.float32)
+            else:
+                self.action_spaces[agent] = spaces.Discrete(spec.action.count)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the observation space of an agent, always the same object."""
@@ -83,17 +87,12 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, _Array], dict[str, dict[str, Any]]]:
-        """Start a new episode, of `seed` where one is given.
-
-        Args:
-            seed: restarts the task's random numbers.
-            options: none are known.
-        """
+        """Start a new episode, of `seed` where one is given; no options are known."""
         if seed is not None:
             self._env.generators[0].manual_seed(int(seed))
         seen = self._env.reset()
         self.agents = self._living(seen, self.possible_agents)
-        return self._take(seen), self._infos(seen, {})
+        return self._take(seen, {})
 
     def step(
         self, actions: dict[str, Any]
@@ -108,8 +107,7 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         seen, agents = step.reached, self.agents
         living = self._living(seen, agents)
         reward = dict(zip(self.possible_agents, step.reward[0, 0].tolist(), strict=True))
-        observation = self._take(seen)
-        infos = self._infos(seen, {name: float(value[0, 0]) for name, value in step.metrics.items()})
+        observation, infos = self._take(seen, {name: float(value[0, 0]) for name, value in step.metrics.items()})
         self.agents = [] if terminated or truncated else living
         return (
             observation,
@@ -127,19 +125,9 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         """Return a picture [H, W, 3] uint8, or nothing without a render mode."""
         return None if self.render_mode is None else draw(self._env.scene())
 
-    def close(self) -> None:
-        """Nothing is held open."""
-
-    def _new_action_space(self) -> spaces.Space[Any]:
-        action = self._env.spec.action
-        if isinstance(action, Continuous):
-            return spaces.Box(-1.0, 1.0, (action.width,), np.float32)
-        return spaces.Discrete(action.count)
-
     def _joint(self, actions: dict[str, Any]) -> torch.Tensor:
         """Return the joint action [1, 1, N] or [1, 1, N, width] of a dictionary of actions."""
-        missing = [agent for agent in self.agents if agent not in actions]
-        if missing:
+        if missing := [agent for agent in self.agents if agent not in actions]:
             raise UserError(f"the action of {', '.join(missing)} is missing; give one for every live agent")
         space = self._env.spec.action
         idle = np.zeros(space.width, np.float32) if isinstance(space, Continuous) else np.zeros((), np.int64)
@@ -166,17 +154,14 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
             raise UserError(f"{agent}'s action {action!r} is not an integer from 0 to {space.count - 1}")
         return array.reshape(()).astype(np.int64)
 
-    def _take(self, observation: Observation) -> dict[str, _Array]:
-        """Keep the global state and return the observation of each agent that acted."""
-        self._state = observation.state[0, 0].numpy().copy()
-        return self._by_agent(observation.obs)
-
-    def _infos(self, observation: Observation, metrics: dict[str, float]) -> dict[str, dict[str, Any]]:
-        """Return each agent's metrics and, where there are masks, its allowed actions."""
-        if observation.action_mask is None:
-            return {agent: dict(metrics) for agent in self.agents}
-        masks = self._by_agent(observation.action_mask.to(torch.int8))
-        return {agent: {**metrics, "action_mask": mask} for agent, mask in masks.items()}
+    def _take(
+        self, seen: Observation, metrics: dict[str, float]
+    ) -> tuple[dict[str, _Array], dict[str, dict[str, Any]]]:
+        """Keep the global state; return observation and info of each agent that acted, with its allowed actions."""
+        self._state = seen.state[0, 0].numpy().copy()
+        masks = {} if seen.action_mask is None else self._by_agent(seen.action_mask.to(torch.int8))
+        infos = {agent: metrics | ({"action_mask": masks[agent]} if masks else {}) for agent in self.agents}
+        return self._by_agent(seen.obs), infos
 
     def _by_agent(self, x: torch.Tensor) -> dict[str, _Array]:
         """Return the row of each agent that acts, of [1, 1, N, ...]."""

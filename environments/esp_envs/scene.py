@@ -40,8 +40,7 @@ class Body:
     reach: float | None = None
 
 
-GRID_SPACING = 0.5
-"""Distance of the lines behind a scene, unless it says otherwise."""
+GRID_SPACING = 0.5  # distance of the lines behind a scene, unless it says otherwise
 
 
 @dataclass(frozen=True)

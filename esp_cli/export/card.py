@@ -15,8 +15,7 @@ from esp_envs.registry import task_class
 from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 
 EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
-_MOST_ROWS = 16
-"""Actions beyond which only `policy.json` lists them."""
+_MOST_ROWS = 16  # actions beyond which only `policy.json` lists them
 
 
 def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:

@@ -20,8 +20,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.errors import UserError
 
-OBSERVATIONS = 10_000
-"""Observations on which every export is compared with its policy."""
+OBSERVATIONS = 10_000  # observations on which every export is compared with its policy
 TOLERANCE = 1e-4
 """Largest difference of an output, as a share of the largest output (or of 1); float32 in another order gives 1e-6."""
 _STEPS = 50

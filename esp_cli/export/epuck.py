@@ -27,10 +27,8 @@ from esp_envs.base import Environment
 from esp_envs.epuck.arena import Arena
 from esp_envs.errors import UserError
 
-STATES = 10_000
-"""States on which the observations built from poses are compared with the task\'s."""
-TOLERANCE = 1e-5
-"""Largest difference of an observation's number; float32 in metres gives 1e-6."""
+STATES = 10_000  # states on which the observations built from poses are compared with the task's
+TOLERANCE = 1e-5  # largest difference of an observation's number; float32 in metres gives 1e-6
 Observer = Callable[[Floats, Floats, Floats], Floats]
 """(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
 ROS2_PACKAGE = "esp_formation"

@@ -92,6 +92,15 @@ def require_method(env: Environment, method: str, otherwise: str) -> None:
         raise NotAsked(otherwise)
 
 
+def require_refusal(call: Callable[..., object], given: object, otherwise: str) -> None:
+    """Raise `Broken` unless a call with this argument raises a ValueError."""
+    try:
+        call(given)
+    except ValueError:
+        return
+    raise Broken(otherwise)
+
+
 def require(holds: bool, otherwise: str) -> None:
     """Raise `Broken` with a sentence unless something holds."""
     if not holds:

@@ -9,10 +9,8 @@ import numpy as np
 from esp_envs.epuck.robot import BODY_RADIUS_M, Array
 from esp_envs.errors import UserError
 
-POST_CLEARANCE_M = 0.013
-"""Air between a wall and the body of a robot on its post."""
-PILLAR_RING = 0.4
-"""Distance of the pillars from the middle, as a share of half a side."""
+POST_CLEARANCE_M = 0.013  # air between a wall and the body of a robot on its post
+PILLAR_RING = 0.4  # distance of the pillars from the middle, as a share of half a side
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,13 @@ from esp_envs.epuck.formation_spec import FormationSettings
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array, Flags
 from esp_envs.scene import COLORS, Body, Scene
 
-FADING_M = 0.2
-"""Gap over which the sight `nearness` of a body fades to 1/e."""
-RISKY_GAP_M = 0.05
-"""Gap between two robots below which a state is risky (supplement of the paper)."""
-CONTACT_GAP_M = 0.001
-"""Gap below which two bodies count as touching."""
+FADING_M = 0.2  # gap over which the sight `nearness` of a body fades to 1/e
+RISKY_GAP_M = 0.05  # gap between two robots below which a state is risky (supplement of the paper)
+CONTACT_GAP_M = 0.001  # gap below which two bodies count as touching
 SIGHT_M = 0.25
 """Gap between bodies below which one gives way to the other; this and the weights below were found by search."""
-PUSH = 1.0
-"""Weight of moving away from a near body, against 1 for moving to the goal."""
-SWERVE = 1.5
-"""Weight of passing a near body on the right."""
+PUSH = 1.0  # weight of moving away from a near body, against 1 for moving to the goal
+SWERVE = 1.5  # weight of passing a near body on the right
 _PILLAR_COLOR = "#707070"
 
 

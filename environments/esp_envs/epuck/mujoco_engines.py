@@ -116,8 +116,7 @@ def _compiled(arena: Arena, option: str, floor: str, robots: list[tuple[str, str
     </mujoco>""")
 
 
-SERVO_TIME_S = 0.015
-"""Time constant of the wheel servos in the plane; below the time step they would overshoot."""
+SERVO_TIME_S = 0.015  # time constant of the wheel servos in the plane; below the time step they would overshoot
 
 
 class MujocoPlanar(MujocoWorlds):
@@ -177,11 +176,9 @@ class MujocoPlanar(MujocoWorlds):
         return self._qvel.copy()
 
 
-CENTRE_HEIGHT_M = 0.020
-"""Of the mass, ours: at the axle, where the battery and the motors are."""
+CENTRE_HEIGHT_M = 0.020  # of the mass, ours: at the axle, where the battery and the motors are
 CASTER_RADIUS_M = 0.005
-CASTER_DISTANCE_M = 0.028
-"""Of each caster from the axle, ahead and behind; ours: just inside the body."""
+CASTER_DISTANCE_M = 0.028  # of each caster from the axle, ahead and behind; ours: just inside the body
 MOTOR_INERTIA = MASS_KG / 2 * WHEEL_RADIUS_M**2
 """kg m^2 of each rotor behind its gear, ours: as much as a wheel feels of the robot. Servo and contacts are solved
 one after the other, and a light wheel on a firm servo would be torn from the floor at every time step."""

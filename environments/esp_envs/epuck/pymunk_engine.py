@@ -20,10 +20,8 @@ from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
 from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, MASS_KG, Array, chord
 
-ITERATIONS = 100
-"""Iterations of the solver, which treats contacts in turn; with these many their order does not matter."""
-CONTACT_SLOP_M = 1e-4
-"""Overlap that is left alone."""
+ITERATIONS = 100  # iterations of the solver, which treats contacts in turn; with these many their order does not matter
+CONTACT_SLOP_M = 1e-4  # overlap that is left alone
 WALL_THICKNESS_M = 1.0
 _INERTIA = MASS_KG * BODY_RADIUS_M**2 / 2
 _FIELDS = (

@@ -14,18 +14,14 @@ Flags = NDArray[np.bool_]
 
 BODY_RADIUS_M = 0.037
 BODY_HEIGHT_M = 0.045
-MASS_KG = 0.16
-"""Body and wheels together."""
+MASS_KG = 0.16  # body and wheels together
 WHEEL_MASS_KG = 0.005
 WHEEL_RADIUS_M = 0.020
-AXLE_M = 0.052
-"""Distance between the wheels."""
-MAX_WHEEL_SPEED = 6.28
-"""rad/s; at full speed the robot drives 0.1256 m/s, or spins at 4.83 rad/s."""
+AXLE_M = 0.052  # distance between the wheels
+MAX_WHEEL_SPEED = 6.28  # rad/s; at full speed the robot drives 0.1256 m/s, or spins at 4.83 rad/s
 MAX_SPEED_M_S = MAX_WHEEL_SPEED * WHEEL_RADIUS_M
 MAX_SPIN_RAD_S = 2 * MAX_SPEED_M_S / AXLE_M
-FRICTION = 1.0
-"""Of the wheels on the floor: no wheel pushes harder than this times its share of the weight."""
+FRICTION = 1.0  # of the wheels on the floor: no wheel pushes harder than this times its share of the weight
 GRAVITY_M_S2 = 9.81
 DIMENSIONS = {
     "body_radius_m": BODY_RADIUS_M,

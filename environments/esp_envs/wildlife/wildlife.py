@@ -11,10 +11,12 @@ from torch import Tensor
 from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, TaskSpec, others_of
-from esp_envs.wildlife.pictures import all_pictures, cell_index
-from esp_envs.wildlife.wildlife_spec import MOVES, REST, STEP_COST, WildlifeSettings, wildlife_spec
+from esp_envs.wildlife.wildlife_spec import MOVES, PIXELS, REST, STEP_COST, WildlifeSettings, wildlife_spec
 
 _POACHER_COLOR = "#202020"
+_DRONE = ((0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (0.0, 1.0, 0.0))
+_POACHER = ((1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0))
+"""A plus and a cross: both are the same after every turn and mirror of the square."""
 
 
 class Wildlife(BatchedTask):
@@ -139,7 +141,8 @@ class Wildlife(BatchedTask):
     def _observe(self, world: World) -> Tensor:
         drones, poacher = world["cells"][:, :, :-1], world["cells"][:, :, -1:]
         settings = self.settings
-        picture = cell_index(self._wrap(poacher - drones), settings.width, settings.height)
+        x, y = self._wrap(poacher - drones).unbind(-1)
+        picture = (settings.height // 2 - y) * settings.width + x + settings.width // 2
         obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
         others = drones[:, :, self._others] - drones.unsqueeze(3)
         if settings.convention == "corrected":
@@ -209,3 +212,21 @@ class Wildlife(BatchedTask):
             chosen.append(cell)
         index = torch.stack(chosen, -1)
         return torch.stack([index % width, index // width], -1) - self._half
+
+
+def all_pictures(width: int, height: int) -> Tensor:
+    """Return every picture that a drone can see, by the cell of the poacher: [cells, 9 * cells], rows from the top.
+
+    It shows the whole torus with the drone in the middle. A poacher below the drone hides it.
+    """
+    pictures = torch.zeros(height, width, PIXELS * height, PIXELS * width)
+    _stamp(pictures, height // 2, width // 2, _DRONE)
+    for row in range(height):
+        for column in range(width):
+            _stamp(pictures[row, column], row, column, _POACHER)
+    return pictures.flatten(2).flatten(0, 1)
+
+
+def _stamp(picture: Tensor, row: int, column: int, stamp: tuple[tuple[float, ...], ...]) -> None:
+    y, x = PIXELS * row, PIXELS * column
+    picture[..., y : y + PIXELS, x : x + PIXELS] = torch.tensor(stamp)

@@ -10,13 +10,12 @@ from pydantic import model_validator
 from esp_envs.errors import UserError
 from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
-from esp_envs.wildlife.pictures import PIXELS
 
 REST = (0.0, 0.0)
 MOVES = Discrete(Kind.VECTOR, (REST, UP, RIGHT, DOWN, LEFT), ("rest", "up", "right", "down", "left"))
 """In the order of van der Pol's code; the meaning of each is the way to the next cell."""
-STEP_COST = 0.05
-"""What a step costs the whole team."""
+STEP_COST = 0.05  # what a step costs the whole team
+PIXELS = 3  # along a side of a cell in a drone's picture
 
 
 class WildlifeSettings(TaskSettings):

@@ -65,10 +65,9 @@ class NumpyPolicy:
         hidden = memory[..., : self.hidden]
         obs, x = x, np.concatenate([x, memory[..., self.hidden :]], -1)
         for layer, arrays in self.layers:
-            if layer["kind"] == "gru":
-                x = hidden = _recur(x, hidden, arrays)
-            else:
-                x = LAYERS[layer["kind"]](x, layer, arrays, obs)
+            remembers = layer["kind"] == "gru"
+            x = LAYERS[layer["kind"]](x, layer, arrays, hidden if remembers else obs)
+            hidden = x if remembers else hidden
         return x, hidden
 
     def _allowed(self, outputs: Any, action_mask: Any) -> Any:
@@ -91,7 +90,7 @@ class NumpyPolicy:
         )
 
 
-def _recur(x: Any, hidden: Any, arrays: list[Any]) -> Any:
+def _recur(x: Any, _: dict[str, Any], arrays: list[Any], hidden: Any) -> Any:
     """Advance the gated recurrent unit by one step."""
     p, q = x @ arrays[0] + arrays[1], hidden @ arrays[2] + arrays[3]
     (pr, pz, pn), (qr, qz, qn) = np.split(p, 3, -1), np.split(q, 3, -1)
@@ -133,9 +132,10 @@ LAYERS = {
     "relu": lambda x, *_: np.maximum(x, 0),
     "tanh": lambda x, *_: np.tanh(x),
     "norm": _normalise,
+    "gru": _recur,
     "slice": lambda x, layer, *_: x[..., layer["begin"] : layer["end"]],
     "convolution": _convolve,
     "global_max_pool": lambda x, layer, *_: x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1),
     "aggregate": _aggregate,
 }
-"""What a layer without memory makes of rows x [..., width], by its kind."""
+"""What a layer makes of rows x [..., width], with its arrays and the observations (a gru: its hidden state)."""
