@@ -105,7 +105,10 @@ def build_command(name: str, target: str) -> Any:
 def report(failure: Exception) -> int | None:
     """Print the sentence that a failure deserves and return its exit code; None where it is a bug without one."""
     if isinstance(failure, typer.TyperException):
-        return _report_usage(failure)
+        message, context = failures.own_words(failure.format_message()), getattr(failure, "ctx", None)
+        if message:  # empty where no argument was given at all: typer has shown the help already
+            console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
+        return failure.exit_code
     if isinstance(failure, typer.Abort):
         console.note("aborted")
         return EXIT_MACHINE
@@ -123,14 +126,6 @@ def report(failure: Exception) -> int | None:
         return None
     console.error(f"your code raises in {place}: {installed.last_line(failure)}; ESP_TRACEBACK=1 shows the traceback")
     return EXIT_USER
-
-
-def _report_usage(failure: typer.TyperException) -> int:
-    message = failures.own_words(failure.format_message())
-    context = getattr(failure, "ctx", None)
-    if message:  # empty where no argument was given at all: typer has shown the help already
-        console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
-    return failure.exit_code
 
 
 def _sentence(failure: UserError | ValidationError) -> str:
@@ -163,12 +158,11 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_VERSION = typer.Option("--version", help="Print the version and leave.", callback=_print_version, is_eager=True)
+
+
 @app.callback()
-def root(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version and leave.", callback=_print_version, is_eager=True)
-    ] = False,
-) -> None:
+def root(version: Annotated[bool, _VERSION] = False) -> None:
     """Train, evaluate and render multi-agent policies with the symmetry prior of ESP."""
 
 

@@ -139,18 +139,6 @@ def test_a_page_that_is_none_is_told_in_one_sentence(tmp_path):
         filled(tmp_path / "pipe.md")
 
 
-@pytest.mark.parametrize("fewer", ["MAPPO", "MAPPO-ESP"])
-def test_one_seed_proves_nothing_on_either_side(tmp_path: Path, fewer: str):
-    ends = {"MAPPO": [-119.5, -119.5, -119.5], "MAPPO-ESP": [-119.0, -118.0, -119.0]}
-    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
-    plain, esp = results.cells
-    assert side(results, esp, plain) == "ahead"
-    cut = {cell.variant: cell for cell in results.cells}
-    one = cut[fewer]
-    cut[fewer] = one.model_copy(update={"seeds": one.seeds[:1], "returns": {"greedy": one.returns["greedy"][:1]}})
-    assert side(results, cut["MAPPO-ESP"], cut["MAPPO"]) is None
-
-
 def test_each_method_gets_its_verdict(material):
     """Fading: within an error of ESP, then level with plain. Gate: 1 below ESP. Measured: as ESP, then ahead."""
     results = material.results
@@ -210,14 +198,6 @@ def test_a_page_has_one_column_for_each_method_and_marks_the_best(material):
     assert (both.headings[0], both.rows[3][0]) == ("run", "navigation, QMIX, 200, unbroken")
     cells = {name: cell.model_copy(update={"early": None}) for name, cell in series_of(results)[0].cells[0.3].items()}
     assert leaders(results, cells, early=True) == set()
-
-
-def test_who_leads_early_is_told_by_the_early_returns(tmp_path: Path):
-    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-110.0, -120.0, -130.0]}
-    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
-    cells = {cell.variant: cell.model_copy(update={"early": (-180.0, -190.0, -170.0)}) for cell in results.cells}
-    assert leaders(results, cells, early=True) == {"MAPPO", "MAPPO-ESP"}
-    assert leaders(results, cells, early=False) == {"MAPPO-ESP"}
 
 
 def test_equal_runs_are_level_and_one_seed_says_nothing(material):

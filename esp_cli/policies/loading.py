@@ -272,16 +272,14 @@ def _build(
 ) -> TrainedPolicy:
     if config.device == "cuda" and not torch.cuda.is_available():
         config = config.model_copy(update={"device": "cpu"})
-    step = meta.get("step")
-    if type(step) is not int or step < 0:
+    if type(step := meta.get("step")) is not int or step < 0:
         raise UserError(f"{path} is damaged: it does not say after how many steps it was written")
     misfit = f"{path}: the weights do not fit the configuration beside them"
     # Checked before worlds are made for every seed: a damaged configuration may ask for more than the memory holds.
     if {tuple(tensor.shape[:1]) for tensor in tensors.values()} != {(len(config.seeds),)}:
         raise UserError(f"{misfit} (seeds {', '.join(map(str, config.seeds[:10]))})")
     spec = spec_of(config)
-    version = meta.get("task_version", spec.version)
-    if version != spec.version:
+    if (version := meta.get("task_version", spec.version)) != spec.version:
         raise UserError(
             f"{path} was trained on {config.task} version {str(version)[:20]}, but this is version {spec.version}, in "
             "which observations, actions or rewards differ; use the esp that it was trained with, or train again"
@@ -293,8 +291,7 @@ def _build(
     network = _at_default(config.network, "compiled")  # using a policy needs no compiler
     policy = _untrained(config, spec, network).to(config.device)
     _fill(policy, tensors, path, misfit)
-    stopped = _stopped(meta, len(config.seeds))
-    if stopped:
+    if stopped := _stopped(meta, len(config.seeds)):
         seeds = ", ".join(str(config.seeds[k]) for k in stopped)
         notes = (*notes, f"{path}: training of seed {seeds} stopped early on a number that is not finite")
     return TrainedPolicy(config, policy, spec, step, path, notes, stopped)

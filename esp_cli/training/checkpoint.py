@@ -37,7 +37,7 @@ from esp_envs.spec import TaskSpec
 
 CHECKPOINT_FORMAT = "esp-checkpoint"
 _VERSION = 1  # of both formats
-_RESERVED = ("format", "version", "sha256")
+_RESERVED = {"format", "version", "sha256"}
 _MAX_HEADER_BYTES = 4 * 2**20  # parsed JSON takes some 20 times the space of its text
 _MAX_FILE_BYTES = 64 * 2**30
 _MAX_DIMENSIONS = 16
@@ -66,16 +66,14 @@ def save_checkpoint(
         meta: JSON-able description. The keys ``format``, ``version`` and ``sha256`` are the container's own.
         format_name: kind of file, asked for again when it is loaded.
     """
-    taken = [key for key in _RESERVED if key in meta]
-    if taken:
+    if taken := sorted(_RESERVED & meta.keys()):
         raise CheckpointError(f"cannot write {path}: the description may not use the reserved key '{taken[0]}'")
     try:
         # through JSON and back, so that the digest is of what a reader will see (lists for tuples, text keys)
         described = json.loads(json.dumps(dict(meta), allow_nan=False))
     except (TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"cannot write {path}: its description is not JSON ({error})") from None
-    stored = _storable(path, tensors)
-    described = {"format": format_name, "version": _VERSION, **described}
+    stored, described = _storable(path, tensors), {"format": format_name, "version": _VERSION, **described}
     described["sha256"] = digest(stored, described)
     content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
@@ -89,12 +87,7 @@ def load_checkpoint(
     format_name: str = CHECKPOINT_FORMAT,
     sha256: str | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read and verify what `save_checkpoint` wrote.
-
-    Args:
-        path: of the file.
-        format_name: kind of file that is expected.
-        sha256: of the whole file, where somebody else vouches for it (the file's own is verified in any case).
+    """Read and verify what `save_checkpoint` wrote, and a SHA-256 of the whole file where a manifest states one.
 
     Returns:
         The tensors by name, on the CPU, and the description without the container's own keys.
@@ -165,9 +158,7 @@ def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
             raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
         (header_bytes,) = struct.unpack("<Q", prefix)
         if header_bytes > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
-            raise CheckpointError(
-                "is truncated or no safetensors file: the header that it declares does not fit into it"
-            )
+            raise CheckpointError("is truncated or no safetensors file: its declared header does not fit into it")
         text = file.read(header_bytes)
         header = parse_object(text, "header")
         if not whole:
@@ -183,9 +174,10 @@ def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
 
 def _declared_bytes(header: Mapping[str, Any]) -> int:
     """Return where the data of the last tensor of a header ends; -1 where it does not say so."""
-    entries = [entry for name, entry in header.items() if name != "__metadata__"]
     try:
-        return max((int(entry["data_offsets"][1]) for entry in entries), default=0)
+        return max(
+            (int(entry["data_offsets"][1]) for name, entry in header.items() if name != "__metadata__"), default=0
+        )
     except (TypeError, KeyError, IndexError, ValueError):
         return -1
 
@@ -222,11 +214,9 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
 
 def same(a: Tensor, b: Tensor) -> bool:
     """Return whether two tensors are equal bit for bit, NaN included."""
-    if a.dtype != b.dtype or a.shape != b.shape:
-        return False
-    # a part of a longer buffer has strides that no view as bytes can have
-    a, b = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
-    return torch.equal(a, b)
+    # cloned, since a part of a longer buffer has strides that no view as bytes can have
+    x, y = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
+    return a.dtype == b.dtype and a.shape == b.shape and torch.equal(x, y)
 
 
 def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:

@@ -117,14 +117,10 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return one metric of the rows of a run; rows without it are left out, ``null`` is NaN.
+    """Return the steps [K] and values [K, S] of one metric in the rows of a run.
 
-    Returns:
-        Steps [K] (env steps per seed) and values [K, S]; a bare number is a value of one seed.
-
-    Raises:
-        NoMetricError: no row has the metric.
-        MetricsError: its rows differ in the number of seeds, or hold something else than numbers.
+    Rows without it are left out, ``null`` is NaN, a bare number is a value of one seed. Where no row has the metric,
+    that is a NoMetricError.
     """
     found = [(row["step"], row[name]) for row in rows if name in row]
     if not found:
@@ -166,23 +162,21 @@ class Metrics(Mapping[str, Floats]):
         self._whole: set[str] = set()
         for index, row in enumerate(rows):
             for name, value in row.items():
-                if name != "step":
-                    if name not in self._arrays:
-                        columns = len(self.seeds) if isinstance(value, list) else 1
-                        self._arrays[name] = np.full((len(rows), columns), math.nan)
-                        self._whole |= set() if isinstance(value, list) else {name}
-                    self._arrays[name][index] = np.array(value, dtype=np.float64)
+                if name == "step":
+                    continue
+                if name not in self._arrays:
+                    columns = len(self.seeds) if isinstance(value, list) else 1
+                    self._arrays[name] = np.full((len(rows), columns), math.nan)
+                    self._whole |= set() if isinstance(value, list) else {name}
+                self._arrays[name][index] = np.array(value, dtype=np.float64)
 
     def __getitem__(self, name: str) -> Floats:
-        """Return one metric [U, S]."""
         return self._arrays[name]
 
     def __iter__(self) -> Iterator[str]:
-        """Return the names."""
         return iter(self._arrays)
 
     def __len__(self) -> int:
-        """Return the number of metrics."""
         return len(self._arrays)
 
     def to_pandas(self) -> pandas.DataFrame:

@@ -90,7 +90,7 @@ class RunFolder:
 
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
-            config: resolved configuration, JSON-able; the keys ``format``, ``version`` and ``run_id`` are taken.
+            config: resolved configuration, JSON-able.
             initial: weights of the policy that the run starts from.
         """
         path = Path(path)
@@ -188,14 +188,10 @@ class RunFolder:
         self._remove_superseded()
 
     def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-        """Load the newest good checkpoint; `note` is told, in a sentence, of a damaged one that is passed over.
+        """Return the newest good checkpoint; `note` is told, in a sentence, of a damaged one that is passed over.
 
-        Returns:
-            Its tensors, on the CPU, and its description, with ``step``; None where the run has written none yet.
-
-        Raises:
-            RunFolderError: there are checkpoints, and all are damaged.
-            CheckpointError: the newest good one is of another run or another configuration.
+        It is tensors, on the CPU, and a description, with ``step``; None where the run has written none yet. Where all
+        are damaged, or the newest good one is of another run or configuration, that is an error.
         """
         problem = None
         for file in reversed(self.checkpoints()):
@@ -217,11 +213,10 @@ class RunFolder:
 
     def task_version(self) -> int | None:
         """Return the version of the task that the run was trained on; None where no good file states it."""
-        formats = [(self.policy_path, POLICY_FORMAT), *((file, CHECKPOINT_FORMAT) for file in self.checkpoints()[::-1])]
-        for file, format_name in formats:
+        for file in (self.policy_path, *reversed(self.checkpoints())):
             with contextlib.suppress(CheckpointError):
-                version = read_description(file, format_name).get("task_version")
-                if type(version) is int:
+                about = read_description(file, POLICY_FORMAT if file == self.policy_path else CHECKPOINT_FORMAT)
+                if type(version := about.get("task_version")) is int:
                     return version
         return None
 

@@ -1,12 +1,14 @@
-"""Opening: the program's own files are regular ones, never what somebody planted in their place."""
+"""Opening and holding: the program's own files are regular ones, never what somebody planted in their place."""
 
 from __future__ import annotations
 
 import os
+import signal
+from pathlib import Path
 
 import pytest
 
-from esp_cli.files.opening import open_own, read_regular
+from esp_cli.files.opening import LockError, acquire, is_held, open_own, read_regular, release
 
 FLAGS = pytest.mark.parametrize("flags", [os.O_RDWR, os.O_WRONLY | os.O_APPEND])
 
@@ -61,3 +63,21 @@ def test_reading_stops_at_a_bound(tmp_path):
     (tmp_path / "a").write_bytes(b"12345")
     assert read_regular(tmp_path / "a", 5) == b"12345"
     assert read_regular(tmp_path / "a", 4) is None
+
+
+def test_a_lock_is_let_go_of_though_a_forked_process_lives_on(tmp_path: Path) -> None:
+    file = tmp_path / "lock"
+    descriptor = acquire(file)
+    child = os.fork()
+    if not child:
+        signal.pause()
+    try:
+        assert is_held(file)
+        with pytest.raises(LockError, match=f"in use by process {os.getpid()}"):
+            acquire(file)
+        release(descriptor)
+        assert not is_held(file)
+        release(acquire(file))
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)

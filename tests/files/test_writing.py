@@ -106,24 +106,6 @@ def test_a_file_in_the_place_of_a_link_takes_no_permissions_from_its_target(tmp_
     assert (tmp_path / "policy").stat().st_mode & 0o111 == 0
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root makes device nodes")
-@pytest.mark.parametrize("through_link", [False, True])
-def test_a_device_node_is_written_through_and_stays(tmp_path, through_link):
-    null = tmp_path / "null"
-    try:
-        os.mknod(null, stat.S_IFCHR | 0o666, os.makedev(1, 3))
-        with null.open("wb"):
-            pass
-    except OSError as error:
-        pytest.skip(f"this machine makes no device nodes: {error}")
-    path = tmp_path / "link" if through_link else null
-    if through_link:
-        path.symlink_to(null)
-    write_file(path, b"x")
-    assert stat.S_ISCHR(null.stat().st_mode)
-    assert {entry.name for entry in tmp_path.iterdir()} == {"null", *(["link"] if through_link else [])}
-
-
 def test_the_null_device_takes_everything_and_stays():
     write_file("/dev/null", bytes(100_000))
     assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -51,18 +50,6 @@ def test_interval_agrees_with_the_normal_one_where_that_holds():
     assert high == pytest.approx(5 + half, abs=0.02)
 
 
-def test_interval_is_the_same_every_time_and_json():
-    interval = bootstrap_interval(TEN)
-    assert interval == bootstrap_interval(TEN)
-    assert interval[0] < np.mean(TEN) < interval[1]
-    assert json.loads(json.dumps(interval)) == list(interval)
-
-
-def test_interval_moves_and_scales_with_the_values():
-    low, high = bootstrap_interval(TEN)
-    assert bootstrap_interval(2 * np.array(TEN) + 7) == (pytest.approx(2 * low + 7), pytest.approx(2 * high + 7))
-
-
 @pytest.mark.parametrize("values", [[3.0], [3.0, 3.0, 3.0], [0.1] * 10])
 def test_where_the_bootstrap_cannot_tell_there_is_no_interval(values, recwarn):
     assert bootstrap_interval(values) is None
@@ -92,12 +79,6 @@ def test_interquartile_mean_by_hand():
     assert interquartile_mean(range(10)).value == 4.5
     # of three, none
     assert interquartile_mean([0, 0, 3]).value == 1.0
-
-
-def test_interquartile_mean_ignores_an_outlier_as_the_mean_does_not():
-    sample = [*TEN[:9], -1000.0]
-    assert interquartile_mean(sample).value > -125
-    assert mean_and_sem(sample)[0] < -200
 
 
 def test_aggregate_pools_all_seeds_of_all_tasks():
@@ -143,13 +124,6 @@ def test_pairing_removes_what_the_seeds_share():
         difference(x, y[:4], paired=True)
 
 
-def test_difference_turns_its_sign_with_its_groups():
-    x, y = TEN, [value - 5 + index for index, value in enumerate(TEN)]
-    assert difference(x, y).value == -difference(y, x).value
-    assert difference(x, x).value == 0.0
-    assert difference(x, x).ci95[0] < 0 < difference(x, x).ci95[1]
-
-
 def test_probability_of_improvement_by_hand():
     # pairs (1,0) (1,2) (3,0) (3,2): three wins of four
     assert probability_of_improvement([1.0, 3.0], [0.0, 2.0]).value == 0.75
@@ -165,15 +139,6 @@ def test_probability_of_improvement_by_hand():
 def test_probability_of_improvement_of_parted_groups_is_one_without_an_interval():
     assert probability_of_improvement([5.0, 6.0, 7.0], [1.0, 2.0]) == Estimate(1.0, None)
     assert probability_of_improvement([1.0, 2.0], [5.0, 6.0, 7.0]) == Estimate(0.0, None)
-
-
-def test_probability_of_improvement_agrees_with_counting():
-    rng = np.random.default_rng(1)
-    x, y = rng.integers(0, 5, 7).astype(float), rng.integers(0, 5, 9).astype(float)
-    counted = sum((a > b) + 0.5 * (a == b) for a in x for b in y) / 63
-    estimate = probability_of_improvement(x, y)
-    assert estimate.value == pytest.approx(counted)
-    assert estimate.ci95[0] < counted < estimate.ci95[1]
 
 
 def test_steps_to_threshold_by_hand():

@@ -218,31 +218,20 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
         ),
         ({"overrides": {"network.name": "cnn"}}, "unknown network 'cnn'; the networks are mlp, gru, mpn"),
         ({"overrides": {"network.name": [1]}}, "unknown network '[1]'; the networks are mlp"),
-        (
-            {"overrides": {"evaluation.often": 1}},
-            "unknown setting 'evaluation.often'; evaluation has every_steps, episodes",
-        ),
         ({"overrides": {"task.prey": "still"}}, "unknown setting 'task.prey'; task has convention, actions, horizon"),
         (
             {"overrides": {"mappo.num_envs": 0}},
             "bad value 0 for 'mappo.num_envs': input should be greater than or equal",
         ),
         ({"overrides": {"mappo.gamma": float("nan")}}, "bad value nan for 'mappo.gamma': it has to be a finite number"),
-        ({"overrides": {"network.hidden": "[64, wide]"}}, "bad value '[64, wide]' for 'network.hidden'"),
         ({"overrides": {"network.hidden": "64"}}, "bad value 64 for 'network.hidden': it has to be a list, as [64,64]"),
         ({"overrides": {"network.hidden": [64, "wide"]}}, "bad value 'wide' for 'network.hidden.1'"),
-        (
-            {"overrides": {"mappo.learning_rate": "inf"}},
-            "bad value inf for 'mappo.learning_rate': it has to be a finite",
-        ),
         ({"overrides": {"mappo.learning_rate": "1e999"}}, "bad value 1e999 for 'mappo.learning_rate': it has to be a"),
         (
             {"overrides": {"evaluation.every_steps": "9" * 400}},
             "for 'evaluation.every_steps': it has more than 64 bits",
         ),
         ({"overrides": {"mappo.num_envs": "true"}}, "bad value true for 'mappo.num_envs': it has to be a number"),
-        ({"overrides": {"mappo.gamma": "true"}}, "bad value true for 'mappo.gamma': it has to be a number"),
-        ({"overrides": {"task.horizon": "true"}}, "bad value true for 'task.horizon': it has to be a number"),
         ({"overrides": {"network.hidden": "[64,true]"}}, "bad value [64, true] for 'network.hidden': it has to be"),
         ({"overrides": {"network.hidden": "[" * 20_000}}, "for 'network.hidden'"),
         ({"steps": 10**30}, "for 'run.steps': input should be less than or equal to 1000000000000"),
@@ -270,12 +259,6 @@ def test_a_stored_configuration_is_read_back_as_it_was(task, choice):
     stored = json.loads(json.dumps(config.model_dump(mode="json"), allow_nan=False))
     assert parse_config(stored, Path("run")) == config
     assert isinstance(parse_config(stored, Path("run")), RunConfig)
-
-
-def test_a_configuration_cannot_be_changed_afterwards():
-    config = resolve_config("navigation")
-    with pytest.raises(ValueError, match="frozen"):
-        config.steps = 5
 
 
 def test_a_stored_configuration_gets_the_settings_that_came_later_and_keeps_its_own() -> None:

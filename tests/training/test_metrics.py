@@ -82,15 +82,6 @@ def test_a_full_disk_names_the_file(tmp_path, full_disk):
     assert caught.value.filename == str(tmp_path / "m.jsonl")
 
 
-def test_a_planted_link_is_not_written_to(tmp_path):
-    mine = tmp_path / "mine.txt"
-    mine.write_text("mine\n")
-    (tmp_path / "m.jsonl").symlink_to(mine)
-    with pytest.raises(MetricsError, match="no regular file is there; remove it"):
-        MetricsWriter(tmp_path / "m.jsonl").write(1, {"train/loss": [1.0]})
-    assert mine.read_text() == "mine\n"
-
-
 def test_column_is_steps_and_values_per_seed(path):
     rows = read_metrics(path)
     steps, values = column(rows, "train/loss")
@@ -149,18 +140,6 @@ def test_truncating_keeps_the_rows_up_to_a_step_byte_for_byte(path):
     assert truncate_metrics(path, 200) == 0
     assert truncate_metrics(path, 0) == 2
     assert path.read_bytes() == b""
-
-
-@pytest.mark.parametrize("torn", [b"", b'{"step": 400, "tr', b"\x00\x00\x00"])
-def test_a_resumed_file_equals_that_of_an_uninterrupted_run(path, tmp_path, torn):
-    path.write_bytes(path.read_bytes() + torn)
-    truncate_metrics(path, 200)
-    through = tmp_path / "through.jsonl"
-    through.write_bytes(path.read_bytes())
-    for target in (path, through):
-        with MetricsWriter(target) as writer:
-            writer.write(300, {"train/loss": [0.1, 0.2]})
-    assert path.read_bytes() == through.read_bytes()
 
 
 def test_a_torn_line_does_not_swallow_the_next_row(path):

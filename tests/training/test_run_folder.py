@@ -5,22 +5,16 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
 
 import pytest
 import torch
 
 from esp_cli.files.writing import TEMPORARY_PREFIX
-from esp_cli.training.checkpoint import CheckpointError, load_checkpoint
-from esp_cli.training.metrics import MetricsWriter, read_metrics, truncate_metrics
+from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.faults import Fault
 
 CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def weights(step):
@@ -120,16 +114,10 @@ def test_create_on_a_file_or_without_permission_is_one_sentence(tmp_path):
     ("content", "text"),
     [
         (None, "is no run folder: it has no config.json"),
-        (b"", "not valid JSON"),
         (b'{"format": "esp-run", "version": 1, "ta', "not valid JSON"),
-        (b"\xff\xfe", "not valid JSON"),
-        (b"[" * 100_000, "not valid JSON"),
-        (b'{"format": "esp-run", "version": 1, "x": NaN}', "not valid JSON"),
-        (b"[]", "no JSON object"),
         (b'{"model_type": "llama"}', "is foreign: it is not the configuration of a run of esp"),
-        (b'{"format": "esp-run", "version": "1"}', "is foreign"),
         (b'{"format": "esp-run", "version": 2}', "written by a newer esp"),
-        (b" " * (17 * 2**20), "larger than the configuration of a run can be"),
+        (b'{"format": "esp-run", "version": 1, "run_id": 3}', "is damaged: its run_id is not a text"),
     ],
 )
 def test_a_folder_that_is_no_run_is_one_sentence(tmp_path, content, text):
@@ -137,7 +125,6 @@ def test_a_folder_that_is_no_run_is_one_sentence(tmp_path, content, text):
         (tmp_path / "config.json").write_bytes(content)
     with pytest.raises(RunFolderError, match=re.escape(text)) as caught:
         RunFolder.open(tmp_path)
-    assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(str(tmp_path))
 
 
@@ -238,64 +225,19 @@ def test_a_damaged_future_does_not_push_out_good_checkpoints(folder):
     assert names(folder) == ["step-000000000100.safetensors", "step-000000000200.safetensors"]
 
 
-def test_a_policy_file_stands_alone(folder):
-    folder.write_policy(weights(3), {"task": "navigation", "network": "mlp", "activation": "tanh"})
-    tensors, meta = load_checkpoint(folder.policy_path, POLICY_FORMAT)
-    assert meta == {"task": "navigation", "network": "mlp", "activation": "tanh"}
-    assert tensors["weight"].tolist() == [3.0] * 4
-    with pytest.raises(CheckpointError, match="'esp-checkpoint' is needed"):
-        load_checkpoint(folder.policy_path)
-
-
-def test_metrics_past_the_checkpoint_go_before_a_run_goes_on(folder):
-    with MetricsWriter(folder.metrics_path) as writer:
-        for step in (100, 200, 300):
-            writer.write(step, {"train/loss": [float(step)]})
-    write_checkpoints(folder, 200)
-    assert truncate_metrics(folder.metrics_path, 200) == 1
-    assert [row["step"] for row in read_metrics(folder.metrics_path)] == [100, 200]
-    folder.metrics_path.unlink()
-    assert truncate_metrics(folder.metrics_path, 200) == 0
-    assert read_metrics(folder.metrics_path) == []
-
-
 # Processes
-
-HOLDER = """
-import sys, time
-from esp_cli.training.run_folder import RunFolder
-with RunFolder.open(sys.argv[1]).lock():
-    print("held", flush=True)
-    time.sleep(60)
-"""
-
-
-def test_a_second_process_is_refused_until_the_first_is_killed(folder):
-    holder = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, str(folder.path)], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert holder.stdout.readline() == "held\n"
-        with (
-            pytest.raises(RunFolderError, match=rf"is in use by process {holder.pid} on '.+'; wait for it, or stop it"),
-            folder.lock(),
-        ):
-            pytest.fail("two processes hold one folder")
-        (folder.path / "config.json").unlink()  # as if the other process were still making the folder
-        with pytest.raises(RunFolderError, match="is in use by"):
-            RunFolder.create(folder.path, CONFIG)
-    finally:
-        holder.kill()
-        holder.wait()
-        holder.stdout.close()
-    with folder.lock():
-        owner = json.loads((folder.path / "run.lock").read_text())
-    assert owner["pid"] == os.getpid()
 
 
 def test_one_process_cannot_hold_a_folder_twice_but_again(folder):
-    with folder.lock(), pytest.raises(RunFolderError, match=f"is in use by process {os.getpid()}"), folder.lock():
-        pytest.fail("held twice")
+    with folder.lock():
+        with (
+            pytest.raises(RunFolderError, match=f"is in use by process {os.getpid()} on '.+'; wait for it"),
+            folder.lock(),
+        ):
+            pytest.fail("held twice")
+        (folder.path / "config.json").unlink()  # as if another process were still making the folder
+        with pytest.raises(RunFolderError, match="is in use by"):
+            RunFolder.create(folder.path, CONFIG)
     with folder.lock():
         pass
 
@@ -313,63 +255,6 @@ def test_locking_removes_what_a_killed_process_left_half_written(folder):
     rest.write_bytes(b"half")
     with folder.lock():
         assert not rest.exists()
-
-
-# A run whose state is a number: x <- x + noise. Steps come in hundreds, and a checkpoint follows every third row.
-RUNNER = """
-import sys
-import torch
-torch.set_num_threads(1)
-from esp_cli.training.metrics import MetricsWriter, truncate_metrics
-from esp_cli.training.run_folder import RunFolder
-
-folder, last = RunFolder.open(sys.argv[1]), int(sys.argv[2])
-with folder.lock():
-    generator, step, x = torch.Generator().manual_seed(0), 0, torch.zeros(1)
-    found = folder.latest_checkpoint(print)
-    if found is not None:
-        tensors, meta = found
-        step, x = meta["step"], tensors["x"]
-        generator.set_state(tensors["generator"])
-    truncate_metrics(folder.metrics_path, step)
-    print("running", flush=True)
-    with MetricsWriter(folder.metrics_path) as writer:
-        while step < last:
-            step += 100
-            x = x + torch.rand(1, generator=generator)
-            writer.write(step, {"train/x": x})
-            if step % 300 == 0 or step == last:
-                folder.write_checkpoint(step, {"x": x, "generator": generator.get_state()}, {})
-print("done")
-"""
-
-
-@pytest.mark.slow
-def test_a_run_killed_again_and_again_equals_one_that_ran_through(tmp_path):
-    through = RunFolder.create(tmp_path / "through", CONFIG)
-    killed = RunFolder.create(tmp_path / "killed", CONFIG)
-    command = [sys.executable, "-c", RUNNER]
-    for delay in (0.03, 0.08):
-        process = subprocess.Popen(
-            [*command, str(killed.path), str(10**9)], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True
-        )
-        assert process.stdout.readline() == "running\n"
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.wait(delay)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-    rows = read_metrics(killed.metrics_path)
-    found = killed.latest_checkpoint(pytest.fail)
-    assert rows
-    assert rows[-1]["step"] >= (found[1]["step"] if found else 0), "a checkpoint stands for rows that are not there"
-    last = rows[-1]["step"] + 1000
-    both = [subprocess.Popen([*command, str(f.path), str(last)], env=ENVIRONMENT) for f in (through, killed)]
-    assert [process.wait(60) for process in both] == [0, 0]
-    assert killed.metrics_path.read_bytes() == through.metrics_path.read_bytes()
-    assert len(read_metrics(killed.metrics_path)) == last // 100
-    assert torch.equal(killed.latest_checkpoint(pytest.fail)[0]["x"], through.latest_checkpoint(pytest.fail)[0]["x"])
-    assert not list(killed.path.rglob(f"{TEMPORARY_PREFIX}*"))
 
 
 def test_planted_links_in_a_run_folder_lead_nowhere(folder, tmp_path):

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,8 +21,6 @@ from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trainer import Trainer, checkpoint_seconds
 from tests.forks import fork, said, wait
 from tests.training.runs import tiny_config, tiny_folder
-
-ESP = "from esp_cli.app import main; main()"
 
 
 def trainer(folder):
@@ -340,12 +336,6 @@ def test_a_wrong_number_of_seconds_between_checkpoints_is_one_sentence(monkeypat
     assert checkpoint_seconds() == 0.5
 
 
-def _start(folder):
-    command = [sys.executable, "-c", ESP, "train", "--resume", str(folder)]
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "ESP_CHECKPOINT_SECONDS": "0.1"}
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment, text=True)
-
-
 def _newest(folder):
     """The step of the newest checkpoint, 0 before the first."""
     return max((int(file.name[5:17]) for file in (folder / "checkpoints").glob("step-*")), default=0)
@@ -391,20 +381,6 @@ def test_a_killed_process_is_resumed_bit_for_bit_and_a_second_one_is_refused(tmp
     assert untimed(straight) == untimed(killed)
 
 
-def test_an_interrupt_stops_cleanly_with_the_command_to_go_on(tmp_path):
-    folder = tiny_folder(tmp_path / "run", steps=10_000_000)
-    process = _start(folder.path)
-    _wait_for_steps(folder.path, 0)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert f"esp train --resume {folder.path}" in stderr
-    assert "Traceback" not in stderr
-    tensors, meta = load_checkpoint(folder.checkpoints()[-1])
-    assert meta["step"] == read_metrics(folder.metrics_path)[-1]["step"]
-    assert tensors
-
-
 def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
     folder = tiny_folder(tmp_path / "run")
     trainer(folder).run(lambda news: True)
@@ -422,12 +398,3 @@ def test_the_policy_file_acts_as_the_run_does_and_describes_itself(tmp_path):
     }
     assert len(meta["greedy_returns"]) == 2
     assert run.step == alone.step == 300
-
-
-def test_a_checkpoint_that_does_not_say_where_its_run_stands_is_refused_in_one_sentence(tmp_path):
-    folder = tiny_folder(tmp_path / "run")
-    trainer(folder).run(stop_after(2))
-    tensors, meta = folder.latest_checkpoint(pytest.fail)
-    folder.write_checkpoint(meta["step"] + 50, tensors, {"iteration": "many"})
-    with pytest.raises(ValueError, match="does not say where its run stands"):
-        trainer(folder)

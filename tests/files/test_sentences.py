@@ -1,4 +1,4 @@
-"""Failures of the file system: which the user can correct, and what the sentence says."""
+"""What sentences say: of failures of the file system, and of a name near one that nobody knows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import pytest
 
 from esp_cli.files import failures
+from esp_cli.files.formatting import did_you_mean, nearest
 
 
 class ToyError(ValueError):
@@ -31,3 +32,23 @@ def test_a_failure_of_the_machine_passes_and_names_the_path(number):
     assert caught.value.errno == number
     assert not failures.is_correctable(caught.value)
     assert failures.sentence(caught.value).startswith(f"{os.strerror(number).lower()}: a/b; ")
+
+
+NAMES = ("learning_rate", "clip_epsilon", "gamma", "num_envs")
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("learing_rate", "learning_rate"),
+        ("lr", "learning_rate"),
+        ("clip", "clip_epsilon"),
+        ("gama", "gamma"),
+        ("colour", None),
+        ("", None),
+        ("x", None),
+    ],
+)
+def test_a_typing_error_an_abbreviation_and_a_part_find_their_name(text: str, name: str | None) -> None:
+    assert nearest(text, NAMES) == name
+    assert did_you_mean(text, NAMES) == (f"; did you mean '{name}'?" if name else "")
