@@ -14,7 +14,7 @@ import os
 import socket
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -77,22 +77,20 @@ def acquire(file: Path) -> int:
         LockError: another process, or this one, holds it already, or something else than a regular file is there.
         OSError: the file system cannot lock.
     """
-    with attempting("lock", file, LockError):
+    with attempting("lock", file, LockError), ExitStack() as undo:
         descriptor = open_own(file, os.O_RDWR)
+        undo.callback(os.close, descriptor)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-            # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
-            os.pwrite(descriptor, owner.encode(), 0)
-            os.ftruncate(descriptor, len(owner.encode()))
-            folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except BlockingIOError:
             holder = _holder(os.pread(descriptor, 4096, 0))
-            os.close(descriptor)
             raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
-        except OSError:
-            os.close(descriptor)
-            raise
+        owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+        # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
+        os.pwrite(descriptor, owner.encode(), 0)
+        os.ftruncate(descriptor, len(owner.encode()))
+        folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        undo.pop_all()
     _held[descriptor] = HeldFolder(_absolute(file.parent), file.name, folder, descriptor, os.getpid())
     try:
         require_held(file)

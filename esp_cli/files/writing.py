@@ -47,11 +47,10 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
         write(content)
 
 
-def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) -> None:
+def mend_last_line(path: Path) -> None:
     """Remove what a kill left behind the last line break, so that the next line does not run into it.
 
-    Where `is_whole` says that what is left is a line that lacks its break alone, it gets one. A last line longer than
-    any line can be is a UserError.
+    A last line longer than any line can be is a UserError.
     """
     if not path.exists():
         return
@@ -62,12 +61,7 @@ def mend_last_line(path: Path, is_whole: Callable[[bytes], bool] | None = None) 
                 raise UserError(f"{path} is damaged: its last line has more than 16 MiB; remove that line")
             start = file.seek(max(0, size - max(2 * len(tail), TAIL_BYTES)))
             tail = file.read(size - start)
-        last = tail.rpartition(b"\n")[2]
-        if last and is_whole is not None and is_whole(last):
-            file.seek(size)
-            file.write(b"\n")
-        elif last:
-            file.truncate(size - len(last))
+        file.truncate(size - len(tail.rpartition(b"\n")[2]))
 
 
 @contextlib.contextmanager

@@ -22,6 +22,7 @@ from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import default_transforms
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make, task_class
+from esp_envs.spec import TaskSpec
 
 SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
 """The sections that settings of every run have, and where its configuration holds them."""
@@ -80,11 +81,12 @@ class RunConfig(Strict):
             "task": task.without_effect(),
             "prior": self.prior.without_effect() | of_others,
             "network": self.network.without_effect() | ({"compiled"} if self.device == "cuda" else set()),
-            self.algorithm: settings.without_effect(
-                self.network, lambda: make(self.task, 1, (0,), self.task_settings).spec
-            ),
+            self.algorithm: settings.without_effect(self.network, self._spec),
         }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
+
+    def _spec(self) -> TaskSpec:
+        return make(self.task, 1, (0,), self.task_settings).spec
 
     def own_words(self, *others: RunConfig) -> list[str]:
         """Return the options that name code of the user in a command about runs, each once: ["--task", "mine:Task"]."""
@@ -135,17 +137,16 @@ def resolve_config(
     """Resolve a preset and overrides into a full configuration.
 
     Args:
-        task: registered task name.
-        algorithm: registered algorithm name.
+        task: registered name.
+        algorithm: registered name.
         preset: one of the algorithm's: "default" takes what measured best on the task, where that is known, "fast"
             what reaches the same return in fewer seconds.
         steps: environment steps per seed.
-        seeds: run seeds.
+        seeds: of the run.
         device: "cpu" or "cuda".
         overrides: dotted names to values, such as "mappo.learning_rate"; text is read as JSON where that is possible.
 
-    Raises:
-        UserError: an unknown name or a value out of range, in one sentence.
+    An unknown name or a value out of range is a UserError.
     """
     sections = _preset_sections(task, algorithm, preset)
     _override(sections, overrides or {}, task, algorithm)

@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,8 @@ from torch import Tensor
 
 from esp_cli.files.failures import attempting
 from esp_cli.files.opening import open_own, open_regular, require_held
-from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, mend_last_line, replacing, write_all
-from esp_cli.training.trackers import Sink
+from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
+from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,41 +44,40 @@ class NoMetricError(MetricsError):
 
 
 class MetricsWriter:
-    """Appends rows to a JSONL file, and hands each to sinks, which are closed with it; a torn last line is removed."""
+    """Appends rows to a JSONL file that `truncate_metrics` has mended, and hands each to trackers, closed with it."""
 
-    def __init__(self, path: str | os.PathLike[str], sinks: Sequence[Sink] = ()) -> None:
-        self._path = Path(path)
-        self._sinks = sinks
+    def __init__(self, path: str | os.PathLike[str], trackers: Sequence[Guarded] = ()) -> None:
+        self._path, self._trackers = Path(path), trackers
         with attempting("write", self._path, MetricsError):
-            mend_last_line(self._path, lambda line: _parse(line) is not None)
             self._descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND)
 
     def __enter__(self) -> MetricsWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        os.close(self._descriptor)
+        for tracker in self._trackers:
+            tracker.close()
 
-    def write(self, step: int, values: Mapping[str, Value]) -> None:
-        """Append one row at a step: by name ("train/...", "eval/...", "time/...") a number, or one per seed [S]."""
-        row: dict[str, Any] = {"step": int(step)}
+    def write(self, step: int, values: Mapping[str, Value], without: Collection[int] = ()) -> dict[str, Any]:
+        """Append one row at a step: by name ("train/...", "eval/...", "time/...") a number, or one per seed [S].
+
+        Return the row, in which the seeds at the places `without` have no numbers.
+        """
+        row: dict[str, Any] = {}
         for name, value in values.items():
             if name == "step":
                 raise MetricsError("'step' is the row's own column; give the metric another name")
-            row[name] = _plain(name, value)
-        line = json.dumps(row, allow_nan=False, separators=(",", ":")).encode() + b"\n"
+            row[name] = numbers = _plain(name, value)
+            if isinstance(numbers, list):
+                row[name] = [None if k in without else number for k, number in enumerate(numbers)]
+        line = json.dumps({"step": int(step), **row}, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with attempting("write", self._path, MetricsError):
             require_held(self._path)
             write_all(self._descriptor, line)
-        del row["step"]
-        for sink in self._sinks:
-            sink.write(int(step), row)
-
-    def close(self) -> None:
-        """Close the file and the sinks."""
-        os.close(self._descriptor)
-        for sink in self._sinks:
-            sink.close()
+        for tracker in self._trackers:
+            tracker.write(int(step), row)
+        return row
 
 
 def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
@@ -99,21 +98,18 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     return row or {}
 
 
-def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> int:
+def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
     """Rewrite a metrics file, or make it, without a torn last line and without the rows past the step of a checkpoint.
 
-    What remains is kept byte for byte. Return the number of whole rows removed.
+    What remains is kept byte for byte.
     """
-    path, removed = Path(path), 0
+    path = Path(path)
     with attempting("write", path, MetricsError):
         os.close(open_own(path, os.O_WRONLY))
     with attempting("write", path, MetricsError), replacing(path) as write:
         for line, row in _rows(path):
             if row["step"] <= last_step:
                 write(line + b"\n")
-            else:
-                removed += 1
-    return removed
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

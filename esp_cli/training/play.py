@@ -4,23 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from esp_cli.networks.policy import Policy
 from esp_envs.base import Environment, Observation
-
-
-class Controller(Protocol):
-    """Chooses joint actions: a trained policy or a reference policy."""
-
-    def begin(self, env: Environment, observation: Observation) -> None:
-        """Prepare for new episodes in all worlds."""
-
-    def act(self, env: Environment, observation: Observation) -> Tensor:
-        """Return what `Environment.step` takes."""
 
 
 class PolicyController:
@@ -30,11 +19,11 @@ class PolicyController:
         self.policy, self.generators = policy, generators
 
     def begin(self, env: Environment, observation: Observation) -> None:
-        """Empty the memory."""
+        """Empty the memory, for new episodes in all worlds."""
         self.memory = self.policy.initial_memory(env.num_envs, observation.obs)
 
     def act(self, env: Environment, observation: Observation) -> Tensor:
-        """Return the greedy or a drawn action."""
+        """Return the greedy or a drawn action, as `Environment.step` takes it."""
         noise = None
         if self.generators is not None:
             shape = (env.num_envs, env.spec.num_agents)
@@ -59,6 +48,10 @@ class ScriptedController:
     def act(self, env: Environment, observation: Observation) -> Tensor:
         """Return what the task's policy chooses."""
         return self._choose(env)
+
+
+Controller = PolicyController | ScriptedController
+"""Chooses joint actions."""
 
 
 @dataclass(frozen=True)

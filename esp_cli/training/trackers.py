@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from esp_cli.files.documents import flat
 from esp_cli.files.opening import own_folder
@@ -31,16 +31,6 @@ class TrackedRun:
     seeds: tuple[int, ...]  # in the order of the metrics
     config: Mapping[str, Any]  # resolved
     first_step: int = 0  # rows after it are written again by a resumed run
-
-
-class Sink(Protocol):
-    """Takes the rows of a run's metrics as they come."""
-
-    def write(self, step: int, values: Row) -> None:
-        """Take one row at a step (environment steps per seed)."""
-
-    def close(self) -> None:
-        """Flush and close; nothing is written afterwards."""
 
 
 class TensorBoard:
@@ -169,7 +159,8 @@ class MlFlow:
         self._client.set_terminated(self._run_id)
 
 
-TRACKERS: dict[str, Callable[[TrackedRun], Sink]] = {
+Tracker = TensorBoard | WeightsAndBiases | MlFlow
+TRACKERS: dict[str, Callable[[TrackedRun], Tracker]] = {
     "tensorboard": TensorBoard,
     "wandb": WeightsAndBiases,
     "mlflow": MlFlow,
@@ -180,13 +171,13 @@ TRACKERS: dict[str, Callable[[TrackedRun], Sink]] = {
 class Guarded:
     """A sink that hands rows to a tracker until the tracker fails; the failure becomes one sentence for the user."""
 
-    def __init__(self, name: str, make: Callable[[], Sink], tell: Callable[[str], None]) -> None:
+    def __init__(self, name: str, make: Callable[[], Tracker], tell: Callable[[str], None]) -> None:
         self._name, self._tell = name, tell
-        self._tracker: Sink | None = None
+        self._tracker: Tracker | None = None
         self._attempt("open", lambda: setattr(self, "_tracker", make()))
 
     def write(self, step: int, values: Row) -> None:
-        """Hand over one row, unless the tracker has failed before."""
+        """Hand over one row at a step (environment steps per seed), unless the tracker has failed before."""
         if (tracker := self._tracker) is not None:
             self._attempt("write", lambda: tracker.write(step, values))
 

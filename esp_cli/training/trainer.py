@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor
 
 from esp_cli.algorithms.normalisation import with_variances
@@ -35,16 +35,12 @@ def checkpoint_seconds() -> float:
     return float(text)
 
 
-CHECKPOINT_SECONDS = checkpoint_seconds()
-"""Seconds between checkpoints, which are what a kill can lose. Set by ESP_CHECKPOINT_SECONDS."""
-CHECKPOINT_SPACING = 20
-"""The next checkpoint waits at least this many times as long as the last one took; a large replay takes seconds."""
+CHECKPOINT_SECONDS = checkpoint_seconds()  # between checkpoints, which are what a kill can lose
+CHECKPOINT_SPACING = 20  # the next one waits at least so many times as long as the last one took
 
 
 class Standing(BaseModel):
     """Where a run stands, as its checkpoint says; steps are per seed."""
-
-    model_config = ConfigDict(frozen=True)
 
     step: int = Field(ge=0)
     iteration: int = Field(ge=0)
@@ -82,10 +78,6 @@ class Trainer:
         folder: where results go; held by the caller's lock. A checkpoint found there is continued.
         track: names of trackers that get the metrics too.
         check: take a short look at a task that is not built in before the first step, and note what it found.
-
-    Raises:
-        UserError: the checkpoint does not fit the configuration or is gone from a finished run, or a tracker is not
-            installed.
     """
 
     def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = (), check: bool = True) -> None:
@@ -126,10 +118,7 @@ class Trainer:
         return {mode: column(rows, f"eval/return_{mode}")[1][-1] for mode in ("greedy", "stochastic")}
 
     def run(self, listener: Listener) -> bool:
-        """Train to the end or until the listener asks to stop.
-
-        Returns:
-            Whether the run is complete.
+        """Train to the end or until the listener asks to stop; return whether the run is complete.
 
         Raises:
             UserError: every seed stopped on a number that is not finite.
@@ -217,12 +206,7 @@ class Trainer:
 
     def _record(self, writer: MetricsWriter, row: dict[str, Any], listener: Listener) -> bool:
         """Write a metrics row, without the numbers of stopped seeds, and tell the listener."""
-        values = {name: value.tolist() if isinstance(value, Tensor) else value for name, value in row.items()}
-        for name, numbers in values.items():
-            if isinstance(numbers, list):
-                values[name] = [None if k in self.stopped_seeds else x for k, x in enumerate(numbers)]
-        writer.write(self.step, values)
-        notes = tuple(self.notes)
+        values, notes = writer.write(self.step, row, self.stopped_seeds), tuple(self.notes)
         self.notes.clear()
         return listener(Progress(self.step, self.config.steps, values, notes)) is not False
 
