@@ -63,7 +63,8 @@ class Run:
         config: that decides its numbers.
 
     Raises:
-        UserError: there is no run, or its configuration is damaged or of another version.
+        UserError: here and in all methods, what a caller can correct: there is no run, it is damaged or of another
+            version, it has no checkpoint yet, another process trains it, or an argument does not fit it.
     """
 
     def __init__(
@@ -100,9 +101,6 @@ class Run:
         Args:
             track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
             check: take a short look at a task that is not built in before a new run begins.
-
-        Raises:
-            UserError: another process trains it, or its device or a tracker is not there.
         """
         resolve_device(self.config.device)
         with self.folder.lock():
@@ -115,9 +113,6 @@ class Run:
             listener: told of progress after every update; False asks for a clean stop.
             track: as of `trainer`.
             check: as of `trainer`.
-
-        Raises:
-            UserError: another process trains it, or no seed has finite numbers any more.
         """
         with self.trainer(track, check) as trainer:
             return (trainer.is_complete and self.is_complete) or trainer.run(listener or (lambda _: True))
@@ -128,9 +123,6 @@ class Run:
         Args:
             episodes: per seed, greedy and stochastic each.
             settings: of the task, without the prefix "task.", where they differ from those of training.
-
-        Raises:
-            UserError: there is no checkpoint yet, or a setting does not fit the policy.
         """
         return evaluate_policy(self._trained(settings), episodes)
 
@@ -157,9 +149,6 @@ class Run:
             speed: times real time.
             greedy: whether it takes its most probable actions, or draws them.
             settings: as of `evaluate`.
-
-        Raises:
-            UserError: another ending, no checkpoint yet, no such seed or view.
         """
         from esp_cli.drawing.draw import Request, draw  # noqa: PLC0415 - training needs no plotting
 

@@ -36,19 +36,15 @@ def page(tmp_path):
 
 
 def test_what_stands_between_the_marks_is_computed_and_the_rest_stays(page):
-    text = filled(page)
+    example = "```\n  <!-- results: measured/no.json paper -->\n  <!-- end of results -->\n```\n"  # indented
+    page.write_text(example + page.read_text())
+    assert filled(page).startswith(example)
+    text = filled(page).removeprefix(example)
     assert "stale" not in text
     assert "| navigation, 200 | -150.00 ± 5.77 | -130.00 ± 5.77 |" in text
     assert text.startswith("# Before\n\n<!-- results: measured/a.json returns -->\n\n| ")
     assert "\n\nbetween\n\n" in text
     assert text.endswith("<!-- end of results -->\n\nafter\n")
-    assert files_of(page) == ["measured/a.json"]
-
-
-def test_an_indented_example_stays_as_it_is(page):
-    example = "```\n  <!-- results: measured/no.json paper -->\n  <!-- end of results -->\n```\n"
-    page.write_text(example + page.read_text())
-    assert filled(page).startswith(example)
     assert files_of(page) == ["measured/a.json"]
 
 

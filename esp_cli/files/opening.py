@@ -63,48 +63,38 @@ class HeldFolder:
 _held: dict[int, HeldFolder] = {}  # by the descriptor of the lock
 
 
-def acquire(file: Path) -> int:
+@contextmanager
+def holding(file: Path, kind: type[UserError] = LockError) -> Iterator[None]:
     """Hold the folder of a lock file, and write into the file who holds it.
 
     The kernel lets go when the process ends, however it ends. The file stays: removing it would let two processes hold
     two files of one name. While the folder is held, whatever `esp_cli.files` writes or removes in it is written or
     removed in this very folder.
 
-    Returns:
-        The descriptor of the file; `release` of it lets go of the folder.
-
     Raises:
-        LockError: another process, or this one, holds it already, or something else than a regular file is there.
+        kind: another process, or this one, holds it already, or something else than a regular file is there.
         OSError: the file system cannot lock.
     """
-    with attempting("lock", file, LockError), ExitStack() as undo:
-        descriptor = open_own(file, os.O_RDWR)
-        undo.callback(os.close, descriptor)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = _holder(os.pread(descriptor, 4096, 0))
-            raise LockError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
-        owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-        # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
-        os.pwrite(descriptor, owner.encode(), 0)
-        os.ftruncate(descriptor, len(owner.encode()))
-        folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        undo.pop_all()
-    _held[descriptor] = HeldFolder(_absolute(file.parent), file.name, folder, descriptor, os.getpid())
-    try:
+    with ExitStack() as undo:
+        with attempting("lock", file, kind):
+            descriptor = open_own(file, os.O_RDWR)
+            undo.callback(os.close, descriptor)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                holder = _holder(os.pread(descriptor, 4096, 0))
+                raise kind(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
+            undo.callback(fcntl.flock, descriptor, fcntl.LOCK_UN)  # also for processes that are forked meanwhile
+            owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
+            # In this order, so that a process that is refused meanwhile finds a name and not an empty file.
+            os.pwrite(descriptor, owner.encode(), 0)
+            os.ftruncate(descriptor, len(owner.encode()))
+            folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            undo.callback(os.close, folder)
+        _held[descriptor] = HeldFolder(_absolute(file.parent), file.name, folder, descriptor, os.getpid())
+        undo.callback(_held.pop, descriptor)
         require_held(file)
-    except BaseException:
-        release(descriptor)
-        raise
-    return descriptor
-
-
-def release(descriptor: int) -> None:
-    """Let go of a folder that `acquire` holds, also for processes that were forked meanwhile."""
-    os.close(_held.pop(descriptor).folder_fd)
-    fcntl.flock(descriptor, fcntl.LOCK_UN)
-    os.close(descriptor)
+        yield
 
 
 def is_held(file: Path) -> bool:
@@ -115,7 +105,7 @@ def is_held(file: Path) -> bool:
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError as error:  # without locks nothing holds one, and `acquire` says so
+    except OSError as error:  # without locks nothing holds one, and `holding` says so
         return isinstance(error, BlockingIOError)
     finally:
         os.close(descriptor)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from esp_cli.files.documents import Strict
-from esp_cli.files.opening import acquire, is_held, release
+from esp_cli.files.opening import holding, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
@@ -94,14 +94,11 @@ class RunSet(ABC):
         """
         cls.refuse_foreign(path)
         path.mkdir(parents=True, exist_ok=True)
-        descriptor = acquire(path / STUDY_LOCK)
-        try:
+        with holding(path / STUDY_LOCK):
             for folder in (path, path / FRESH):
                 for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
                     file.unlink(missing_ok=True)
             yield
-        finally:
-            release(descriptor)
 
     def run_path(self, cell: Cell) -> Path:
         """Return the run folder of a cell."""

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.failures import attempting
-from esp_cli.files.opening import LockError, acquire, open_own, release, require_held
+from esp_cli.files.opening import holding, open_own, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
@@ -135,11 +135,7 @@ class RunFolder:
         checkpoints = self.path / CHECKPOINTS
         if checkpoints.is_symlink():
             raise RunFolderError(f"{checkpoints} is a link, which is not followed; put the folder itself there")
-        try:
-            descriptor = acquire(self.lock_path)
-        except LockError as error:
-            raise RunFolderError(str(error)) from None
-        try:
+        with holding(self.lock_path, RunFolderError):
             with attempting("tidy up", self.path, RunFolderError):
                 for folder in (self.path, checkpoints):
                     for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
@@ -147,8 +143,6 @@ class RunFolder:
                 if self.policy_path.is_file():  # a process was killed before it came to this
                     self._remove_superseded()
             yield
-        finally:
-            release(descriptor)
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
         """Return the file of the checkpoint at a step (env steps per seed)."""

@@ -18,7 +18,7 @@ from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, parse_study_steps
 from esp_cli.commands.study_progress import StudyProgress, share, whole_status
 from esp_cli.commands.studying import open_resources, run_cells
-from esp_cli.files.opening import acquire, release
+from esp_cli.files.opening import holding
 from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler, Snapshot
@@ -238,9 +238,8 @@ def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, f
     assert "holds another study" in refused(*options)
     options[-1] = tmp_path / "t"
     (tmp_path / "t").mkdir()
-    lock = acquire(tmp_path / "t" / "study.lock")
-    assert "is in use by process" in refused(*options)
-    release(lock)
+    with holding(tmp_path / "t" / "study.lock"):
+        assert "is in use by process" in refused(*options)
     assert not (tmp_path / "t" / "runs").exists()
 
 

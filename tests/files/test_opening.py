@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files.opening import LockError, acquire, is_held, open_own, read_regular, release
+from esp_cli.files.opening import LockError, holding, is_held, open_own, read_regular
 
 FLAGS = pytest.mark.parametrize("flags", [os.O_RDWR, os.O_WRONLY | os.O_APPEND])
 
@@ -66,18 +66,18 @@ def test_reading_stops_at_a_bound(tmp_path):
 
 
 def test_a_lock_is_let_go_of_though_a_forked_process_lives_on(tmp_path: Path) -> None:
-    file = tmp_path / "lock"
-    descriptor = acquire(file)
-    child = os.fork()
-    if not child:
-        signal.pause()
+    file, child = tmp_path / "lock", 0
     try:
-        assert is_held(file)
-        with pytest.raises(LockError, match=f"in use by process {os.getpid()}"):
-            acquire(file)
-        release(descriptor)
+        with holding(file):
+            child = os.fork()
+            if not child:
+                signal.pause()
+            assert is_held(file)
+            with pytest.raises(LockError, match=f"in use by process {os.getpid()}"), holding(file):
+                pytest.fail("held twice")
         assert not is_held(file)
-        release(acquire(file))
+        with holding(file):
+            pass
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)

@@ -66,12 +66,6 @@ def test_the_measures_of_the_task_are_those_of_the_greedy_policy(tmp_path):
     assert any(drawn[name].mean().item() != pytest.approx(value) for name, value in result.metrics.items())
 
 
-def test_a_heuristic_that_would_try_too_many_sharings_is_left_out(tmp_path):
-    result = evaluate(untrained(tmp_path, task__num_agents=6), 2)
-    assert result.heuristics == ("greedy",)
-    assert result.anchors.keys() == {"random", "heuristic"}
-
-
 def test_a_seed_that_stopped_has_no_numbers(tmp_path):
     whole = untrained(tmp_path)
     result = evaluate(replace(whole, stopped=(1,)), 3)
@@ -132,11 +126,6 @@ def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypa
     assert episodes.shape == (2, 5)
     assert result.anchors["heuristic"] == pytest.approx(episodes.mean().item())
     assert len({round(x, 4) for x in episodes.flatten().tolist()}) == 10, "each episode is another one"
-
-
-def test_more_seeds_than_worlds_still_play(tmp_path, monkeypatch):
-    monkeypatch.setattr(final, "MAX_WORLDS", 1)
-    assert len(evaluate(untrained(tmp_path), 2).greedy.per_seed) == 2
 
 
 def test_a_recurrent_policy_of_another_task_is_evaluated(tmp_path):

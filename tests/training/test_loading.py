@@ -49,6 +49,10 @@ def test_run_and_policy_file_give_the_weights_that_were_trained(trained):
         assert not loaded.policy.training
         assert loaded.policy.state_dict().keys() == weights.keys()
         assert all(torch.equal(tensor, weights[name]) for name, tensor in loaded.policy.state_dict().items())
+    _, meta = load_checkpoint(trained.folder.policy_path, format_name=POLICY_FORMAT)
+    described = {"task": "navigation", "task_version": 1, "network": "mlp", "activation": "tanh", "step": 100}
+    assert {name: meta[name] for name in described} == described
+    assert len(meta["greedy_returns"]) == 2
 
 
 def test_a_run_that_keeps_no_checkpoint_is_loaded_from_its_policy_file(folder):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import app
-from esp_cli.files.opening import FolderLostError, HeldFolder, acquire, release
+from esp_cli.files.opening import FolderLostError, HeldFolder, holding
 from esp_cli.files.writing import remove_file, replace_file
 from esp_cli.training import trainer
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
@@ -97,8 +97,7 @@ def test_what_is_written_in_a_held_folder_goes_into_it_though_another_takes_its_
     for folder in (mine, other):
         (folder / "checkpoints").mkdir(parents=True)
         (folder / "checkpoints" / "a").write_bytes(folder.name.encode())
-    lock = acquire(mine / "run.lock")
-    try:
+    with holding(mine / "run.lock"):
         monkeypatch.setattr(HeldFolder, "require", lambda self: None)  # as if it came before the exchange
         replace_by_another(mine, other)
         replace_file(mine / "checkpoints" / "a", b"new")
@@ -110,8 +109,6 @@ def test_what_is_written_in_a_held_folder_goes_into_it_though_another_takes_its_
         for write in (lambda file: replace_file(file, b"x"), remove_file):
             with pytest.raises(FolderLostError, match="was moved, replaced or deleted"):
                 write(mine / "checkpoints" / "a")
-    finally:
-        release(lock)
     replace_file(mine / "checkpoints" / "a", b"x")  # not held any more
 
 
