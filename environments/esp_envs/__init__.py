@@ -4,18 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from esp_envs.errors import UserError
-from esp_envs.spec import (
-    Continuous,
-    Discrete,
-    Field,
-    Items,
-    Kind,
-    Layout,
-    Spaces,
-    TaskSpec,
-    joint_layout,
-    layout,
-)
+from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Layout, Spaces, TaskSpec, joint_layout, layout
 
 if TYPE_CHECKING:
     from esp_envs.base import Environment, Observation, Step, generator_states, generators_for, restore_generators

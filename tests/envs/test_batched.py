@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_envs import BatchedTask, Environment, Field, Kind, TaskSettings, generators_for, layout, to_others
+from esp_envs import BatchedTask, Environment, Field, Kind, generators_for, layout, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec, discrete_moves
@@ -130,19 +130,16 @@ def test_vectors_of_a_kind_of_ones_own_are_bounded_by_their_length() -> None:
 
 
 @pytest.mark.parametrize("method", ["heuristic", "scene", "set_state"])
-def test_what_a_task_lacks_is_said_in_one_sentence(method: str) -> None:
+def test_what_a_task_lacks_is_said_in_one_sentence(method: str, rendezvous: type[Environment]) -> None:
     class Bare(Plain):
         set_state = Environment.set_state
 
     env = worlds(Bare)
     env.reset()
     assert not env.has(method)
+    assert worlds(rendezvous).has(method)
     with pytest.raises(ValueError, match=f"task plain .*its class has no '{method}'"):
         getattr(env, method)(*([torch.zeros(2, 5, 4)] if method == "set_state" else []))
-
-
-def test_what_a_task_has_is_known(rendezvous: type[Environment]) -> None:
-    assert all(worlds(rendezvous).has(method) for method in ("heuristic", "scene", "set_state"))
 
 
 def test_actions_arrive_within_their_bounds() -> None:
@@ -159,15 +156,6 @@ def test_actions_arrive_within_their_bounds() -> None:
     torch.testing.assert_close(seen[0][0, 0, 0], torch.tensor([0.6, -0.8, 1.0]))
 
 
-def test_a_start_of_another_shape_is_refused() -> None:
-    class Short(Plain):
-        def _start(self, generator):
-            return {"position": self.draw(2, generator=generator)}
-
-    with pytest.raises(ValueError, match=r"'position' has shape \(5, 2\) in what '_start' of plain drew"):
-        worlds(Short).reset()
-
-
 @pytest.mark.parametrize(
     ("method", "value", "sentence"),
     [
@@ -180,6 +168,12 @@ def test_a_start_of_another_shape_is_refused() -> None:
         ),
         ("_allow", torch.ones(2, 5, 2, 5), "'_allow' is torch.float32, expected torch.bool"),
         ("_ended", torch.ones(2, dtype=torch.bool), r"'_ended' has shape \(2,\), expected \(2, 5\)"),
+        ("_start", {"position": torch.zeros(5, 2)}, r"'position' has shape \(5, 2\) in what '_start' of plain drew"),
+        (
+            "_observe",
+            torch.zeros(2, 5, 2, 2, 2),
+            r"observation that '_observe' of plain gives has shape \(2, 5, 2, 4\), expected \(2, 5, 2, 2\)",
+        ),
         (
             "_advance",
             (torch.zeros(2, 5, 2), {"met": torch.zeros(())}),
@@ -187,7 +181,7 @@ def test_a_start_of_another_shape_is_refused() -> None:
         ),
     ],
 )
-def test_flags_and_metrics_of_another_shape_are_refused(method: str, value, sentence: str) -> None:
+def test_tensors_of_another_shape_are_refused(method: str, value, sentence: str) -> None:
     def describe(self) -> TaskSpec:
         extras = {
             "_living": {"agents_end": True},
@@ -218,18 +212,6 @@ def test_heuristics_are_a_tuple_of_names(given) -> None:
 def test_moves_are_a_number_or_names(moves: object) -> None:
     with pytest.raises(ValueError, match="is neither a number of directions nor their names"):
         discrete_moves(moves)
-
-
-def test_an_observation_of_another_width_is_refused() -> None:
-    class Wide(Plain):
-        def _observe(self, world):
-            return to_others(world["position"]).repeat(1, 1, 1, 2, 1)
-
-    with pytest.raises(
-        ValueError,
-        match=r"the observation that '_observe' of plain gives has shape \(2, 5, 2, 4\), expected \(2, 5, 2, 2\)",
-    ):
-        worlds(Wide).reset()
 
 
 @pytest.mark.parametrize("switch", ["terminates", "masks", "agents_end"])
@@ -458,7 +440,3 @@ def test_a_task_that_raises_is_a_finding_too() -> None:
     findings = list(check(Subject(lambda num_envs, seeds: worlds(Raising, num_envs, seeds))))
     assert findings[0].broken == "KeyError: 'speed'"
     assert len(findings) == len(PROMISES)
-
-
-def test_settings_are_the_classs_own() -> None:
-    assert Plain.Settings is TaskSettings

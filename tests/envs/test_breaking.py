@@ -11,7 +11,7 @@ import torch
 from esp_cli.checking import check_symmetry
 from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
-from esp_envs import make
+from esp_envs import Environment, Step, make
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
 from esp_envs.settings import Breaks, remaining
 from esp_envs.spec import Spaces
@@ -86,90 +86,78 @@ def test_what_several_breakings_leave() -> None:
     assert settings.broken_in_words() == ", wind 1, action_turn_rad 0.5"
 
 
-def still(task: str, **settings: object):
-    """Return a step of do-nothing from rest, every body far from the others: agents on x = 2, 4, ... and one on -2."""
+def placed(task: str, positions: list[float], velocity: float = 0.0, **settings: object) -> Environment:
+    """Return one world with its bodies at these places, all with the same velocity along both axes."""
     env = make(task, 1, [0], settings)
-    names = env.spec.state.slices()
-    state = torch.zeros(env.state_shape)
-    places = torch.tensor([[2.0, 0.0], [4.0, 0.0], [-2.0, 0.0]])
-    state[..., names["position"]] = places.flatten()
-    state[..., names["velocity"]] = torch.ones(6) if settings.get("mud") else torch.zeros(6)
     env.reset()
-    env.set_state(state)
-    after = env.step(torch.zeros(env.action_shape, dtype=torch.int64)).next.state
-    return after[0, 0, names["velocity"]].view(3, 2)
+    moving = torch.full((env.spec.state.width - len(positions),), velocity)
+    env.set_state(torch.cat([moving, torch.tensor(positions)]).view(env.state_shape))
+    return env
 
 
-def test_a_wind_is_a_share_of_the_full_force() -> None:
-    assert still("navigation", wind=0.3) == pytest.approx(torch.tensor([[0.15, 0.0]] * 3))  # 0.3 x 5 x 0.1 s
+def idle(env: Environment, action: int = 0) -> Step:
+    """Let every agent take one action, by default do nothing."""
+    return env.step(torch.full(env.action_shape, action))
 
 
-def test_a_wind_is_as_strong_for_a_weak_agent_and_nobody_is_faster_for_it() -> None:
-    assert still("navigation", wind=0.3, weak_agent=0.5) == pytest.approx(torch.tensor([[0.15, 0.0]] * 3))
-    # 10 x 3 x 0.1 s is more than a predator's greatest speed, 1
-    assert still("predator-prey", wind=10.0, prey="still") == pytest.approx(torch.tensor([[1.0, 0.0]] * 3))
+APART = [2.0, 0.0, 4.0, 0.0, -2.0, 0.0]
+OTHERS = {"navigation": [9.0] * 6, "predator-prey": [0.0, 9.0, 9.0, 0.0, 0.0, -9.0]}
+FORCES = [
+    ("navigation", {"wind": 0.3}, [[0.15, 0.0]] * 3),  # 0.3 x 5 x 0.1 s
+    ("navigation", {"wind": 0.3, "weak_agent": 0.5}, [[0.15, 0.0]] * 3),
+    ("predator-prey", {"wind": 10.0, "prey": "still"}, [[1.0, 0.0]] * 3),  # its greatest speed, not 10 x 3 x 0.1 s
+    ("navigation", {"gust_mean": 2.0}, [[0.2, 0.2]] * 3),
+    ("navigation", {"mud": 0.5}, [[0.375] * 2, [0.375] * 2, [0.75] * 2]),  # from a velocity of 1
+]
 
 
-def test_a_gust_with_a_mean_pushes_along_both_axes() -> None:
-    assert still("navigation", gust_mean=2.0) == pytest.approx(torch.tensor([[0.2, 0.2]] * 3))
-
-
-def test_mud_slows_on_one_side_alone() -> None:
-    assert still("navigation", mud=0.5) == pytest.approx(torch.tensor([[0.375] * 2, [0.375] * 2, [0.75] * 2]))
+@pytest.mark.parametrize(("task", "settings", "velocity"), FORCES, ids=str)
+def test_what_pushes_and_brakes_agents_that_do_nothing(task: str, settings, velocity) -> None:
+    env = placed(task, APART + OTHERS[task], float("mud" in settings), **settings)
+    after = idle(env).next.state[0, 0, env.spec.state.slices()["velocity"]]
+    assert after.view(3, 2) == pytest.approx(torch.tensor(velocity))
 
 
 def test_a_turned_action_pushes_elsewhere_and_turned_actions_do_not_push_others() -> None:
     for actions in ("discrete", "continuous"):
-        env = make("navigation", 1, [0], {"action_turn_rad": math.pi / 6, "actions": actions})
-        state = torch.zeros(env.state_shape)
-        state[..., env.spec.state.slices()["position"]] = torch.tensor([0.0, 0.0, 3.0, 3.0, 6.0, 6.0])
-        env.set_state(state)
-        right = (
-            torch.full(env.action_shape, 2) if actions == "discrete" else torch.tensor([1.0, 0.0]).expand(1, 1, 3, 2)
-        )
-        moved = env.step(right).next.state[0, 0, :6].view(3, 2)
-        assert moved == pytest.approx(torch.tensor([[0.5 * 3**0.5 / 2, 0.25]] * 3))
-    env = make("predator-prey", 1, [0], {"action_turn_rad": 1.0, "prey": "still"})
-    env.reset()
-    start = env.set_state(state := torch.arange(20.0).expand(1, 1, 20)).state
-    assert torch.equal(start, state)
-    after = env.step(torch.full(env.action_shape, 2)).next.state[0, 0]
-    plain = make("predator-prey", 1, [0], {"prey": "still"})
-    plain.reset()
-    plain.set_state(state)
-    same = plain.step(torch.full(env.action_shape, 2)).next.state[0, 0]
+        env = placed("navigation", [0.0, 0.0, 3.0, 3.0, *[6.0] * 8], action_turn_rad=math.pi / 6, actions=actions)
+        right = torch.tensor([1.0, 0.0]).expand(1, 1, 3, 2)
+        step = idle(env, 2) if actions == "discrete" else env.step(right)
+        assert step.next.state[0, 0, :6].view(3, 2) == pytest.approx(torch.tensor([[0.5 * 3**0.5 / 2, 0.25]] * 3))
+    places = torch.arange(8.0, 20.0).tolist()
+    after, same = (
+        idle(placed("predator-prey", places, prey="still", **turned), 2).next.state[0, 0]
+        for turned in ({"action_turn_rad": 1.0}, {})
+    )
     assert torch.equal(after[6:8], same[6:8]), "the prey's own force is not turned"
     assert not torch.equal(after[:6], same[:6])
 
 
+HUNT = {"prey": "still", "num_predators": 2, "num_obstacles": 0}
+
+
 def test_the_reward_counts_places_to_the_right() -> None:
     """One agent on its landmark, or 0.3 right of it: distances 0.3 and 0 where the reward is 0.3 off."""
-    env = make("navigation", 1, [0], {"reward_offset": 0.3, "num_agents": 1, "num_landmarks": 1})
     rewards = []
     for x in (0.0, 0.3):
-        env.set_state(torch.tensor([0.0, 0.0, x, 0.0, 0.0, 0.0]).expand(1, 1, 6))
-        step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
+        step = idle(placed("navigation", [x, 0.0, 0.0, 0.0], reward_offset=0.3, num_agents=1, num_landmarks=1))
         rewards.append(float(step.reward[0, 0, 0]) + 1)  # the collision with oneself
         assert float(step.metrics["coverage"]) == (x == 0.0), "metrics are of the real places"
     assert rewards == pytest.approx([-0.3, 0.0], abs=1e-6)
-    env = make("predator-prey", 1, [0], {"reward_offset": 0.5, "prey": "still", "num_predators": 2, "num_obstacles": 0})
-    env.set_state(torch.tensor([0.0] * 6 + [0.5, 0.0, -0.5, 0.0, 0.0, 0.0]).expand(1, 1, 12))
-    step = env.step(torch.zeros(env.action_shape, dtype=torch.int64))
+    step = idle(placed("predator-prey", [0.5, 0.0, -0.5, 0.0, 0.0, 0.0], reward_offset=0.5, **HUNT))
     assert step.reward[0, 0].tolist() == [10.0, 10.0], "for who is right of the prey, and not for who is left of it"
     assert float(step.metrics["touches"]) == 0, "nobody really touches it"
 
 
 def test_the_prey_is_no_predator_beside_a_place_that_is_rewarded() -> None:
     """The place is 0.1 right of the prey, nearer than a touch; only predators count, and they are far away."""
-    env = make("predator-prey", 1, [0], {"reward_offset": 0.1, "prey": "still", "num_predators": 2, "num_obstacles": 0})
-    env.set_state(torch.tensor([0.0] * 6 + [3.0, 3.0, -3.0, 3.0, 0.0, 0.0]).view(env.state_shape))
-    assert env.step(torch.zeros(env.action_shape, dtype=torch.int64)).reward[0, 0].tolist() == [0.0, 0.0]
+    env = placed("predator-prey", [3.0, 3.0, -3.0, 3.0, 0.0, 0.0], reward_offset=0.1, **HUNT)
+    assert idle(env).reward[0, 0].tolist() == [0.0, 0.0]
 
 
 def test_predators_that_chase_run_at_the_place_that_is_rewarded() -> None:
     """The prey is half a length left of the origin: one predator is there already, the other comes from below."""
-    env = make("predator-prey", 1, [0], {"reward_offset": 0.5, "prey": "still", "num_predators": 2, "num_obstacles": 0})
-    env.set_state(torch.tensor([0.0] * 6 + [0.0, 0.0, 0.0, -1.0, -0.5, 0.0]).view(env.state_shape))
+    env = placed("predator-prey", [0.0, 0.0, 0.0, -1.0, -0.5, 0.0], reward_offset=0.5, **HUNT)
     assert [env.spec.action.names[k] for k in env.heuristic().flatten()] == ["no-op", "up"]
 
 
@@ -190,17 +178,15 @@ def test_heuristics_know_where_forces_and_rewards_point() -> None:
 def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:
     """Seed 0 of the file always moves up; a still prey else stays."""
     settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.25}
-    env = make("predator-prey", 256, [0, 1], settings)
-    env.reset()
-    nothing, velocity = torch.zeros(env.action_shape, dtype=torch.int64), slice(6, 8)
+    env, alone = (make("predator-prey", 256, seeds, settings) for seeds in ([0, 1], [1]))
+    env.reset(), alone.reset()
+    velocity = slice(6, 8)
     saved = env.state_dict()
-    first = env.step(nothing).next.state[..., velocity]
+    first = idle(env).next.state[..., velocity]
     assert float((first[..., 1] > 0.35).float().mean()) == pytest.approx(0.25, abs=0.06)
     env.load_state_dict(saved)
-    assert torch.equal(env.step(nothing).next.state[..., velocity], first)
-    alone = make("predator-prey", 256, [1], settings)
-    alone.reset()
-    assert torch.equal(alone.step(nothing[1:]).next.state[0, :, velocity], first[1])
+    assert torch.equal(idle(env).next.state[..., velocity], first)
+    assert torch.equal(idle(alone).next.state[0, :, velocity], first[1])
     with pytest.raises(ValueError, match="give both or neither"):
         make("predator-prey", 1, [0], {"learned_prey": 0.5})
     with pytest.raises(ValueError, match="leave learned_prey out"):
@@ -210,75 +196,49 @@ def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:
 def test_a_prey_follows_its_policy_in_the_steps_that_were_drawn(tmp_path: Path) -> None:
     """Up, not, up: 0.4, then 0.75 of it, then 0.75 of that and 0.4."""
     settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.5}
-    env, other = make("predator-prey", 1, [0], settings), make("predator-prey", 1, [1], settings)
-    env.reset(), other.reset()
-    places = [3.0, 3.0, -3.0, 3.0, 3.0, -3.0, 0.0, 0.0, 5.0, 5.0, -5.0, 5.0]
-    env.set_state(torch.tensor([0.0] * 8 + places).view(env.state_shape))
+    env = placed("predator-prey", [3.0, 3.0, -3.0, 3.0, 3.0, -3.0, 0.0, 0.0, 5.0, 5.0, -5.0, 5.0], **settings)
+    other = make("predator-prey", 1, [1], settings)
     saved = env.state_dict()
     saved["follows"][:3] = torch.tensor([True, False, True]).view(3, 1)
+    other.reset()
     other.load_state_dict(saved)
-    nothing = torch.zeros(env.action_shape, dtype=torch.int64)
-    speeds = [other.step(nothing).next.state[0, 0, 7].item() for _ in range(3)]
+    speeds = [idle(other).next.state[0, 0, 7].item() for _ in range(3)]
     assert speeds == pytest.approx([0.4, 0.3, 0.625])
 
 
 def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() -> None:
     settings = {"gust_std": 1.0, "num_landmarks": 1, "num_agents": 1}
-    env = make("navigation", 4, [0, 1], settings)
-    env.reset()
-    alone = make("navigation", 4, [1], settings)
-    alone.reset()
-    nothing = torch.zeros(2, 4, 1, dtype=torch.int64)
+    env, alone = (make("navigation", 4, seeds, settings) for seeds in ([0, 1], [1]))
+    env.reset(), alone.reset()
     saved = env.state_dict()
-    first = [env.step(nothing).next.state for _ in range(3)]
-    assert torch.equal(alone.step(nothing[1:]).next.state[0], first[0][1])
+    kept = saved["gusts"].clone()
+    first = [idle(env).next.state for _ in range(3)]
+    assert torch.equal(idle(alone).next.state[0], first[0][1])
     env.load_state_dict(saved)
-    assert all(torch.equal(env.step(nothing).next.state, state) for state in first)
+    assert all(torch.equal(idle(env).next.state, state) for state in first)
     speed = first[0][..., :2]
     assert speed.unique().numel() == speed.numel()
-
-
-def test_each_step_has_a_gust_of_its_own_times_the_deviation() -> None:
-    """From rest, along x and y: 0.1 x 0.5 x (2, -1), then 0.75 of that and 0.1 x 0.5 x (4, 1)."""
-    env = make("navigation", 1, [0], {"gust_std": 0.5, "num_landmarks": 1, "num_agents": 1})
     env.reset()
-    env.set_state(torch.zeros(env.state_shape))
+    assert torch.equal(saved["gusts"], kept), "saved gusts stay as they were"
+    assert not torch.equal(kept, env.state_dict()["gusts"])
+
+
+@pytest.mark.parametrize(
+    ("wind", "expected"), [(0.0, [[0.1, -0.05], [0.275, 0.0125]]), (0.3, [[0.25, -0.05], [0.5375, 0.0125]])]
+)
+def test_each_step_has_a_gust_of_its_own_times_the_deviation_on_top_of_the_wind(wind: float, expected) -> None:
+    """From rest, along x and y: 0.1 x 0.5 x (2, -1), then 0.75 of that and 0.1 x 0.5 x (4, 1); wind adds 0.1 x 5 x."""
+    env = placed("navigation", [0.0] * 4, gust_std=0.5, wind=wind, num_landmarks=1, num_agents=1)
     saved = env.state_dict()
     saved["gusts"][:2, 0, :, 0] = torch.tensor([[2.0, -1.0], [4.0, 1.0]])
     env.load_state_dict(saved)
-    nothing = torch.zeros(env.action_shape, dtype=torch.int64)
-    velocities = [env.step(nothing).next.state[0, 0, :2] for _ in range(2)]
-    assert velocities[0] == pytest.approx(torch.tensor([0.1, -0.05]), abs=1e-6)
-    assert velocities[1] == pytest.approx(torch.tensor([0.275, 0.0125]), abs=1e-6)
-
-
-def test_saved_gusts_stay_as_they_were() -> None:
-    env = make("navigation", 2, [0], {"gust_std": 1.0})
-    env.reset()
-    saved, now = (env.state_dict()["gusts"] for _ in range(2))
-    env.reset()
-    assert torch.equal(saved, now)
-    assert not torch.equal(saved, env.state_dict()["gusts"])
-
-
-def test_gusts_add_to_the_wind() -> None:
-    """0.1 x (0.5 x 2 + 0.3 x 5) along x, and 0.1 x 0.5 x -1 along y."""
-    env = make("navigation", 1, [0], {"gust_std": 0.5, "wind": 0.3, "num_landmarks": 1, "num_agents": 1})
-    env.reset()
-    env.set_state(torch.zeros(env.state_shape))
-    saved = env.state_dict()
-    saved["gusts"][0, 0, :, 0] = torch.tensor([2.0, -1.0])
-    env.load_state_dict(saved)
-    velocity = env.step(torch.zeros(env.action_shape, dtype=torch.int64)).next.state[0, 0, :2]
-    assert velocity == pytest.approx(torch.tensor([0.25, -0.05]), abs=1e-6)
+    velocities = torch.stack([idle(env).next.state[0, 0, :2] for _ in range(2)])
+    assert velocities == pytest.approx(torch.tensor(expected), abs=1e-6)
 
 
 def test_the_first_agent_is_weak() -> None:
-    env = make("navigation", 1, [0], {"weak_agent": 0.5, "num_landmarks": 1})
-    state = torch.zeros(env.state_shape)
-    state[..., env.spec.state.slices()["position"]] = torch.tensor([0.0, 0.0, 3.0, 3.0, 6.0, 6.0])
-    env.set_state(state)
-    moved = env.step(torch.full(env.action_shape, 2)).next.state[0, 0, :6].view(3, 2)
+    env = placed("navigation", [0.0, 0.0, 3.0, 3.0, 6.0, 6.0, 0.0, 0.0], weak_agent=0.5, num_landmarks=1)
+    moved = idle(env, 2).next.state[0, 0, :6].view(3, 2)
     assert moved == pytest.approx(torch.tensor([[0.25, 0.0], [0.5, 0.0], [0.5, 0.0]]))
 
 

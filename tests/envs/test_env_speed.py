@@ -1,8 +1,9 @@
-"""The speed script runs, prints its table and writes JSON."""
+"""The speed scripts run, print their tables and write JSON."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -10,25 +11,31 @@ from pathlib import Path
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[1] / "benchmarks" / "env_speed.py"
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SUBJECTS = {
+    "env_speed": ([], ("task",), [(task,) for task in ("navigation", "predator-prey", "wildlife")]),
+    "epuck_speed": (
+        ["--engine", "mujoco", "--engine", "pymunk", "--threads", "1"],
+        ("subject", "engine"),
+        list(itertools.product(("physics", "formation"), ("mujoco", "pymunk"))),
+    ),
+}
 
 
+@pytest.mark.parametrize("name", SUBJECTS)
 def test_the_script_measures_and_writes_json(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spec = importlib.util.spec_from_file_location("env_speed", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    script = importlib.import_module(name)
+    arguments, keys, expected = SUBJECTS[name]
     out = tmp_path / "speed.json"
-    arguments = ["--worlds", "8", "--seconds", "0.01", "--runs", "3", "--json", str(out)]
-    monkeypatch.setattr(sys, "argv", ["env_speed.py", *arguments])
+    common = ["--worlds", "2", "--seconds", "0.01", "--runs", "3", "--json", str(out)]
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments, *common])
     before = torch.get_num_threads()
     script.main()
     torch.set_num_threads(before)
     records = json.loads(out.read_text())["records"]
-    tasks = ("navigation", "predator-prey", "wildlife")
-    assert [(r["task"], r["worlds"], r["runs"]) for r in records] == [(task, 8, 3) for task in tasks]
+    assert [tuple(record[key] for key in keys) for record in records] == expected
     assert all(0 < r["least"] <= r["steps_per_second"] <= r["most"] for r in records)
-    assert "predator-prey" in capsys.readouterr().out
+    assert expected[-1][0] in capsys.readouterr().out

@@ -64,10 +64,7 @@ def test_an_ordinary_name_needs_no_registration() -> None:
 @pytest.mark.parametrize(
     ("source", "sentence"),
     [
-        (
-            "import no_such_module\n",
-            "cannot import the module 'mine' of the task: ModuleNotFoundError: No module",
-        ),
+        ("import no_such_module\n", "cannot import the module 'mine' of the task: ModuleNotFoundError: No module"),
         ("raise SystemExit(3)\n", "cannot import the module 'mine' of the task: SystemExit: 3"),
         ("def f(:\n", "cannot import the module 'mine' of the task: SyntaxError: "),
         ("raise RuntimeError('first\\nlast')\n", "cannot import the module 'mine' of the task: RuntimeError: last"),

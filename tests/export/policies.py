@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 
@@ -34,14 +36,14 @@ LARGE = {"team, values, equivariant": ("wildlife", "qmix", {"network.name": "emp
 """Exported alike; a comparison on thousands of observations takes long."""
 REFUSED = {"ensemble": ("navigation", "mappo", {"network.symmetrise": "c4"})}
 """What no export takes."""
-UNSEEN = {name: ("formation", "mappo", {f"task.{name}": 1.0}) for name in ("heading_offset_rad", "blind_sector_rad")}
-"""What a robot sees is not built from poses."""
 
 
-def drawn_policy(kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10)) -> TrainedPolicy:
+def drawn_policy(
+    kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10), **of_task: object
+) -> TrainedPolicy:
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
-    task, algorithm, settings = (KINDS | LARGE | REFUSED | UNSEEN)[kind]
-    overrides = {"network.hidden": list(hidden), **settings}
+    task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
+    overrides = {"network.hidden": list(hidden), **settings, **{f"task.{k}": value for k, value in of_task.items()}}
     config = resolve_config(task, algorithm, seeds=seeds, steps=100, overrides=overrides)
     spec = build_environment(config, 1, "shape").spec
     policy = ALGORITHMS[algorithm].build_policy(spec, config.network, generators(seeds, "shape")).eval()
@@ -50,6 +52,11 @@ def drawn_policy(kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ..
         for parameter in policy.parameters():
             parameter.add_(torch.randn(parameter.shape, generator=generator), alpha=size)
     return TrainedPolicy(config, policy, spec, 100, Path("drawn"))
+
+
+def imported(file: Path) -> SimpleNamespace:
+    """Run an exported Python file as a module."""
+    return SimpleNamespace(**runpy.run_path(str(file)))
 
 
 def write_policy(trained: TrainedPolicy, path: Path) -> Path:

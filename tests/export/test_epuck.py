@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import re
 import runpy
 import sys
@@ -19,7 +18,7 @@ from esp_cli.export import c_file, check, epuck
 from esp_cli.export.export import export
 from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
 from esp_envs.epuck.arena import Arena
-from tests.export.policies import drawn_policy
+from tests.export.policies import drawn_policy, imported
 
 needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
@@ -31,21 +30,12 @@ SETTINGS = {
 }
 
 
-def policy_with(monkeypatch: pytest.MonkeyPatch, kind: str = "wheels", **settings: object):
-    from tests.export import policies
-
-    task, algorithm, overrides = policies.KINDS[kind]
-    changed = overrides | {f"task.{name}": value for name, value in settings.items()}
-    monkeypatch.setitem(policies.KINDS, kind, (task, algorithm, changed))
-    return drawn_policy(kind)
-
-
 @needs_cc
 @pytest.mark.parametrize("case", SETTINGS)
 def test_c_and_python_see_from_poses_what_the_task_shows(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trained = policy_with(monkeypatch, **SETTINGS[case])
+    trained = drawn_policy("wheels", **SETTINGS[case])
     assert epuck.STATES == 10_000
     states = epuck.STATES if case == "offset" else 2_000
     scenes = epuck.take_scenes(trained, states)
@@ -61,8 +51,8 @@ def test_c_and_python_see_from_poses_what_the_task_shows(
     assert "Observations built from poses were compared" in (tmp_path / "README.md").read_text()
 
 
-def test_an_observation_that_is_built_wrongly_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = policy_with(monkeypatch, sight="nearness")
+def test_an_observation_that_is_built_wrongly_is_found() -> None:
+    trained = drawn_policy("wheels", sight="nearness")
     scenes = epuck.take_scenes(trained, 300)
     description = described(trained)
     assert epuck.compare_scenes(scenes, epuck.python_observer(description)) < 1e-6
@@ -140,9 +130,7 @@ def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(epuck, "take_scenes", lambda trained: take(trained, 20))
         export(drawn_policy(request.param), ["c", "numpy"], folder)
-    spec = importlib.util.spec_from_file_location("exported_for_c", folder / "policy.py")
-    policy = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(policy)
+    policy = imported(folder / "policy.py")
     return c_file.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
 
 
@@ -250,7 +238,7 @@ def test_the_launch_file_starts_the_node_of_the_package(tmp_path: Path, monkeypa
     assert np.allclose(node[2]["parameters"][0]["pillars"], Arena(2.0, 8, 2, 0.05).pillars().ravel(), atol=1e-4)
 
 
-def test_what_remembers_goes_out_without_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = policy_with(monkeypatch, "point, recurrent")
+def test_what_remembers_goes_out_without_poses(tmp_path: Path) -> None:
+    trained = drawn_policy("point, recurrent")
     assert "esp_epuck.c" not in export(trained, ["numpy"], tmp_path).formats[0].files
     assert not (tmp_path / "esp_epuck.py").exists()

@@ -18,7 +18,7 @@ from esp_cli.training.build import build_environment
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
-from tests.export.policies import UNSEEN, drawn_policy
+from tests.export.policies import drawn_policy
 
 STEPS = 40
 EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
@@ -80,27 +80,17 @@ def trained_paths(trained: TrainedPolicy, team: Team) -> np.ndarray:
 
 
 SETTINGS = {
-    "offset": ("wheels", {}),
-    "nearness, three neighbours": ("wheels", {"sight": "nearness", "neighbours": 3, "num_agents": 5}),
-    "wheel pairs": ("wheel pairs", {}),
-    "no pillars": ("wheels", {"num_obstacles": 0, "num_agents": 4}),
+    "offset": {"kind": "wheels"},
+    "nearness, three neighbours": {"kind": "wheels", "sight": "nearness", "neighbours": 3, "num_agents": 5},
+    "wheel pairs": {"kind": "wheel pairs"},
+    "no pillars": {"kind": "wheels", "num_obstacles": 0, "num_agents": 4},
 }
-
-
-def policy_for(case: str, monkeypatch: pytest.MonkeyPatch) -> TrainedPolicy:
-    from tests.export import policies
-
-    kind, settings = SETTINGS[case]
-    task, algorithm, overrides = policies.KINDS[kind]
-    changed = overrides | {f"task.{name}": value for name, value in settings.items()}
-    monkeypatch.setitem(policies.KINDS, kind, (task, algorithm, changed))
-    return drawn_policy(kind)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("case", SETTINGS)
 def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained = policy_for(case, monkeypatch)
+    trained = drawn_policy(**SETTINGS[case])
     export(trained, ["webots"], tmp_path)
     module = imported(tmp_path / WEBOTS, "esp_epuck", monkeypatch)
     policy = importlib.import_module("policy")
@@ -132,9 +122,9 @@ def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         pilot.observations(poses[:1], goals[:1], [(0.5, 0.5)])
 
 
-@pytest.mark.parametrize("setting", UNSEEN)
+@pytest.mark.parametrize("setting", ["heading_offset_rad", "blind_sector_rad"])
 def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path, setting: str) -> None:
-    trained = drawn_policy(setting)
+    trained = drawn_policy("wheels", **{setting: 1.0})
     for kind in ("ros2", "webots"):
         with pytest.raises(ValueError, match=r"without heading_offset_rad and blind_sector_rad; train without them"):
             export(trained, [kind], tmp_path)
@@ -210,7 +200,7 @@ class Robot:
 def test_the_webots_controller_drives_as_the_policy_does(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trained = policy_for(case, monkeypatch)
+    trained = drawn_policy(**SETTINGS[case])
     export(trained, ["webots"], tmp_path)
     team = Team(trained)
     wheels, paths = np.zeros((len(team.poses), 2)), [team.poses]
@@ -316,6 +306,10 @@ class RosNode:
     def destroy_node(self) -> None:
         pass
 
+    def speeds(self) -> list[list[float]]:
+        """Return the wheel speeds that were last published, robot by robot."""
+        return [message.data for topic, message in self.published.items() if topic.endswith("wheel_speeds")]
+
 
 def ros_fakes(spin=None) -> dict[str, ModuleType]:
     def twist() -> SimpleNamespace:
@@ -359,39 +353,38 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
             node.now_s = step * 0.1
             node.callback(ros_poses(team.poses))
             node.tick()
-            team.drive([node.published[f"epuck{k}/wheel_speeds"].data for k in range(8)])
+            team.drive(node.speeds())
             twist, wheels = node.published["epuck3/cmd_vel"], node.published["epuck3/wheel_speeds"].data
             speed, spin_rate = drive(np.array(wheels))
             assert (twist.linear.x, twist.angular.z) == pytest.approx((float(speed), float(spin_rate)))
         node.now_s += 0.6
         node.tick()
-        assert all(node.published[f"epuck{k}/wheel_speeds"].data == [0.0, 0.0] for k in range(8)), "nobody drives blind"
+        assert node.speeds() == [[0.0, 0.0]] * 8, "nobody drives blind"
         node.now_s -= 0.6
         node.tick()
-        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        assert node.speeds()[0] != [0.0, 0.0]
         lost = team.poses.copy()
         lost[3, 1] = math.nan
         node.callback(ros_poses(lost))
         node.tick()
-        assert all(node.published[f"epuck{k}/wheel_speeds"].data == [0.0, 0.0] for k in range(8)), "one robot is lost"
+        assert node.speeds() == [[0.0, 0.0]] * 8, "one robot is lost"
         node.callback(ros_poses(team.poses, stamp_s=1))
         node.tick()
-        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        assert node.speeds()[0] != [0.0, 0.0]
         node.now_s += 0.6
         node.callback(ros_poses(team.poses, stamp_s=1))
         node.tick()
-        assert node.published["epuck0/wheel_speeds"].data == [0.0, 0.0], "a tracker that repeats itself tells nothing"
+        assert node.speeds()[0] == [0.0, 0.0], "a tracker that repeats itself tells nothing"
         node.callback(ros_poses(team.poses, stamp_s=2))
         node.tick()
-        assert node.published["epuck0/wheel_speeds"].data != [0.0, 0.0]
+        assert node.speeds()[0] != [0.0, 0.0]
         nodes.append(node)
         raise KeyboardInterrupt
 
     nodes: list[RosNode] = []
     module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
     module.main()
-    stopped = [nodes[0].published[f"epuck{k}/wheel_speeds"].data for k in range(8)]
-    assert stopped == [[0.0, 0.0]] * 8, "interrupted robots stand still"
+    assert nodes[0].speeds() == [[0.0, 0.0]] * 8, "interrupted robots stand still"
     gap = np.abs(np.stack(paths)[..., :2] - trained_paths(trained, team)[..., :2]).max()
     assert gap < 1e-3
 
@@ -420,4 +413,4 @@ def test_a_ros_node_stops_a_team_of_another_size_than_its_goals(
     driver = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes()).Driver()
     driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0], [0.0, 0.6, 0.0]])))
     driver.act()
-    assert [driver.published[f"epuck{k}/wheel_speeds"].data for k in range(3)] == [[0.0, 0.0]] * 3
+    assert driver.speeds() == [[0.0, 0.0]] * 3

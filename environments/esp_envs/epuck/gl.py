@@ -16,10 +16,7 @@ from importlib import import_module
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter
 
-_LIBRARIES = {
-    "osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),
-    "egl": ("libEGL.so.1", "libEGL.so"),
-}
+_LIBRARIES = {"osmesa": ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"), "egl": ("libEGL.so.1", "libEGL.so")}
 """Files of each library that MuJoCo names, preferred first: OSMesa draws anywhere, EGL asks for a working driver."""
 _OF_SYSTEM = {"linux": ("osmesa", "egl", "glx"), "win32": ("wgl",), "darwin": ("cgl",)}
 _ANYWHERE = ("glfw", "enable", "enabled", "on", "true", "1", "disable", "disabled", "off", "false", "0")

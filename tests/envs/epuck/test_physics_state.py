@@ -31,29 +31,20 @@ def heap(physics: Physics, steps: int) -> Array:
 
 
 @every_engine
-def test_place_forgets_the_past(name: str) -> None:
+@pytest.mark.parametrize("in_contact", [False, True])
+def test_place_forgets_the_past(name: str, in_contact: bool) -> None:
     rng = np.random.default_rng(0)
-    start = bodies(ARENA, at_posts(ARENA, WORLDS, rng), **made_of(rng))
-    fresh = make_physics(name, ARENA, WORLDS, PERIOD_S)
-    fresh.place(start)
     used = engine(name, ARENA, at_posts(ARENA, WORLDS, rng), **made_of(rng))
     heap(used, 35)
     assert gap_between_robots(used.pose) < 0, "there are contacts to forget"
-    used.place(start)
-    np.testing.assert_array_equal(heap(used, 50), heap(fresh, 50))
-
-
-@every_engine
-def test_place_into_contact_forgets_the_past(name: str) -> None:
-    rng = np.random.default_rng(1)
-    used = engine(name, ARENA, at_posts(ARENA, WORLDS, rng))
-    heap(used, 35)
-    assert gap_between_robots(used.pose) < 0
-    start = bodies(ARENA, used.pose, velocity=used.velocity)
+    if in_contact:
+        start = bodies(ARENA, used.pose, velocity=used.velocity)
+    else:
+        start = bodies(ARENA, at_posts(ARENA, WORLDS, rng), **made_of(rng))
     fresh = make_physics(name, ARENA, WORLDS, PERIOD_S)
-    fresh.place(start)
-    used.place(start)
-    np.testing.assert_array_equal(heap(used, 20), heap(fresh, 20))
+    for physics in (fresh, used):
+        physics.place(start)
+    np.testing.assert_array_equal(heap(used, 50), heap(fresh, 50))
 
 
 @every_engine
