@@ -221,6 +221,10 @@ class Environment(ABC):
         """
         raise UserError(f"task {self.spec.name} cannot be drawn; its class has no 'scene'")
 
+    def settable(self) -> bool:
+        """Return whether worlds can be put into states; an adapter then shows its simulator's state from here on."""
+        return self.has("set_state")
+
     def has(self, method: str) -> bool:
         """Return whether the task offers an optional method: `set_state`, `heuristic`, `scene` or `state_dict`."""
         return getattr(type(self), method) is not getattr(Environment, method)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
+import torch
+
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import declares, exchangeable, scene_of
 from esp_cli.symmetry.elements import order_name
@@ -34,11 +36,10 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """
     texts = [transforms] if transforms is not None else _defaults(spaces)
     refusals = _refusals(texts, spaces)
-    found: list[Element] = []
-    for element in (element for element, refusal in refusals.items() if refusal is None):
-        alike = (build_transform([element @ one.inverse()], spaces).is_identity for one in found)
-        if transforms is not None or not any(alike):
-            found.append(element)
+    possible = [element for element, refusal in refusals.items() if refusal is None]
+    moves = {element: _moved(element, spaces) for element in reversed(possible)}
+    first = {numbers: element for element, numbers in moves.items()}  # of those that move alike
+    found = [element for element in possible if transforms is not None or first[moves[element]] == element]
     if not found:
         said = next(iter(refusals.values()), None)
         raise UserError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
@@ -77,6 +78,23 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
     except ValueError as error:
         return str(error)
     return f"{element.name} moves no number of it" if transform.is_identity else None
+
+
+def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
+    """Return where an element moves some numbers of a task, in thousandths: the same for those that move all alike."""
+    transform, agents = build_transform([element], spaces), spaces.num_agents
+    generator = torch.Generator().manual_seed(0)
+    obs, state = (
+        torch.rand(1, 1, *shape, generator=generator, dtype=torch.float64).float()
+        for shape in ((agents, spaces.observation.width), (spaces.state.width,))
+    )
+    if isinstance(spaces.action, Discrete):
+        action = torch.arange(spaces.action.count).view(1, -1, 1).expand(1, -1, agents)
+    else:
+        action = torch.rand(1, 1, agents, spaces.action.width, generator=generator)
+    parts = transform.obs(obs), transform.state(state), transform.action(action)
+    parts += (transform.per_agent(torch.arange(float(agents)).view(1, 1, -1)),)
+    return tuple(round(1000 * number) + 0.0 for part in parts for number in part.flatten().tolist())
 
 
 def is_declared(element: Element, spaces: Spaces) -> bool:

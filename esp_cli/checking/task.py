@@ -12,14 +12,16 @@ from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
+from esp_cli.symmetry.elements import AGENTS
+from esp_envs.base import Environment
 from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.spec import Spaces
 
 PAIRED, TRANSITIONS = "paired states", "transitions"
 TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 """Standard deviations that a field may be off and yet hold, by method."""
-_COPIES = 256
-"""Worlds of a task that cannot be set to a state, at most."""
+_COPIES, _FOREIGN = 256, 64
+"""Worlds of a task that cannot be set to a state, and of a simulator of others that can, at most."""
 _EPISODES = 4096
 
 
@@ -93,10 +95,26 @@ def judged(
 ) -> tuple[str, list[ElementVerdict]]:
     """Return the method that a task allows, and what it says of some elements."""
     probe = make(1, [0])
-    if probe.has("set_state") and not from_transitions:
-        return PAIRED, paired.check_paired(make, elements)
-    worlds = make(min(_COPIES, max(32, 8192 // probe.spec.horizon)), [0])
-    return TRANSITIONS, transitions.check_transitions(probe.spec, collect(worlds, _EPISODES), elements)
+    seen, native = probe.spec, probe.has("set_state")
+    if from_transitions or not probe.settable():
+        worlds = make(min(_COPIES, max(32, 8192 // seen.horizon)), [0])
+        return TRANSITIONS, transitions.check_transitions(seen, collect(worlds, _EPISODES), elements)
+
+    def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
+        env = make(num_envs, seeds)
+        env.settable()
+        return env
+
+    carried = [element for element in elements if _is_carried(element, probe.spec)]
+    verdicts = dict(zip(carried, paired.check_paired(settable, carried, None if native else _FOREIGN), strict=True))
+    if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
+        verdicts |= dict(zip(rest, judged(make, rest, from_transitions=True)[1], strict=True))
+    return PAIRED, [verdicts[element] for element in elements]
+
+
+def _is_carried(element: Element, spaces: Spaces) -> bool:
+    named = {field.name for field in spaces.state.fields}
+    return spaces.is_joint or all(name in named or name == AGENTS for name, _ in element.orders)
 
 
 def _reported(

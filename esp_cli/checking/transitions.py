@@ -39,7 +39,7 @@ _SEEN = 0.1
 """Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
 _MOST_ROWS = 1 << 15
 """Steps of agents that are looked at, at most; of more episodes every k-th step."""
-_FEWEST_INSIDE = 0.05
+_FEWEST_INSIDE = 0.5
 """Share of the images that lie where transitions do, below which they show nothing; these alone are judged."""
 _PREFERS, _ELSEWHERE = 0.05, 0.5
 """Shifts of starts or first actions, in standard deviations: from the first on, what looks broken may be a preference;
@@ -81,7 +81,8 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     for name in halves[0].fields:
         alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
         still = halves[0].is_still(name)
-        verdicts.append(_of_nothing(name) if still else _judged(name, alone, squares, planted[:, counts]))
+        never = name == "reward" and not any(half.is_paid for half in halves)
+        verdicts.append(_of_nothing(name, never) if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
     shift, preference = _shift(first.obs, image.obs), _shift(_done(first, spaces), _done(image, spaces))
@@ -93,9 +94,9 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     return found
 
 
-def _of_nothing(name: str) -> FieldVerdict:
-    """Judge what never changes: that is its law where it is seen, and a reward that never came has none."""
-    return concluded(name, 0.0, 0.0, broken=False, p_value=float(name == "reward"))
+def _of_nothing(name: str, never_came: bool) -> FieldVerdict:
+    """Judge what never changes: that is its law where it is seen; that of a reward that never came is unknown."""
+    return concluded(name, 0.0, 0.0, broken=False, p_value=float(never_came))
 
 
 def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
@@ -142,6 +143,11 @@ class _Half:
         self.fields |= {"reward": slice(width, width + 1)}
         self.fields |= {"action mask": slice(width + 1, None)} if self._width > width + 1 else {}
 
+    @property
+    def is_paid(self) -> bool:
+        """Whether any reward came."""
+        return bool(self._held.reward.any())
+
     def is_still(self, name: str) -> bool:
         """Return whether a field never changes."""
         return float(self._spread[self.fields[name]].sum()) < STILL**2
@@ -155,16 +161,21 @@ class _Half:
         carried = transform.per_agent(self._planted.movedim(-1, 0)).movedim(0, -1)
         there, (size, counts) = self._sides(image, carried), strength(carried, self._controls(image), weight)
         worse = weight * ((self._trust * there.said - there.true).square() - self._errors)
+        plain = _Products(self._here, torch.ones_like(weight))
+        sums = [_Products(side, weight) for side in (self._here, there)]
         fields = {}
         for name, where in self.fields.items():
             main = where.start + int(self._deviation[where].argmax())
             variance = self._spread[where].sum().clamp_min(STILL**2)
-            planted = weight * _excess(self._here, there, main, TOLERATED * (variance / size).sqrt())
-            others = (worse[..., where].sum(-1) - worse[..., main]).unsqueeze(-1)
-            squares = worse[..., self._width :][..., where].sum(-1)
+            amounts = TOLERATED * (variance / size).sqrt()
+            trust = plain.trust(main, amounts)
+            before, after = (side.errors(main, amounts, trust) for side in sums)
+            others = (worse[..., where].sum(-1) - worse[..., main]).mean((1, 2)).unsqueeze(-1)
+            squares = worse[..., self._width :][..., where].sum(-1).mean((1, 2))
             of_squares = self._spread[self._width :][where].sum().clamp_min(STILL**2)
-            parts = worse[..., where].sum(-1) / variance, squares / of_squares, (planted + others) / variance
-            fields[name] = tuple(part.mean((1, 2)).double() for part in parts)
+            alone = worse[..., where].sum(-1).mean((1, 2)) / variance
+            parts = alone, squares / of_squares, (after - before + others) / variance
+            fields[name] = tuple(part.double() for part in parts)
         return _Compared(float(inside.mean()), counts, fields)
 
     def _sides(self, data: Transitions, functions: Tensor) -> _Sides:
@@ -207,17 +218,44 @@ def _trust(said: Tensor, true: Tensor) -> Tensor:
     return ((said * true).mean((0, 1, 2)) / said.square().mean((0, 1, 2)).clamp_min(1e-20)).clamp(0, 1)
 
 
-def _excess(here: _Sides, there: _Sides, number: int, amounts: Tensor) -> Tensor:
-    """Return by how much a number's squared errors are larger on images, with each control added: [M, T, N, B]."""
-    said, true = (
-        [part[..., [number]] + amounts * planted for part, planted in pairs]
-        for pairs in (
-            ((here.said, here.planted_said), (there.said, there.planted_said)),
-            ((here.true, here.planted_true), (there.true, there.planted_true)),
+class _Products:
+    """Weighted means, over the steps and agents of each episode, of products of what is predicted and what is true.
+
+    They give the squared errors of a number s (true: t) with any amount a of each control p (true: q) added to it:
+    (r (s + a p) - (t + a q))^2, where r is the trust.
+    """
+
+    def __init__(self, side: _Sides, weight: Tensor) -> None:
+        self._pairs, self._weight = torch.stack([side.said, side.true], -1).flatten(1, 2), weight.flatten(1, 2)
+        self._planted = torch.cat([side.planted_said, side.planted_true], -1).flatten(1, 2)
+        p, q = (self._weight * self._planted).chunk(2, -1)
+        said, true = self._planted.chunk(2, -1)
+        self._squares = (p * said).mean(1), (p * true).mean(1), (q * true).mean(1)
+
+    def _of(self, number: int, amounts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the means of (s + a p)^2, (s + a p)(t + a q) and (t + a q)^2, [M, B] each."""
+        pair = self._pairs[..., number, :]
+        weighted = (self._weight * pair).mT / pair.shape[1]
+        own = weighted @ pair
+        ss, st, tt = own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]
+        crossed = weighted @ self._planted
+        (sp, sq), (tp, tq) = (row.chunk(2, -1) for row in crossed.unbind(1))
+        pp, pq, qq = self._squares
+        return (
+            ss.unsqueeze(-1) + amounts * (2 * sp + amounts * pp),
+            st.unsqueeze(-1) + amounts * (sq + tp + amounts * pq),
+            tt.unsqueeze(-1) + amounts * (2 * tq + amounts * qq),
         )
-    )
-    trust = _trust(said[0], true[0])
-    return (trust * said[1] - true[1]).square() - (trust * said[0] - true[0]).square()
+
+    def trust(self, number: int, amounts: Tensor) -> Tensor:
+        """Return by how much to shrink predictions with controls added, [B]; see `_trust`."""
+        squares, products, _ = self._of(number, amounts)
+        return (products.mean(0) / squares.mean(0).clamp_min(1e-20)).clamp(0, 1)
+
+    def errors(self, number: int, amounts: Tensor, trust: Tensor) -> Tensor:
+        """Return the squared errors with controls added, [M, B]."""
+        squares, products, true = self._of(number, amounts)
+        return trust * (trust * squares - 2 * products) + true
 
 
 def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:

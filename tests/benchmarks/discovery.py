@@ -20,6 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from esp_cli import machine
 
 if __name__ == "__main__":
@@ -52,9 +54,9 @@ CASES: Sequence[tuple[str, Settings, str]] = (
     ("wildlife", {"wind": 0.8, **DRONES}, "flip-x*agents"),
 )
 """Task, settings, and what is there."""
-EPISODES, WORLDS = 2048, 256
-TURNS = {"rot45", "rot60", "rot90", "rot120", "rot180", "rot57", "flip-x", "flip-diagonal", "flip30", "flip23"}
-"""Turns and mirrors that are tried where all angles can be."""
+EPISODES = 2048
+MOST = 5
+"""Turns and mirrors of a random task that are looked at, drawn from its seed, beside an exchange of each kind."""
 SYMMETRIC = 1e-3
 """Gap below which an element is symmetric: what rounding leaves."""
 
@@ -73,10 +75,12 @@ def found(task: str, settings: Settings, logs: bool) -> str:
 def of_random_task(seed: int) -> dict[str, Any]:
     """Return what is said of each element of a random task, beside by how much it is off."""
     recipe, begun = Recipe.drawn(seed), time.process_time()
-    env = recipe.make(WORLDS, [0])
+    env = recipe.make(EPISODES, [0])
     elements = candidates(env.spec)
-    if len(elements) > 2 * len(TURNS):
-        elements = [element for element in elements if element.orders or element.name in TURNS]
+    planar = [element for element in elements if not element.orders]
+    drawn = np.random.default_rng(seed).permutation(len(planar))[:MOST]
+    exchanges = {element.orders[0][0]: element for element in reversed(elements) if element.orders}
+    elements = [*(planar[k] for k in sorted(drawn)), *exchanges.values()]
     verdicts = check_transitions(env.spec, collect(env, EPISODES), elements)
     seconds = time.process_time() - begun
     families = {name: getattr(recipe, name) for name in ("reward", "force", "noise", "tails", "start", "listed")}
@@ -135,17 +139,18 @@ def main() -> None:
     parser.add_argument("--logs", action="store_true", help="from transitions alone")
     parser.add_argument("--random", type=int, help="so many random tasks instead, from transitions alone")
     parser.add_argument("--first", type=int, default=0, help="seed of the first random task")
-    parser.add_argument("--json", help="file for the random tasks")
+    parser.add_argument("--json", help="file for the random tasks; a run that was stopped goes on there")
     args = parser.parse_args()
     if args.random:
-        tasks: list[dict[str, Any]] = []
-        for seed in range(args.first, args.first + args.random):
+        known = Path(args.json) if args.json else None
+        tasks: list[dict[str, Any]] = json.loads(known.read_text())["tasks"] if known and known.exists() else []
+        for seed in range(args.first + len(tasks), args.first + args.random):
             tasks.append(of_random_task(seed))
             told = counted(tasks)
             print(*(f"{name}: {told[name]};" for name in ("tasks", "falsely accepted", "misses by reward")), flush=True)
-            if args.json:
-                Path(args.json).write_text(json.dumps({"counted": told, "tasks": tasks}, indent=1) + "\n")
-        print(json.dumps(told, indent=2))
+            if known:
+                known.write_text(json.dumps({"counted": told, "tasks": tasks}, indent=1) + "\n")
+        print(json.dumps(counted(tasks), indent=2))
         return
     cases = [case for case in CASES if args.only in (None, case[0])]
     for task, settings, group in cases:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
 
-_RESET, _STEP, _LEAVE = b"reset", b"step", b"leave"
+_RESET, _STEP, _PLACE, _LEAVE = b"reset", b"step", b"place", b"leave"
 TERMINATED, TRUNCATED = 1, 2
 """What `Board.ended` says of a copy whose episode ended in this step."""
 NOW, FINAL = 0, 1
@@ -110,6 +110,9 @@ class Stepper(Protocol):
     def step(self) -> None:
         """Advance every copy by one step, and reset those whose episode ends."""
 
+    def place(self) -> None:
+        """Put every copy, which has just been reset, into the state on the board."""
+
 
 class WorkerCopies:
     """The copies shared out among worker processes, which are forks of this one.
@@ -147,6 +150,10 @@ class WorkerCopies:
     def step(self) -> None:
         """Advance every copy by one step."""
         self._command(_STEP)
+
+    def place(self) -> None:
+        """Put every copy, which has just been reset, into the state on the board."""
+        self._command(_PLACE)
 
     def _command(self, word: bytes) -> None:
         for pipe, _ in self._workers:
@@ -205,7 +212,7 @@ def _work(
     pipe.send_bytes(failure.encode())
     if stepper is None:
         return
-    commands = {_RESET: stepper.reset, _STEP: stepper.step}
+    commands = {_RESET: stepper.reset, _STEP: stepper.step, _PLACE: stepper.place}
     with contextlib.suppress(EOFError, ConnectionError):
         while (word := pipe.recv_bytes()) != _LEAVE:
             pipe.send_bytes(_failure_of(commands[word]).encode())

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
+from esp_envs.adapters.pairing import Simulator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
 
@@ -46,9 +47,24 @@ class CopyHooks(ABC):
     metrics: tuple[str, ...] = ()
     """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
 
+    simulated: Layout | None = None
+    """What `take` returns, so that checks can pair states; known of MPE's particles, and where agents see all of it."""
+
     @abstractmethod
     def make_one(self) -> Any:
         """Return one new copy, a PettingZoo `ParallelEnv`."""
+
+    def own_of(self, env: Any) -> Any:
+        """Return what `take` and `put` are given: the environment that the task itself made."""
+        return env
+
+    def take(self, env: Any) -> Array:
+        """Return the numbers of `simulated`: all that decides what follows, up to chance and what `reset` drew."""
+        raise NotImplementedError
+
+    def put(self, env: Any, state: Array) -> None:
+        """Put a copy that has just been reset into a state that `take` returned of another."""
+        raise NotImplementedError
 
     def reading(self, agent: str, observation: Any) -> Array:
         """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
@@ -96,6 +112,7 @@ class Copy:
             listed = ", ".join(map(str, self.agents)) or "none"
             raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {listed}")
         self.rest = [name for name in self.agents if name not in self.learners]
+        self.simulator = Simulator(self.env, self.learners)
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
         self._boxes = [_bounds(space) for space in spaces]
         starts = [getattr(space, "start", 0) for space in spaces]
@@ -161,6 +178,20 @@ class Copy:
         low, high = box
         action = np.nan_to_num(action)  # of a seed that is about to stop: its environment should not stop the others
         return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)
+
+    def take(self) -> Array:
+        """Return the state of the simulator."""
+        by_task = type(self._task).take is not CopyHooks.take
+        row = self._task.take(self._task.own_of(self.env)) if by_task else self.simulator.read()
+        return foreign.numbers(() if row is None else row, "what 'take' returns")
+
+    def put(self, state: Array) -> Mapping[Any, Any] | None:
+        """Put the simulator into a state at a start; return what agents see then, where the environment says so."""
+        if type(self._task).put is not CopyHooks.put:
+            self._task.put(self._task.own_of(self.env), state)
+        else:
+            self.simulator.write(state)
+        return self.simulator.look(self.agents)
 
     def close(self) -> None:
         """Let go of the copy; what it raises then concerns nobody."""

@@ -6,6 +6,7 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import require_attributes, seed_of
+from esp_envs.adapters import pairing, require_attributes, seed_of
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.hooks import Array, Copy, CopyHooks
 from esp_envs.adapters.stepper import CopyStepper
@@ -84,6 +85,7 @@ class ParallelTask(CopyHooks, Environment):
         one.require_spaces()
         one.close()
         self._copies: Stepper | None = None
+        self._simulated = False
         lead = (self.num_seeds, num_envs)
         self._base = torch.zeros(lead, dtype=torch.int64)
         self._begun, self._time = torch.zeros_like(self._base), torch.zeros_like(self._base)
@@ -128,6 +130,39 @@ class ParallelTask(CopyHooks, Environment):
             metrics={name: self._per_world(board.metrics[:, m]) for m, name in enumerate(self.metrics)},
         )
 
+    def settable(self) -> bool:
+        """Let the state be the simulator's from here on; return whether it can be set.
+
+        What agents see at the start of an episode from such a state is NaN where the environment does not say it.
+        """
+        one = Copy(self)
+        with one.naming("put"):
+            found = pairing.simulated(one, self.observation, self.simulated)
+        one.close()
+        if found is not None:
+            self._simulated, self._copies, self.spec = True, None, replace(self.spec, state=found)
+        return self._simulated
+
+    def has(self, method: str) -> bool:
+        """Return whether the task offers an optional method; `set_state` where it is `settable`."""
+        return self._simulated if method == "set_state" else super().has(method)
+
+    def set_state(self, state: Tensor) -> Observation:
+        """Put every copy into a state of its simulator, at the start of an episode.
+
+        Raises:
+            UserError: the state has another shape, or `settable` was not asked for or says no.
+        """
+        if not self._simulated:
+            return super().set_state(state)
+        require_shape("state", state, self.state_shape)
+        if self._time.any():
+            self.reset()
+        copies = self._started()
+        copies.board.state[NOW] = state.flatten(0, 1).cpu().numpy()
+        copies.place()
+        return self._seen()
+
     def _started(self) -> Stepper:
         """Return the copies, made when they are first needed."""
         if self._copies is None:
@@ -152,7 +187,7 @@ class ParallelTask(CopyHooks, Environment):
         return self._copies
 
     def _stepper(self, board: Board, copies: range) -> CopyStepper:
-        return CopyStepper(self, board, copies)
+        return CopyStepper(self, board, copies, self._simulated)
 
     def _seeds(self, which: Array) -> list[int]:
         """Return the seed of the next episode of some copies; no copy's depends on the others."""

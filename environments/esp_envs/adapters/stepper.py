@@ -14,10 +14,17 @@ from esp_envs.errors import UserError
 
 
 class CopyStepper:
-    """Steps some copies of a board."""
+    """Steps some copies of a board.
 
-    def __init__(self, task: CopyHooks, board: Board, copies: range) -> None:
-        self._task, self.board = task, board
+    Args:
+        task: what it says of its copies.
+        board: of all copies.
+        copies: which ones.
+        simulated: whether the state is that of the simulator.
+    """
+
+    def __init__(self, task: CopyHooks, board: Board, copies: range, simulated: bool = False) -> None:
+        self._task, self.board, self._simulated = task, board, simulated
         self._copies: dict[int, Copy] = {}
         self._copies.update((k, Copy(task)) for k in copies)
         self._seen: dict[int, Mapping[str, Any]] = {}
@@ -34,6 +41,18 @@ class CopyStepper:
         """Advance every copy by one step, and reset those whose episode ends."""
         for k, copy in self._copies.items():
             self._step(k, copy)
+
+    def place(self) -> None:
+        """Put every copy, which has just been reset, into the state on the board."""
+        for k, copy in self._copies.items():
+            state = self.board.state[NOW, k].copy()
+            with copy.naming("put", k):
+                seen = copy.put(state)
+            if seen is not None:
+                self._seen[k] = seen
+                self._write(k, NOW)
+            else:  # nobody knows what agents see before the first step
+                self.board.obs[NOW, k] = np.nan
 
     def __del__(self) -> None:
         """Close the copies of a task that is forgotten, or of a worker that leaves."""
@@ -137,5 +156,8 @@ class CopyStepper:
                     if not row.any() and not over:
                         raise UserError(f"the mask of {name} allows nothing; leave it one action")
                     board.mask[when, k, i] = (row != 0) | (not row.any())  # after the end a mask often allows nothing
-        state = board.obs[when, k].reshape(-1) if task.state is None else copy.env.state()
+        if self._simulated:
+            state = copy.take()
+        else:
+            state = board.obs[when, k].reshape(-1) if task.state is None else copy.env.state()
         board.state[when, k] = foreign.numbers(state, "the state", board.state.shape[-1])
