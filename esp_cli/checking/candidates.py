@@ -92,8 +92,8 @@ def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
         action = torch.arange(spaces.action.count).view(1, -1, 1).expand(1, -1, agents)
     else:
         action = torch.rand(1, 1, agents, spaces.action.width, generator=generator)
-    parts = transform.obs(obs), transform.state(state), transform.action(action)
-    parts += (transform.per_agent(torch.arange(float(agents)).view(1, 1, -1)),)
+    order = transform.per_agent(torch.arange(float(agents)).view(1, 1, -1))
+    parts = (transform.obs(obs), transform.state(state), transform.action(action), order)
     return tuple(round(1000 * number) + 0.0 for part in parts for number in part.flatten().tolist())
 
 

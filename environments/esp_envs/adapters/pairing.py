@@ -7,25 +7,14 @@ array `state`, as the classic tasks of Gymnasium. Others say how by the hooks `s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_envs.adapters import foreign
 from esp_envs.spec import Field, Items, Kind, Layout
 
-if TYPE_CHECKING:
-    from esp_envs.adapters.hooks import Copy
-
 Array = NDArray[Any]
-
-
-_TRIED = 16
-"""States that are set twice, to see whether the same follows."""
-_UNLIKE = 0.1
-"""Share of a number's variance that may be left to chance, of the number in the middle."""
 
 
 class Simulator:
@@ -99,68 +88,6 @@ class Simulator:
             ("words", [agent for agent in agents if not agent.silent], "c", Items.FIXED),
         ]
         return [column for column in columns if column[1]]
-
-
-def simulated(copy: Copy, observation: Layout, declared: Layout | None) -> Layout | None:
-    """Return the layout of a copy's state, None where a check cannot put it into one.
-
-    Args:
-        copy: one that nobody uses yet.
-        observation: what its agents see.
-        declared: what the task says that the layout is.
-    """
-    seen = _seen(copy, copy.start(0)[0])
-    size = copy.take().size
-    found = declared or copy.simulator.layout
-    if found is None and seen.shape == (1, size) and np.allclose(seen[0], copy.take(), atol=1e-5):
-        found = observation
-    if found is None or found.width != size or not _takes_effect(copy):
-        return None
-    return found if declared else _with_names(copy, found, observation)
-
-
-def _takes_effect(copy: Copy) -> bool:
-    """Return whether much the same follows a state and an action, whatever the reset before drew."""
-    spaces = {name: foreign.space_of(copy.env, name) for name in copy.agents}
-    for k, space in enumerate(spaces.values()):
-        space.seed(k)
-    reached: list[list[Array]] = []
-    for k in range(_TRIED):
-        copy.start(k)
-        for _ in range(k % 3):
-            copy.env.step({name: space.sample() for name, space in spaces.items()})
-        state, action = copy.take(), {name: space.sample() for name, space in spaces.items()}
-        reached.append([])
-        for twin in (2, 3):
-            copy.start(_TRIED * twin + k)
-            if copy.put(state) is None and copy.rest:
-                return False  # the others act by what they see
-            reached[-1].append(_seen(copy, copy.env.step(action)[0]))
-    one, other = np.array(reached).swapaxes(0, 1)
-    spread = one.var(0)
-    apart = ((one - other) ** 2).mean(0)[spread > 1e-12] / (2 * spread[spread > 1e-12])
-    return bool(apart.size) and float(np.median(apart)) < _UNLIKE
-
-
-def _with_names(copy: Copy, found: Layout, observation: Layout) -> Layout:
-    """Call landmarks as agents see them, if a field shows them: one that changes round as they do."""
-    marks = next((field for field in found.fields if field.name == "landmarks"), None)
-    for field, where in zip(observation.fields, observation.slices().values(), strict=True):
-        if marks is None or (field.kind, field.count, field.items) != (marks.kind, marks.count, marks.items):
-            continue
-        rows, state = [_seen(copy, copy.start(0)[0])[:, where]], copy.take()
-        state[found.slices()[marks.name]] = np.roll(state[found.slices()[marks.name]], 2)
-        if (seen := copy.put(state)) is not None and marks.count > 1:
-            rows.append(_seen(copy, seen)[:, where])
-            if np.allclose(np.roll(rows[0], 2, 1), rows[1], atol=1e-5):
-                return Layout(tuple(replace(f, name=field.name) if f is marks else f for f in found.fields))
-    return found
-
-
-def _seen(copy: Copy, given: Mapping[Any, Any]) -> Array:
-    """Return what learning agents see [N, D]; zeros of those that see nothing."""
-    rows = {name: copy.see(name, given[name]) for name in copy.learners if name in given}
-    return np.array([rows.get(name, np.zeros_like(next(iter(rows.values())))) for name in copy.learners])
 
 
 def _is_mujoco(bare: Any) -> bool:

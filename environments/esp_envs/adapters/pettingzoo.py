@@ -14,9 +14,10 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import pairing, require_attributes, seed_of
+from esp_envs.adapters import require_attributes, seed_of
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.hooks import Array, Copy, CopyHooks
+from esp_envs.adapters.settable import simulated_layout
 from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
@@ -137,7 +138,7 @@ class ParallelTask(CopyHooks, Environment):
         """
         one = Copy(self)
         with one.naming("put"):
-            found = pairing.simulated(one, self.observation, self.simulated)
+            found = simulated_layout(one, self.observation, self.simulated)
         one.close()
         if found is not None:
             self._simulated, self._copies, self.spec = True, None, replace(self.spec, state=found)
