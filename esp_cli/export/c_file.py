@@ -27,15 +27,10 @@ FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
 @dataclass(frozen=True)
 class Cost:
-    """The memory that a program in C needs on a microcontroller.
+    """The memory that a program in C needs on a microcontroller."""
 
-    Attributes:
-        flash_bytes: of the weights; the code comes on top (about 1 kB without libm).
-        ram_bytes: of the scratch and of one agent's memory; the stack needs some 100 more.
-    """
-
-    flash_bytes: int
-    ram_bytes: int
+    flash_bytes: int  # of the weights; the code comes on top (about 1 kB without libm)
+    ram_bytes: int  # of the scratch and of one agent's memory; the stack needs some 100 more
 
 
 def cost(program: Program) -> Cost:
@@ -45,11 +40,7 @@ def cost(program: Program) -> Cost:
 
 
 def c_source(program: Program, comment: str) -> dict[str, bytes]:
-    """Write a program as a header and a source.
-
-    Args:
-        program: the policy.
-        comment: what it is, line by line; stands at the top of the header.
+    """Write a program as a source and a header that begins with a comment.
 
     Raises:
         UserError: agents that exchange messages and have continuous actions.
@@ -79,14 +70,7 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
 
 
 def example_source(program: Program, observation: list[float], action: list[float], allowed: list[bool]) -> bytes:
-    """Return a program that acts on the worked example and says whether the action is the right one.
-
-    Args:
-        program: the policy.
-        observation: of the example; of a team all of them.
-        action: that it should take.
-        allowed: actions of the example; empty where there are no masks.
-    """
+    """Return a program that acts on the worked example (of a team all rows), and says whether it acts as it should."""
     choose = program.head == "choose"
     return filled(
         "policy_example.c",

@@ -19,13 +19,7 @@ _MOST_ROWS = 16  # actions beyond which only `policy.json` lists them
 
 
 def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:
-    """Return what `policy.json` holds.
-
-    Args:
-        trained: one seed's policy.
-        program: the same as plain arrays.
-        sample: of what it does; its first row (of a team its first world), with empty memory, is the worked example.
-    """
+    """Return what `policy.json` holds; the sample's first row (of a team its first world) is the worked example."""
     config, spec, head = trained.config, trained.spec, trained.policy.head
     first = slice(program.team) if program.team > 1 else 0
     # What builds observations from poses knows no compass.

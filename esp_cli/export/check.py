@@ -51,17 +51,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How far an export is from the policy.
+    """How far an export is from the policy."""
 
-    Attributes:
-        observations: compared.
-        max_difference: of an output, an action's number or the memory after it.
-        other_actions: choices that differ, each of them a tie within rounding; None where the head does not choose.
-    """
-
-    observations: int
-    max_difference: float
-    other_actions: int | None
+    observations: int  # compared
+    max_difference: float  # of an output, an action's number or the memory after it
+    other_actions: int | None  # that differ, each of them a tie within rounding; None where the head does not choose
 
 
 @torch.no_grad()

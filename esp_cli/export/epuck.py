@@ -50,10 +50,7 @@ def seen_robots(settings: Mapping[str, Any]) -> int:
 
 
 def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the header and the source that build observations from poses and drive the wheels.
-
-    Args:
-        description: of an exported policy without memory that drives e-pucks.
+    """Return header and source that build observations from poses and drive the wheels, by a policy without memory.
 
     Raises:
         UserError: the policy sees something that poses do not tell.
@@ -84,13 +81,7 @@ def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
 
 
 def project_files(kind: str, policy: Mapping[str, bytes], settings: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return a project of Webots or a package of ROS 2 around a policy in Python.
-
-    Args:
-        kind: "webots" or "ros2".
-        policy: the files of the policy.
-        settings: of the task, as an export describes them.
-    """
+    """Return a project of Webots or a package of ROS 2 (`kind` is "webots" or "ros2") around a policy in Python."""
     side, radius = settings["arena_m"], settings["obstacle_radius_m"]
     arena = Arena(side, settings["num_agents"], settings["num_obstacles"], radius)
     pillars = arena.pillars().tolist()
@@ -115,19 +106,12 @@ def project_files(kind: str, policy: Mapping[str, bytes], settings: Mapping[str,
 
 @dataclass(frozen=True)
 class Scenes:
-    """States of the task and what the robots see in them.
+    """States of the task and what the robots see in them."""
 
-    Attributes:
-        poses: [W, N, 3] x, y, heading.
-        goals: [W, N, 2].
-        pillars: [W, M, 2].
-        observations: [W, N, D] observations of the task, without its noise.
-    """
-
-    poses: Floats
-    goals: Floats
-    pillars: Floats
-    observations: Floats
+    poses: Floats  # [W, N, 3] x, y, heading
+    goals: Floats  # [W, N, 2]
+    pillars: Floats  # [W, M, 2]
+    observations: Floats  # [W, N, D] of the task, without its noise
 
 
 @torch.no_grad()

@@ -39,74 +39,44 @@ Files = dict[str, bytes]
 
 @dataclass(frozen=True)
 class Job:
-    """What every format is written from.
+    """What every format is written from."""
 
-    Attributes:
-        trained: one seed's policy.
-        program: the same as plain arrays.
-        sample: of what it does.
-        description: what `policy.json` holds.
-        scenes: states of the task; None unless the policy can drive an e-puck.
-    """
-
-    trained: TrainedPolicy
-    program: Program
-    sample: Sample
-    description: dict[str, Any]
-    scenes: epuck.Scenes | None
+    trained: TrainedPolicy  # one seed's policy
+    program: Program  # the same as plain arrays
+    sample: Sample  # of what it does
+    description: dict[str, Any]  # what `policy.json` holds
+    scenes: epuck.Scenes | None  # states of the task; None unless the policy can drive an e-puck
 
 
 @dataclass(frozen=True)
 class Format:
-    """How a policy is written for another program.
-
-    Attributes:
-        write: returns its files.
-        run: makes what acts by the files in a folder, to be compared with the policy.
-        observer: makes what builds observations from poses by the files in a folder; None where the format has no such.
-    """
+    """How a policy is written for another program."""
 
     write: Callable[[Job], Files]
-    run: Callable[[Path, Program], Runner]
-    observer: Callable[[Path, Job], epuck.Observer] | None = None
+    run: Callable[[Path, Program], Runner]  # makes what acts by the files in a folder
+    observer: Callable[[Path, Job], epuck.Observer] | None = None  # makes what builds observations from poses by them
 
 
 @dataclass(frozen=True)
 class Export:
-    """One format, as it was written.
-
-    Attributes:
-        name: of the format.
-        files: names of the files.
-        size: of them together, bytes.
-        agreement: with the policy; None where it could not be run here.
-        note: why it could not.
-        seen: largest difference between an observation built from poses and the task's; None where none is built.
-    """
+    """One format, as it was written."""
 
     name: str
     files: tuple[str, ...]
-    size: int
-    agreement: Agreement | None
-    note: str | None = None
-    seen: float | None = None
+    size: int  # of the files together, bytes
+    agreement: Agreement | None  # with the policy; None where it could not be run here
+    note: str | None = None  # why it could not
+    seen: float | None = None  # largest difference between an observation built from poses, if any, and the task's
 
 
 @dataclass(frozen=True)
 class Exported:
-    """All formats, and what an action costs.
-
-    Attributes:
-        formats: as they were written.
-        parameters: learned numbers.
-        flops: operations for one action.
-        c: flash and RAM of the C source, where it was written.
-    """
+    """All formats, and what an action costs."""
 
     formats: tuple[Export, ...]
-    parameters: int
-    flops: int
-    c: c_file.Cost | None
+    parameters: int  # learned numbers
+    flops: int  # operations for one action
+    c: c_file.Cost | None  # flash and RAM of the C source, where it was written
 
 
 def _c(job: Job) -> Files:
@@ -180,11 +150,7 @@ FORMATS = {
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each.
 
-    Args:
-        trained: one seed's policy.
-        formats: of `FORMATS`.
-        folder: where to; made where it is missing.
-        force: replace files of an earlier export.
+    `formats` are names of `FORMATS`; `force` replaces files of an earlier export.
 
     Raises:
         UserError: a file exists already, an earlier export has formats that are not written anew, a library is

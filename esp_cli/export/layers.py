@@ -28,28 +28,20 @@ NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch d
 class Layer:
     """One step of a program: rows x to rows y.
 
-    Attributes:
-        kind: its name in JSON.
-        flops: operations for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one.
-        c: statements, in the macros of `templates/policy.c.jinja`; w0, w1, ... stand for the arrays.
-        onnx: an operation a line, in ONNX's text format; w0, w1, ... stand for the arrays, numbers for constants.
-        torch: makes y [rows, width] of x, the arrays, and the observations [rows, D]; the kind `gru` takes the hidden
-            state [rows, H] instead of the latter.
-        arrays: learned numbers, in the order in which exports store them.
-        onnx_arrays: what ONNX stores instead of them, where that differs.
-        numbers: what JSON says of it, beside the shapes of the arrays.
-        width: of the widest row that it reads or writes, where another layer does not tell.
+    In C (in the macros of `templates/policy.c.jinja`) and ONNX (its text format, an operation a line) w0, w1, ... stand
+    for the arrays; in ONNX numbers stand for constants. `torch` makes y [rows, width] of x, the arrays, and the
+    observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the latter.
     """
 
-    kind: str
-    flops: int
+    kind: str  # its name in JSON
+    flops: int  # for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one
     c: str
     onnx: str
     torch: Callable[[Tensor, list[Tensor], Tensor], Tensor]
-    arrays: tuple[Floats, ...] = ()
-    onnx_arrays: tuple[Floats, ...] = ()
-    numbers: tuple[tuple[str, float], ...] = ()
-    width: int = 0
+    arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
+    onnx_arrays: tuple[Floats, ...] = ()  # what ONNX stores instead of them, where that differs
+    numbers: tuple[tuple[str, float], ...] = ()  # what JSON says of it, beside the shapes of the arrays
+    width: int = 0  # of the widest row that it reads or writes, where another layer does not tell
 
     def describe(self) -> dict[str, object]:
         """Return the layer as JSON stores it: without its weights, but with their shapes."""
@@ -150,14 +142,9 @@ def cut(begin: int, end: int) -> Layer:
 
 
 def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side: int, stride: int) -> Layer:
-    """Return a filter at every `stride`-th place of pictures, channels first.
+    """Return a filter at every `stride`-th place of pictures of a shape (channels, rows, columns).
 
-    Args:
-        weight: [channels * side * side, outputs], counted by channel, then row, then column.
-        bias: [outputs].
-        shape: channels, rows and columns of a picture.
-        side: of the filter.
-        stride: places between two of its outputs, along either axis.
+    The weight is [channels * side * side, outputs], counted by channel, then row, then column.
     """
     (channels, rows, columns), outputs = shape, bias.size
     _, high, wide = convolved(shape, outputs, side, stride)

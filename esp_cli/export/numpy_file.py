@@ -18,13 +18,7 @@ from esp_cli.export.templates import filled
 
 
 def numpy_source(program: Program, comment: str, description: dict[str, Any]) -> bytes:
-    """Write a program as a Python file: the runtime as it is, then this policy's numbers.
-
-    Args:
-        program: the policy.
-        comment: what it is, line by line.
-        description: layout, actions and the worked example.
-    """
+    """Write a program as a Python file: a comment, the runtime as it is, then this policy's description and numbers."""
     return filled(
         "policy.py",
         comment=comment.replace("\\", "/").replace('"""', "'''"),

@@ -61,9 +61,7 @@ def onnx_model(program: Program, description: str) -> bytes:
     bool. Outputs: `action` ([rows] int64 or [rows, width] float32), `outputs` [rows, outputs] of the last layer, and
     `memory_out` [rows, H]. A team's rows stand side by side, world after world.
 
-    Args:
-        program: the policy.
-        description: JSON that goes into the model's metadata.
+    The description, which is JSON, goes into the model's metadata.
 
     Raises:
         UserError: onnx is not installed.

@@ -37,29 +37,17 @@ SQUASH_EPSILON = 1e-18  # squashing adds this to the squared length (`esp_cli.ne
 
 @dataclass(frozen=True)
 class Program:
-    """One greedy policy.
+    """One greedy policy."""
 
-    Attributes:
-        num_inputs: D, numbers of an observation.
-        layers: in their order.
-        num_outputs: numbers of the last layer.
-        hidden: H, numbers of the hidden state; 0 for a policy that remembers nothing.
-        previous: numbers of the previous action in the memory.
-        head: how the outputs become an action.
-        groups: widths of what is squashed together; empty where the head chooses.
-        team: agents that act together, with their rows side by side; 1 where each acts by itself.
-        masked: whether a mask of the allowed actions [A] comes with every observation; one that allows none allows all.
-    """
-
-    num_inputs: int
+    num_inputs: int  # D, numbers of an observation
     layers: tuple[Layer, ...]
-    num_outputs: int
-    hidden: int
-    previous: int
-    head: Literal["choose", "squash"]
-    groups: tuple[int, ...]
-    team: int = 1
-    masked: bool = False
+    num_outputs: int  # numbers of the last layer
+    hidden: int  # H, numbers of the hidden state; 0 for a policy that remembers nothing
+    previous: int  # numbers of the previous action in the memory
+    head: Literal["choose", "squash"]  # how the outputs become an action
+    groups: tuple[int, ...]  # widths of what is squashed together; empty where the head chooses
+    team: int = 1  # agents that act together, with their rows side by side; 1 where each acts by itself
+    masked: bool = False  # whether a mask of allowed actions [A] comes along; one that allows none allows all
 
     @property
     def memory_width(self) -> int:
@@ -88,11 +76,7 @@ class Program:
 
 
 def program_of(policy: Policy, masked: bool = False) -> Program:
-    """Return the program of a policy with a single seed.
-
-    Args:
-        policy: of a task.
-        masked: whether the task has masks of allowed actions.
+    """Return the program of a policy with a single seed, of a task with masks of allowed actions or without.
 
     Raises:
         UserError: a network or head that exports do not know.

@@ -63,9 +63,7 @@ def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
 def torch_archive(program: Program, description: str) -> bytes:
     """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team.
 
-    Args:
-        program: the policy.
-        description: JSON that goes into the archive as `policy.json`.
+    The description, which is JSON, goes into the archive as `policy.json`.
     """
     worlds = torch.export.Dim("worlds", min=1)
     rows = worlds if program.team == 1 else program.team * worlds

@@ -44,6 +44,7 @@ class MujocoWorlds(Physics):
         shape = (num_worlds, arena.num_robots)
         self._qpos = self._batch.bind("qpos").reshape(*shape, -1)
         self._qvel = self._batch.bind("qvel").reshape(*shape, -1)
+        self._pose, self._velocity = self._qpos, self._qvel
         self._control = self._batch.bind("ctrl").reshape(*shape, -1)
         self._pillars = self._batch.bind("mocap_pos")
         self._warmstart = self._batch.bind("qacc_warmstart")
@@ -164,16 +165,6 @@ class MujocoPlanar(MujocoWorlds):
         """Drive for one control period."""
         self._control[:] = chord(wheels, self._qpos[..., 2], self.control_period_s)
         self._batch.step(nstep=self._substeps)
-
-    @property
-    def pose(self) -> Array:
-        """[W, N, 3] x, y and heading."""
-        return self._qpos.copy()
-
-    @property
-    def velocity(self) -> Array:
-        """[W, N, 3] of x, y and heading."""
-        return self._qvel.copy()
 
 
 CENTRE_HEIGHT_M = 0.020  # of the mass, ours: at the axle, where the battery and the motors are

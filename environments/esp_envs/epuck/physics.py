@@ -48,6 +48,8 @@ class Physics(ABC):
 
     remembered: ClassVar[tuple[str, ...]]
     """Names of the arrays that a world's future depends on; the attributes have an underscore before them."""
+    _pose: Array
+    _velocity: Array
 
     def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
         self.arena, self.num_worlds, self.control_period_s = arena, num_worlds, control_period_s
@@ -70,14 +72,14 @@ class Physics(ABC):
         """
 
     @property
-    @abstractmethod
     def pose(self) -> Array:
         """[W, N, 3] x, y and heading, as memory of its own."""
+        return self._pose.copy()
 
     @property
-    @abstractmethod
     def velocity(self) -> Array:
         """[W, N, 3] of x, y and heading, as memory of its own."""
+        return self._velocity.copy()
 
     def state_dict(self) -> dict[str, Array]:
         """Return copies of all that `load_state_dict` needs to go on bit for bit."""

@@ -114,16 +114,6 @@ class PymunkPlanar(Physics):
         change[..., 2] = np.clip(change[..., 2], -most, most)
         return change * self._mass[..., None] * [MASS_KG, MASS_KG, _INERTIA] / TIMESTEP_S
 
-    @property
-    def pose(self) -> Array:
-        """[W, N, 3] x, y and heading."""
-        return self._pose.copy()
-
-    @property
-    def velocity(self) -> Array:
-        """[W, N, 3] of x, y and heading."""
-        return self._velocity.copy()
-
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
         """Place the bodies."""
         self.place(Bodies(**arrays))

@@ -43,7 +43,7 @@ def drive(wheels: Array) -> tuple[Array, Array]:
 
 
 def chord(wheels: Array, heading: Array, duration_s: float) -> Array:
-    """Return the constant velocity (vx, vy, spin) that ends where the arc of these wheels would.
+    """Return the constant velocity (vx, vy, spin), [..., 3], that ends where the arc of these wheels would.
 
     A robot that drives at speed v and turns at rate w follows an arc; over a time T its end is reached as well along
     the chord: in the direction heading + w T / 2, at the speed v sin(w T / 2) / (w T / 2).
@@ -52,9 +52,6 @@ def chord(wheels: Array, heading: Array, duration_s: float) -> Array:
         wheels: [..., 2] left and right wheel speed, rad/s.
         heading: [...] at the beginning, rad.
         duration_s: T.
-
-    Returns:
-        [..., 3] in m/s, m/s and rad/s.
     """
     speed, spin = drive(wheels)
     half_turn = spin * duration_s / 2
