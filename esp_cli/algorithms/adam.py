@@ -8,10 +8,10 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from esp_cli.prior.loss import Loss
+from esp_cli.prior.losses import Loss
 
+# numbers per seed are filled up to a multiple of this, so that no seed begins within a vector of the processor
 _ALIGNED = 16
-"""Numbers per seed are filled up to a multiple of this, so that no seed begins within a vector of the processor."""
 BETAS = (0.9, 0.999)
 
 

@@ -48,7 +48,6 @@ class MaddpgConfig(ExploringConfig):
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
-        """Return "actor_gradient" where actions are continuous: the actor's output is the action, nothing is drawn."""
         return frozenset() if isinstance(spec().action, Discrete) else frozenset({"actor_gradient"})
 
 
@@ -63,7 +62,6 @@ class Maddpg(ExploringLearner):
     config: MaddpgConfig
 
     def build(self, env: Environment, network: NetworkConfig) -> None:
-        """Make all that the learner consists of; see `Learner.build`."""
         super().build(env, network)
         config, spec, generators = self.config, self.spec, self.generators["learner"]
         self.head: ActorHead = self.policy.head  # type: ignore[assignment]
@@ -97,7 +95,6 @@ class Maddpg(ExploringLearner):
     def build_policy(
         cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
     ) -> HistoryPolicy:
-        """Return new policies with the actor's head that fits the actions."""
         return HistoryPolicy(spec, network, generators, build_actor_head(spec.action, len(generators)), POLICY_GAIN)
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
@@ -111,7 +108,6 @@ class Maddpg(ExploringLearner):
         return metrics
 
     def answers(self, rows: EpisodeBatch) -> Answers:
-        """Return what actor and critic say of rows, for `SymmetryPrior.errors`."""
         values = self.joint.value(self.critic, self.critic_rows(rows)[:, :, :-1], self._encoded(rows))
         return {"policy": (self.head, self._outputs(rows)), "value": values}
 
@@ -174,7 +170,6 @@ class Maddpg(ExploringLearner):
         return self.joint.exchanged(self.critic, seen, self._encoded(rows), own.unsqueeze(-2)).squeeze(-1)
 
     def _condition(self, batch: EpisodeBatch) -> dict[str, Tensor]:
-        """Return the share of the critic's hidden units that a whole batch leaves at 0."""
         if self.config.critic_activation != "relu":
             return {}
         rows = self.joint.inputs(self.critic_rows(batch)[:, :, :-1], self._encoded(batch))

@@ -28,11 +28,10 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
-PROBE_STEPS = 100
-"""Environment steps per seed on which the symmetry errors are measured after every update."""
+PROBE_STEPS = 100  # environment steps per seed on which the symmetry errors are measured after every update
 
+# metrics that have to be finite for a seed to go on
 WATCHED = ("policy_loss", "value_loss", "actor_grad_norm", "critic_grad_norm")
-"""Metrics that have to be finite for a seed to go on."""
 
 
 class Mappo(Learner):
@@ -49,7 +48,6 @@ class Mappo(Learner):
     collector: Collector
 
     def build(self, env: Environment, network: NetworkConfig) -> None:
-        """Make all that the learner consists of; see `Learner.build`."""
         config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
         self.policy = self.build_policy(spec, network, generators).to(device)
         critic_network = network.with_activation(config.critic_activation)
@@ -92,16 +90,13 @@ class Mappo(Learner):
     def build_policy(
         cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
     ) -> StochasticPolicy:
-        """Return new stochastic policies."""
         return StochasticPolicy(spec, network, generators)
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps per seed of one iteration."""
         return self.config.num_envs * self.config.num_steps
 
     def iterate(self, progress: float) -> Iteration:
-        """Collect one rollout, learn from it, and return what came out; see `Learner.iterate`."""
         rollout = self.collector.collect(self.config.num_steps)
         metrics = {"train/return": self.collector.pop_mean_return(), **self.update(rollout, progress)}
         return self.iteration(metrics, *(metrics[f"train/{name}"] for name in WATCHED))

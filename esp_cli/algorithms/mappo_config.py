@@ -43,7 +43,6 @@ class MappoConfig(LearnerConfig):
     chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
-        """Return what serves memory or a choice of activation that the network does not have."""
         idle = set() if network.recurrent else {"truncation"}
         if network.with_activation("relu") == network.with_activation("tanh"):
             idle.add("critic_activation")

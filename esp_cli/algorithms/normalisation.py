@@ -10,16 +10,12 @@ from torch import Tensor, nn
 from esp_cli.algorithms.losses import beside
 from esp_cli.prior import mean_per_seed
 
-_SMALLEST = 1e-6
-"""The least standard deviation: of rewards that are all 0, say."""
-_RESOLUTION = 1e-7
-"""The least standard deviation in means."""
+_SMALLEST = 1e-6  # the least standard deviation: of rewards that are all 0, say
+_RESOLUTION = 1e-7  # the least standard deviation in means
+# deviations that the mean of rewards may be away from 0: more than in any built-in task (4 to 6 in navigation)
 _FAR = 8.0
-"""Deviations that the mean of rewards may be away from 0: more than in any built-in task (4 to 6 in navigation)."""
-_SHARE = 0.01
-"""Of small sums of rewards: the deviation of values before any is learned."""
-_UNKNOWN = {"mean": 0.0, "variance": 1.0, "weight": 0.0, "offset": 0.0}
-"""Statistics before the first update."""
+_SHARE = 0.01  # of small sums of rewards: the deviation of values before any is learned
+_UNKNOWN = {"mean": 0.0, "variance": 1.0, "weight": 0.0, "offset": 0.0}  # statistics before the first update
 
 
 class ValueNormaliser(nn.Module):

@@ -1,4 +1,4 @@
-"""The losses of the learners, each an equation on what networks output, with its slope; see `prior.loss.Loss`.
+"""The losses of the learners, each an equation on what networks output, with its slope; see `prior.losses.Loss`.
 
 What is minimised is the negative of the paper's objective, a mean over the rows that count: [S]. The consistency terms
 S_pi and S_V (S_Q) of Eq. 8 and 9 are in `prior.losses`; `Copies.penalty` weighs them (Eq. 10).
@@ -15,7 +15,7 @@ from torch.nn.functional import huber_loss
 from esp_cli.networks.policies import Policies
 from esp_cli.prior import Copies, Loss, Term, shares
 from esp_cli.prior.frame import Values
-from esp_cli.prior.loss import Stated
+from esp_cli.prior.losses import Stated
 
 
 def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, entropy_coef: float) -> Loss:

@@ -78,7 +78,6 @@ class OffPolicyLearner(Learner):
     collector: EpisodeCollector
 
     def build(self, env: Environment, network: NetworkConfig) -> None:
-        """Make what the off-policy learners have in common; see `Learner.build`."""
         config, spec, device, generators = self.config, self.spec, self.device, self.generators["learner"]
         per_round = config.num_envs * (1 + self.prior.num_stored)
         if per_round > config.replay_episodes:
@@ -96,7 +95,6 @@ class OffPolicyLearner(Learner):
 
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps per seed of one iteration."""
         return self.config.rounds * self.config.num_envs * self.spec.horizon
 
     @property
@@ -105,7 +103,6 @@ class OffPolicyLearner(Learner):
         return self.joint.width + self.config.critic_sees_time
 
     def iterate(self, progress: float) -> Iteration:
-        """Collect episodes, learn from the replay, and return what came out."""
         config, sums, returns = self.config, dict[str, Tensor](), []
         if config.anneal_learning_rate:
             self.anneal(1.0 - progress)
@@ -220,22 +217,18 @@ class OffPolicyLearner(Learner):
 
     @property
     def has_learned(self) -> bool:
-        """Whether the warm-up is over."""
         return self.updates > 0
 
     def bytes_to_come(self, steps: int) -> int:
-        """Return by how many bytes the replay will grow; see `Learner.bytes_to_come`."""
         episodes = min(self.replay.capacity, steps // self.spec.horizon * (1 + self.prior.num_stored))
         return self.replay.num_bytes * max(0, episodes - self.replay.size) // self.replay.capacity
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
-        """Return what a resumed run needs; a complete run's replay is left out."""
         out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}
         replay = {} if complete else self.replay.state_dict()
         return out | {f"replay.{name}": tensor for name, tensor in replay.items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned; see `Learner.load_state_dict`."""
         super().load_state_dict(tensors)
         replay = below(tensors, "replay")
         if "counters" not in tensors or tensors["counters"].shape != (2,):
@@ -251,11 +244,9 @@ class ExploringLearner(OffPolicyLearner):
     config: ExploringConfig
 
     def explore(self) -> None:
-        """Set epsilon of the next round."""
         self._schedule.explore(self._epsilon())
 
     def exploration(self) -> dict[str, Tensor]:
-        """Return epsilon as it was last."""
         return {"train/epsilon": self._schedule.epsilon.clone()}
 
     @property
@@ -271,5 +262,4 @@ class ExploringLearner(OffPolicyLearner):
         return config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
 
 
-PROBE_EPISODES = 4
-"""Episodes per seed on which the symmetry errors are measured once an iteration."""
+PROBE_EPISODES = 4  # episodes per seed on which the symmetry errors are measured once an iteration

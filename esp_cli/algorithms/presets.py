@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from esp_envs.errors import UserError
 
-Sections = dict[str, dict[str, object]]
-"""Settings by section: the algorithm's name, "network", "prior" or "evaluation"."""
+Sections = dict[str, dict[str, object]]  # settings by section: the algorithm's name, "network", "prior" or "evaluation"
 
 _PAPER_NETWORK: dict[str, object] = {"name": "gru", "hidden": (64, 64), "activation": "relu", "layer_norm": True}
 _PAPER_PRIOR: dict[str, object] = {"transforms": "rot90", "consistency_coef": 0.5}
@@ -181,8 +180,8 @@ FAST: dict[str, dict[str, Sections]] = {
 }
 
 
+# what a task changes in the preset `paper`, whose recurrent MAPPO needs whole episodes
 PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_steps": 300}}}}
-"""What a task changes in the preset `paper`, whose recurrent MAPPO needs whole episodes."""
 
 
 def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:

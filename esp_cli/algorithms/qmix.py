@@ -43,8 +43,8 @@ class QmixConfig(ExploringConfig):
     target_every: int = Field(100, ge=1, description="gradient steps between hard copies into the target networks")
 
 
+# orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards
 VALUE_GAIN = 0.1
-"""Orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards."""
 
 
 class Qmix(ExploringLearner):
@@ -61,7 +61,6 @@ class Qmix(ExploringLearner):
     task_settings = MappingProxyType({"actions": "discrete"})
 
     def build(self, env: Environment, network: NetworkConfig) -> None:
-        """Make all that the learner consists of; see `Learner.build`."""
         super().build(env, network)
         config, generators = self.config, self.generators["learner"]
         widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
@@ -105,7 +104,6 @@ class Qmix(ExploringLearner):
         return self.td_metrics(copies.original(values), target, batch) | {"grad_norm": norm}
 
     def answers(self, rows: EpisodeBatch) -> Answers:
-        """Return Q_tot of rows, for `SymmetryPrior.errors`."""
         return {"value": self._total(self._utilities(rows), rows, self.critic_rows(rows))}
 
     def _utilities(self, rows: EpisodeBatch) -> Tensor:

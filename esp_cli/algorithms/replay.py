@@ -31,12 +31,10 @@ class EpisodeBatch(SeedBatch):
 
     @property
     def mask(self) -> Tensor:
-        """[S, B, T] which rows count, or [S, B, T, N] where agents end."""
         return self.valid if self.alive is None else self.valid.unsqueeze(-1) & self.alive[:, :, :-1]
 
     @property
     def played(self) -> Tensor:
-        """[S, B, T] which rows belong to an episode."""
         return self.valid
 
     def of_living(self, x: Tensor, after: bool = False) -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn import functional as F
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.checking.controls import STILL, planes
 from esp_cli.checking.recorded import Transitions
-from esp_cli.prior.regression import inputs_of, moments, orders_of_others, ridge
+from esp_cli.prior.gate import inputs_of, moments, orders_of_others, ridge
 from esp_envs.spec import Discrete, Spaces
 
 _HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3

@@ -13,15 +13,12 @@ from esp_cli.prior.losses import policy_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 
-Policy = Any
-"""What a policy returns: a distribution, or a tensor (logits of discrete actions, continuous actions)."""
+Policy = Any  # what a policy returns: a distribution, or a tensor (logits of discrete actions, continuous actions)
 
-SAMPLES = 8
-"""Actions drawn where a divergence has no closed form."""
+SAMPLES = 8  # actions drawn where a divergence has no closed form
+# A latent action that a squash sends to the end of its box, and how near to the end, as a share, actions may come
 _FAR, _MARGIN = 30.0, 1e-6
-"""A latent action that a squash sends to the end of its box, and how near to the end, as a share, actions may come."""
-_GOLDEN = 0.6180339887498949
-"""Multiples of it, without their whole parts, lie evenly in [0, 1)."""
+_GOLDEN = 0.6180339887498949  # multiples of it, without their whole parts, lie evenly in [0, 1)
 _KNOWN = "Categorical, OneHotCategorical, Normal, Independent, or a squashed Normal such as TanhNormal"
 
 

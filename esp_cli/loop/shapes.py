@@ -11,12 +11,12 @@ from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces
 
+# what messages advise where numbers look like memory
 HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
-"""What messages advise where numbers look like memory."""
 
 
+# what messages advise where actions and layouts carry no group of the plane
 ANOTHER = "give another group, or fields that say what the numbers are"
-"""What messages advise where actions and layouts carry no group of the plane."""
 _ARGUMENTS = {
     "observation": (Layout, "layout(Field(...), ...)"),
     "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),

@@ -52,8 +52,7 @@ class _Answers(NamedTuple):
     value: Tensor
 
 
-_TERMS = {"policy": "loss_objective", "value": "loss_critic"}
-"""Which loss of PPO each term is added to."""
+_TERMS = {"policy": "loss_objective", "value": "loss_critic"}  # which loss of PPO each term is added to
 
 
 class SymmetricLoss(nn.Module):

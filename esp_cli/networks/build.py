@@ -38,8 +38,8 @@ NETWORKS: Registry[NetworkConfig] = Registry(
 )
 """The settings of every network, by its name."""
 
+# stored configurations of version 0.1.0 hold these fields for every network, also for one that does not read them
 _FLAT_FIELDS = {"activation", "precision", "layer_norm", "group", "separate_parts"}
-"""Stored configurations of version 0.1.0 hold these fields for every network, also for one that does not read them."""
 
 
 def network_class(name: object) -> type[NetworkConfig]:
@@ -63,8 +63,8 @@ def _stored(data: object) -> object:
     return validate(cls, kept)
 
 
+# A field of a pydantic model that holds the settings of any registered network
 AnyNetworkConfig = Annotated[SerializeAsAny[NetworkConfig], BeforeValidator(_stored)]
-"""A field of a pydantic model that holds the settings of any registered network."""
 
 
 def perceptron(config: NetworkConfig, activation: ActivationName) -> MlpConfig:

@@ -152,13 +152,11 @@ class EquivariantConfig(NetworkConfig):
     )
 
     def without_effect(self) -> frozenset[str]:
-        """Return "relaxation" where nothing is relaxed."""
         return frozenset() if self.relax else frozenset({"relaxation"})
 
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build an equivariant perceptron; see `NetworkConfig.build`."""
         return Equivariant(generators, self.io_or_refuse(io), self, output_gain)
 
 
@@ -194,7 +192,6 @@ class Equivariant(Memoryless):
         return perceptron(self._shape, [x], self._plain())
 
     def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        """Return outputs and VJP; see `Network.unroll_with_vjp`."""
         plain = self._plain()
         outputs, vjp = perceptron_with_vjp(self._shape, [x], plain)
 

@@ -154,13 +154,10 @@ class Memoryless(Network):
     """A network that maps each row by itself: a subclass defines `forward`, [S, B, in] -> [S, B, out]."""
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the network to one step."""
         return self(x), memory
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once: [S, ..., in] -> [S, ..., out]."""
         return self(x.flatten(1, -2)).unflatten(1, x.shape[1:-1])
 
     def unroll_agents(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps of all agents; see `Network.unroll_agents`."""
         return self.unroll(x, truncation) if self.team == 1 else super().unroll_agents(x, truncation)

@@ -178,8 +178,7 @@ class BoundedPoint(ExploringHead):
         return {"saturation": (length > SATURATED).float().mean(-1)}
 
 
-SATURATED = 0.99
-"""Length from which a bounded action counts as one at its bounds."""
+SATURATED = 0.99  # length from which a bounded action counts as one at its bounds
 
 ActorHead = ExploringCategorical | BoundedPoint
 

@@ -22,8 +22,7 @@ from esp_cli.networks.policies import CategoricalPolicies, Frame, GaussianPolici
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 _INITIAL_STD = 0.6
-MASKED = -1e9
-"""Output of an action that is not allowed: its probability is exactly 0, and it is never the best."""
+MASKED = -1e9  # output of an action that is not allowed: its probability is exactly 0, and it is never the best
 
 
 def masked(outputs: Tensor, action_mask: Tensor | None) -> Tensor:

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from esp_cli.networks.kernels.library import library
 from esp_cli.networks.perceptron import Shape, activate_, affine, perceptron, perceptron_with_vjp
 
+# orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
-"""Orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)."""
 
 
 def orthogonal(generators: Sequence[torch.Generator], rows: int, columns: int, gain: float) -> Tensor:

@@ -27,13 +27,12 @@ from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Items, Kind, Layout, others_of
 
+# of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller.
 CHANNELS, FILTERS, STRIDES = (16, 32), (7, 5), (2, 1)
-"""Of the two convolutions; van der Pol's script. A filter shrinks to a picture that is smaller."""
 REACH_SQUARED = 18.0
 """Square of the communication range in cells, 3 sqrt(2) cells; van der Pol's code. Drones at exactly this range do not
 exchange messages. Squared distances are integers, so the comparison is exact."""
-_LOT = 16
-"""The number of encoded pictures is a multiple of this, so that few shapes of matrix products occur."""
+_LOT = 16  # the number of encoded pictures is a multiple of this, so that few shapes of matrix products occur
 
 
 class PictureEncoder(nn.Module):
@@ -162,7 +161,6 @@ class MpnConfig(NetworkConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build a message passing network; see `NetworkConfig.build`."""
         return MessagePassing(generators, self.io_or_refuse(io), self, "c1", output_gain)
 
 
@@ -175,7 +173,6 @@ class EmpnConfig(NetworkConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build an equivariant message passing network; see `NetworkConfig.build`."""
         return MessagePassing(generators, self.io_or_refuse(io), self, self.group, output_gain)
 
 
@@ -241,7 +238,6 @@ class MessagePassing(Memoryless):
         return total.flatten(1, 2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once: [S, W * N, T, D] -> [S, W * N, T, out]."""
         worlds = x.unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
         outputs = self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4])
         return outputs.transpose(2, 3).flatten(1, 2)

@@ -120,5 +120,4 @@ def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, T
     return first.unflatten(1, (num_agents, width)), bias, second, offset
 
 
-HYPER_GAIN = 0.5
-"""Orthogonal gain of the hypernetwork's last layer."""
+HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer

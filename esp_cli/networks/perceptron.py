@@ -18,11 +18,11 @@ from torch.autograd import Function
 from esp_cli.networks.kernels.library import computes
 from esp_cli.networks.kernels.perceptron import CompiledPass
 
+# rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache
 CACHED_ROWS = 4096
-"""Rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache."""
 
+# outputs below which a batched product runs several times faster with rows and columns exchanged (MKL, measured)
 THIN = 16
-"""Outputs below which a batched product runs several times faster with rows and columns exchanged (MKL, measured)."""
 
 
 class Shape(NamedTuple):

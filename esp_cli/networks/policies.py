@@ -17,8 +17,7 @@ from esp_cli.networks.contract import WithVJP
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
-Weights = Tensor | float
-"""A number, or [S, 1, R]."""
+Weights = Tensor | float  # A number, or [S, 1, R]
 
 
 class Frame(Protocol):

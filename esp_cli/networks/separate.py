@@ -53,10 +53,8 @@ class Separate(Network):
         self.register_buffer("parts", parts, False)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance one step."""
         y, memory = self.network.step(x, memory)
         return y @ self.parts, memory
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes."""
         return self.network.unroll(x, truncation) @ self.parts

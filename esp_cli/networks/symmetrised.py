@@ -63,14 +63,12 @@ class Symmetrised(Network):
         return torch.matmul(y.unflatten(1, (self.group.order, -1)), self.back).mean(1)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance one step with every image."""
         order, width = self.group.order, self.network.memory_width
         apart = memory.unflatten(-1, (order, width)).permute(0, 2, 1, 3).flatten(1, 2)
         y, apart = self.network.step(self._images(x), apart)
         return self._mean(y), apart.unflatten(1, (order, -1)).permute(0, 2, 1, 3).flatten(2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes with every image: [S, B, T, in] -> [S, B, T, out]."""
         shape = (self.group.order * x.shape[1], x.shape[2])
         images = self._images(x.flatten(1, 2)).unflatten(1, shape)
         return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:3])

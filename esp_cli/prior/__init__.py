@@ -3,8 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 from esp_cli.prior.copies import Copies
-from esp_cli.prior.loss import Loss, Term
-from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
+from esp_cli.prior.losses import Loss, Term, policy_consistency_loss, value_consistency_loss
 from esp_cli.prior.seed_batch import SeedBatch, average, mean_per_seed, shares
 from esp_cli.prior.symmetry_prior import Answers, SymmetryPrior
 

@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from esp_cli.defaults import PriorKind
 from esp_cli.files.documents import Strict
 
+# what `kind` "auto" stands for, under what else the user chooses
 _AUTO = {"kind": "esp", "trust": "measured", "fade": 0.5}
-"""What `kind` "auto" stands for, under what else the user chooses."""
+# settings that another prior has no say in where a user asks for "auto"
 SAID_BY_AUTO = frozenset({*_AUTO, "transforms", "weights"})
-"""Settings that another prior has no say in where a user asks for "auto"."""
 
 
 class PriorConfig(Strict):

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.prior.frame import Frame, Values
-from esp_cli.prior.loss import Loss, OfGraph, Term
-from esp_cli.prior.losses import policy_consistency_loss, policy_gap, value_gap
+from esp_cli.prior.losses import Loss, OfGraph, Term, policy_consistency_loss, policy_gap, value_gap
 from esp_cli.prior.seed_batch import Rows, average, shares
 from esp_cli.symmetry import Transform
 

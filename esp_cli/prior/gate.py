@@ -13,31 +13,29 @@ field. P_N is a ridge regression on products of two numbers, a class of function
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from esp_cli.prior.regression import inputs_of, moments, ridge
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Map
-from esp_envs.spec import Spaces
+from esp_envs.spec import Discrete, Spaces, others_of
 
 if TYPE_CHECKING:  # a loop of one's own brings no environment of ours
     from esp_envs.base import Environment
 
-ROWS = 12_800
-"""Joint steps that the predictors are fitted to, about."""
-STEPS = 50
-"""Steps of an episode that are looked at, at most."""
-_SIGNIFICANT = 4.0
-"""Standard errors of a prediction below which a gap counts as none."""
-_CACHED_ROWS = 2048
-"""Rows of features that fit a processor's cache."""
-_STILL = 1e-5
-"""Standard deviation below which a field does not change, so that it says nothing."""
+ROWS = 12_800  # joint steps that the predictors are fitted to, about
+STEPS = 50  # steps of an episode that are looked at, at most
+_SIGNIFICANT = 4.0  # standard errors of a prediction below which a gap counts as none
+_CACHED_ROWS = 2048  # rows of features that fit a processor's cache
+_STILL = 1e-5  # standard deviation below which a field does not change, so that it says nothing
+_WIDEST_PAIRS = 48  # up to so many numbers of one agent, products of two of them are looked at too
+# up to so many numbers that all other agents see and do, what they see is looked at too; else what they do alone
+_WIDEST_OTHERS = 160
 
 
 @dataclass(frozen=True)
@@ -52,15 +50,12 @@ class GatedTransform(Transform):
 
     @property
     def is_uniform(self) -> bool:
-        """False: rows of one seed differ."""
         return False
 
     def part(self, start: int, stop: int) -> GatedTransform:
-        """Return the transform of some rows."""
         return gated(self, self.open[:, start:stop])
 
     def action(self, action: Tensor) -> Tensor:
-        """Apply K_g to actions."""
         return self._mixed(super().action(action), action)
 
     def _move(self, x: Tensor, by: Map, agent_axis: int | None = None, back: bool = False) -> Tensor:
@@ -187,3 +182,56 @@ def _predicted(inputs: Tensor, weights: Tensor) -> Tensor:
     if len(weights) == 1:  # of all agents: one product, several times faster with its few outputs in front (MKL)
         return (weights[0].mT @ inputs.flatten(0, 2).mT).mT.unflatten(0, inputs.shape[:3])
     return torch.einsum("mtnf,nfo->mtno", inputs, weights)
+
+
+def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
+    """Return [M, T, N, features]: 1, what each agent sees and does, products of two of these numbers, and the others'.
+
+    An agent's next observation depends on what the other agents see and do.
+
+    Args:
+        spaces: what the numbers are.
+        obs: [M, T, N, D].
+        action: [M, T, N] int64, or [M, T, N, width] float32.
+    """
+    acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
+    columns = torch.cat([obs, acted], -1).movedim(-1, 0).contiguous()  # [numbers, M, T, N]
+    orders = orders_of_others(spaces.num_agents)
+    known = columns if len(orders) * len(columns) <= _WIDEST_OTHERS else columns[spaces.observation.width :]
+    return _side_by_side(columns, [known[..., order] for order in orders])
+
+
+def orders_of_others(num_agents: int) -> list[list[int]]:
+    """Return who is each agent's first other, second other and so on, in index order: N - 1 lists of N agents."""
+    return [list(order) for order in zip(*others_of(num_agents), strict=True)]
+
+
+def _side_by_side(columns: Tensor, others: Sequence[Tensor]) -> Tensor:
+    """Return 1, the columns [numbers, ..., N], their products, and others: [..., N, features], features outermost."""
+    count = len(columns)
+    paired = count if count <= _WIDEST_PAIRS else 0
+    sizes = [1, count, *range(paired, 0, -1), *map(len, others)]
+    features = columns.new_empty(sum(sizes), *columns.shape[1:])
+    one, own, *rest = features.split(sizes)
+    one.fill_(1)
+    own.copy_(columns)
+    for k in range(paired):
+        torch.mul(columns[k:], columns[k], out=rest[k])
+    for part, other in zip(rest[paired:], others, strict=True):
+        part.copy_(other)
+    return features.movedim(0, -1)
+
+
+def moments(inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+    """Return X^T X [N, F, F] and X^T Y [N, F, O] of inputs [M, T, N, F] and outputs [M, T, N, O], in float64."""
+    x, y = (part.flatten(0, 1).transpose(0, 1) for part in (inputs, outputs))
+    return (x.mT @ x).double(), (x.mT @ y).double()
+
+
+def ridge(gram: Tensor, cross: Tensor, strength: float = 1e-4, floor: float = 1e-9) -> Tensor:
+    """Return the weights [N, F, O] of ridge regressions, of X^T X [N, F, F] and X^T Y [N, F, O].
+
+    Each feature is held back in proportion to its own square, which counts `floor` at least.
+    """
+    held = strength * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(floor))
+    return torch.linalg.solve(gram + held, cross).float()

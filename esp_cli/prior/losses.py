@@ -1,46 +1,166 @@
-"""The symmetry consistency losses of the paper: S_pi (Eq. 8), and S_V (Eq. 9) or S_Q (supplement eq. 19).
+"""Losses as weighted sums of equations on what networks output, and the paper's consistency losses among them.
 
-Both are stated once, element by element. Learners average them with their slopes (`policy_gap`, `value_gap`); a foreign
-training loop gives them to autograd.
+S_pi (Eq. 8), S_V (Eq. 9) and S_Q (supplement eq. 19) are stated once, element by element. Learners average them with
+their slopes (`policy_gap`, `value_gap`); a foreign training loop gives them to autograd.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
 
 from esp_cli.prior.frame import Values
-from esp_cli.prior.loss import Equation, Stated
-from esp_cli.prior.seed_batch import shares
+from esp_cli.prior.seed_batch import average, shares
+
+
+class Stated(NamedTuple):
+    """An equation, evaluated.
+
+    Attributes:
+        elements: [S, P, R], whose mean it is; or a number per seed [S], or one [].
+        share: of each element in the mean of its seed; see `shares`. None for a number.
+        slope: that of the terms before, or None, with its own times its weight added.
+    """
+
+    elements: Tensor
+    share: Tensor | float | None
+    slope: Any
+
+
+Equation = Callable[[Any, float, Any], Stated]  # (outputs, weight, slope of the terms before or None) -> what is stated
+
+
+class Term(NamedTuple):
+    """A weighted equation on some outputs; see `Loss`."""
+
+    on: Any
+    weight: float
+    equation: Equation
+
+
+class Loss:
+    """A loss per seed, a weighted sum of equations; losses add up, also with tensors that autograd knows.
+
+    An equation gives its value and its slope by what a network outputs; the tests compare the slopes with autograd.
+    `gradients` sums the slopes by outputs, and the VJP of each network takes its sum back to the weights. With a graph
+    of the equations themselves an update takes up to twice as long.
+
+    What equations are on has a method `back`, which turns the sum of slopes into (tensor, slope) pairs for autograd.
+
+    Example:
+        >>> x = torch.tensor([[3.0]], requires_grad=True)
+        >>> (2 * Loss.of(x.square().sum(1))).gradients([x])[0][1]
+        [tensor([[12.]])]
+    """
+
+    def __init__(self, *terms: Term) -> None:
+        self.terms = terms
+
+    @classmethod
+    def of(cls, loss: Tensor) -> Loss:
+        """Return the loss of a tensor [S] or [] that autograd knows; what it does not know is a constant."""
+        return cls(Term(OfGraph(loss), 1.0, _itself))
+
+    def __add__(self, other: Loss | Tensor) -> Loss:
+        """Return the sum with another loss."""
+        return Loss(*self.terms, *(other if isinstance(other, Loss) else Loss.of(other)).terms)
+
+    __radd__ = __add__
+
+    def __mul__(self, weight: float) -> Loss:
+        """Return the loss times a number."""
+        return Loss(*(Term(on, weight * before, equation) for on, before, equation in self.terms))
+
+    __rmul__ = __mul__
+
+    @property
+    def value(self) -> Tensor:
+        """[S], or [] where nothing depends on the seed."""
+        stated, _ = self._evaluate()
+        return sum((w * (x if share is None else average(x, share)) for w, x, share in stated), start=torch.zeros(()))
+
+    def gradients(self, parameters: Sequence[Tensor]) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
+        """Return parameters and the gradients by them of each seed's own loss; the same parameters may come again.
+
+        Gradients [S, ...] are those by each parameter, or one [S, P] by all side by side. `parameters` are those that
+        are learned, for what autograd takes back.
+        """
+        found: list[tuple[Sequence[Tensor], list[Tensor]]] = []
+        graphs: list[Tensor] = []
+        for root, slope in self._evaluate()[1]:
+            if not isinstance(root, OfGraph):
+                found.append((root.parameters, root.vjp(slope)))
+            elif root.graph.requires_grad:
+                graphs.append(_WithSlope.apply(root.graph, slope))  # type: ignore[no-untyped-call]
+        if graphs:
+            by = torch.autograd.grad(
+                sum(graphs[1:], start=graphs[0]), parameters, allow_unused=True, materialize_grads=True
+            )
+            found.append((parameters, [*by]))
+        return found
+
+    @torch.no_grad()
+    def _evaluate(self) -> tuple[list[tuple[float, Tensor, Tensor | float | None]], list[tuple[Any, Tensor]]]:
+        """Return weights, elements and shares of all equations, and what networks returned with the slopes by it."""
+        stated, sums = [], dict[int, tuple[Any, Any]]()
+        for on, weight, equation in self.terms:
+            _, before = sums.get(id(on), (on, None))
+            elements, share, slope = equation(on, weight, before)
+            sums[id(on)] = (on, slope)
+            stated.append((weight, elements, share))
+        return stated, [root for on, slope in sums.values() for root in on.back(slope)]
+
+
+class OfGraph:
+    """What a network returned under autograd: `graph`, and `tensor` without the graph."""
+
+    def __init__(self, graph: Tensor) -> None:
+        self.tensor, self.graph = graph.detach(), graph
+
+    def back(self, slope: Tensor) -> list[tuple[OfGraph, Tensor]]:
+        """Return the slope by itself."""
+        return [(self, slope)]
+
+
+class _WithSlope(Function):
+    """A number whose gradient by x is the slope; given gradients of vectors, torch imports sympy for a second."""
+
+    @staticmethod
+    def forward(ctx, x, slope):  # type: ignore[no-untyped-def]
+        ctx.slope = slope
+        return x.new_zeros(())
+
+    @staticmethod
+    def backward(ctx, _):  # type: ignore[no-untyped-def]
+        return ctx.slope, None
+
+
+def _itself(on: OfGraph, weight: float, slope: Tensor | None) -> Stated:
+    own = torch.full_like(on.tensor, weight)
+    return Stated(on.tensor, None, own if slope is None else slope + own)
 
 
 def policy_consistency_loss(
     divergence: Callable[[Any, Any], Tensor], pulled_back: Any, original: Any, stop_gradient: str = "none"
 ) -> Tensor:
-    """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8).
+    """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), [S, B, N].
 
     Args:
         divergence: KL of two distributions given by their outputs, as a policy head defines it.
-        pulled_back: outputs of the policy at L_g s, pulled back by K_g: action a has the weight of K_g a.
+        pulled_back: outputs [S, B, N, A] of the policy at L_g s, pulled back by K_g: action a has the weight of K_g a.
         original: outputs of the policy at s.
         stop_gradient: "original" or "transformed" holds that side fixed, "none" lets both move.
-
-    Shape:
-        outputs [S, B, N, A] -> [S, B, N].
     """
     pulled_back, original = _stopped(pulled_back, original, stop_gradient)
     return divergence(pulled_back, original)
 
 
 def value_consistency_loss(transformed: Tensor, original: Tensor, stop_gradient: str = "none") -> Tensor:
-    """Return S_V = (V(s) - V(L_g s))^2 (Eq. 9) of values in the critic's own (normalised) units.
-
-    Shape:
-        [S, B, C] each -> [S, B, C].
-    """
+    """Return S_V = (V(s) - V(L_g s))^2 (Eq. 9) of values [S, B, C] in the critic's own (normalised) units."""
     transformed, original = _stopped(transformed, original, stop_gradient)
     return (original - transformed).square()
 
@@ -54,12 +174,7 @@ def _stopped(transformed: Any, original: Any, stop_gradient: str) -> tuple[Any, 
 
 
 def policy_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
-    """Return the mean of S_pi over copies and rows that count, as an equation on `networks.policies.Policies`.
-
-    Args:
-        mask: see `mean_per_seed`.
-        stop_gradient: see `policy_consistency_loss`.
-    """
+    """Return the mean of S_pi over copies and rows that count, as an equation on `networks.policies.Policies`."""
 
     def equation(policies: Any, weight: float, slope: Any) -> Stated:
         gap = policy_consistency_loss(policies.divergence, slice(1, None), slice(0, 1))

@@ -156,11 +156,7 @@ class SymmetryPrior:
         return {f"{name}_symmetry_error": gap for name, gap in copies.gaps(**evaluate(copies.rows)).items()}
 
     def _chosen(self, batch: SeedBatch, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return one transform per copy of a batch, where trust is a gate of those rows alone that it lets through.
-
-        Raises:
-            UserError: there is no gate.
-        """
+        """Return one transform per copy of a batch, where trust is a gate of those rows alone that it lets through."""
         drawn = self._draw(generators)
         if self.config.trust != "gate" or all(weight == 1 for weight in self._weights):
             return drawn

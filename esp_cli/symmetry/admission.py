@@ -25,8 +25,8 @@ _WITHOUT = "use --prior none, or let what holds be found: --prior auto, or --set
 # declared symmetries that no task writes: every element, and every one that leaves agents and items in place
 _ANYTHING, _ANY_SCENE = "any", "any-scene"
 _FEW_ORDERS = 23  # orders that are weighed beside d4, each of which takes about as long: those of four agents
+# the planar groups that `carried_groups` tries, smaller ones first
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
-"""The planar groups that `carried_groups` tries, smaller ones first."""
 
 
 def admitted_elements(text: str, spaces: Spaces, instead: str = "") -> tuple[Element, ...] | Group:

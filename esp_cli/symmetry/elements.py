@@ -151,11 +151,7 @@ class Element:
         )
 
     def __matmul__(self, other: Element) -> Element:
-        """Compose: `g @ h` applies h first, then g.
-
-        Raises:
-            UserError: the two permute different numbers of agents or items.
-        """
+        """Compose: `g @ h` applies h first, then g."""
         geometry: dict[type, Geometry] = {type(g): g for g in other.geometry}
         for g in self.geometry:
             geometry[type(g)] = g @ geometry[type(g)] if type(g) in geometry else g

@@ -157,8 +157,8 @@ def _read_agents(word: str, num_agents: int) -> Element | Group | None:
     return Element(permutation=_order(word, num_agents))
 
 
+# what reads a word for N agents, or returns None; each kind of geometry has its own
 READERS: list[Callable[[str, int], Element | Geometry | Group | None]] = [read_plane, _read_agents]
-"""What reads a word for N agents, or returns None; each kind of geometry has its own."""
 
 
 def _read_items(word: str) -> Element | Group | None:

@@ -76,7 +76,6 @@ class PlaneElement(Geometry):
 
     @property
     def name(self) -> str:
-        """The name that `parse_elements` reads: rot90, flip-x, flip22.5."""
         if self.mirrored:
             axis = self.degrees / 2
             return next((name for name, named in _MIRRORS.items() if named == axis), f"flip{_number(axis)}")

@@ -20,8 +20,9 @@ from torch import Tensor
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
-from esp_cli.symmetry.maps import Gather, Map, Operator, gather_of, map_of
+from esp_cli.symmetry.maps import Gather, Map, gather_of, map_of
 from esp_cli.symmetry.representation import (
+    Operator,
     action_map,
     agent_places,
     output_operator,
@@ -142,11 +143,7 @@ class Transform:
         return self._move(values, self.agents, agent_axis=-1, back=True)
 
     def _move(self, x: Tensor, by: Map, agent_axis: int | None = None, back: bool = False) -> Tensor:
-        """Apply a map of rows, or its inverse; where agents move, a row holds all N agents' numbers.
-
-        Raises:
-            UserError: the rows have another width, the agent axis another size, or the first axis other seeds.
-        """
+        """Apply a map of rows, or its inverse; where agents move, a row holds all N agents' numbers."""
         expected = by.width
         if self.agents is not None and agent_axis is not None:
             num_agents = self.agents.width

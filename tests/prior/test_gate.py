@@ -11,8 +11,7 @@ import torch
 
 from esp_cli.checking.measured import prepared
 from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
-from esp_cli.prior.gate import Gate, fit_gate, gated
-from esp_cli.prior.regression import inputs_of
+from esp_cli.prior.gate import Gate, fit_gate, gated, inputs_of
 from esp_cli.symmetry import transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.checkpoint import read_policy

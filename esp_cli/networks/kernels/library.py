@@ -20,8 +20,7 @@ if TYPE_CHECKING:  # a kernel may be begun before torch is imported
 
 _OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
 
-PADDING = 16
-"""PAD of vectors.h."""
+PADDING = 16  # PAD of vectors.h
 
 
 def padded(width: int) -> int:
@@ -77,11 +76,7 @@ def has_compiler() -> bool:
 
 
 def _compiler() -> list[str]:
-    """Return the command of the compiler; its program may not exist.
-
-    Raises:
-        UserError: CXX is no command.
-    """
+    """Return the command of the compiler; its program may not exist."""
     try:
         named = shlex.split(os.environ.get("CXX", ""))
     except ValueError as error:

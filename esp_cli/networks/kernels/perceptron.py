@@ -15,8 +15,7 @@ from torch import Tensor
 from esp_cli.networks.kernels.library import PADDING, call, fields, padded
 from esp_envs.errors import UserError
 
-_AXES = 3
-"""AXES of perceptron.h."""
+_AXES = 3  # AXES of perceptron.h
 
 
 class _Columns(ctypes.Structure):
