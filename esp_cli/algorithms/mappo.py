@@ -7,21 +7,23 @@ Eq. 4, the consistency terms of Eq. 8 and 9, combined as in Eq. 10.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
-from esp_cli.algorithms.learner import Iteration, Learner
+from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
 from esp_cli.algorithms.losses import beside, explained_variance, gae, normalise_per_seed
-from esp_cli.algorithms.mappo_config import MappoConfig
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_loss
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
 from esp_cli.networks.contract import NetworkConfig, WithVJP
 from esp_cli.networks.critic import Critic
+from esp_cli.networks.io_spec import Reads
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
 from esp_envs.base import Environment
@@ -29,9 +31,44 @@ from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 PROBE_STEPS = 100  # environment steps per seed on which the symmetry errors are measured after every update
-
 # metrics that have to be finite for a seed to go on
 WATCHED = ("policy_loss", "value_loss", "actor_grad_norm", "critic_grad_norm")
+
+
+class MappoConfig(LearnerConfig):
+    """Hyperparameters; every default stands here and nowhere else."""
+
+    num_envs: int = Field(32, ge=1, description="worlds per seed; MAPPO paper on MPE: 128")
+    num_steps: int = Field(25, ge=1, description="steps per world and update")
+    num_epochs: int = Field(10, ge=1, le=1000, description="passes over a rollout")
+    num_minibatches: int = Field(4, ge=1, le=10_000, description="gradient steps per pass; paper: 1")
+    learning_rate: float = Field(1e-3, gt=0, description="of Adam, for actor and critic; paper: 7e-4")
+    anneal_learning_rate: bool = Field(True, description="linearly to 0 over the run")
+    adam_epsilon: float = Field(1e-5, gt=0, description="Adam's epsilon")
+    max_grad_norm: float = Field(10.0, gt=0, description="per seed; actor and critic apart")
+    gamma: float = Field(0.99, ge=0, le=1, description="discount")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of generalised advantage estimation")
+    clip_epsilon: float = Field(0.2, gt=0, description="range of the ratio's clip, and of the value's")
+    clip_value: bool = Field(False, description="MAPPO paper: on; ours off, it slows learning badly")
+    huber_delta: float = Field(10.0, gt=0, description="where the value loss becomes linear, in normalised units")
+    value_coef: float = Field(1.0, gt=0, description="weight of the value loss")
+    entropy_coef: float = Field(0.01, ge=0, description="weight of the entropy bonus")
+    anneal_entropy: bool = Field(True, description="linearly to 0 over the run")
+    bootstrap_truncated: bool = Field(True, description="value the final state where the horizon cuts an episode")
+    value_decay: float = Field(0.99, gt=0, lt=1, description="of the value normaliser; MAPPO paper: 0.99999")
+    critic_input: Reads = Field(
+        "observations",
+        description="the task's global state, all agents' observations in a row, or each agent's own observation",
+    )
+    critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
+    truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
+    chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        idle = set() if network.recurrent else {"truncation"}
+        if network.with_activation("relu") == network.with_activation("tanh"):
+            idle.add("critic_activation")
+        return frozenset(idle)
 
 
 class Mappo(Learner):
@@ -145,15 +182,8 @@ class Mappo(Learner):
         if rollout.alive is not None:
             advantage = advantage.expand(rollout.log_prob.shape)
         per_agent = normalise_per_seed(advantage, valid=rollout.alive).expand(rollout.log_prob.shape)
-        fields = (
-            rollout.obs,
-            rollout.state,
-            rollout.action,
-            rollout.log_prob,
-            per_agent,
-            self.normaliser.normalise(target),
-            raw_value,
-        )
+        done = (rollout.obs, rollout.state, rollout.action, rollout.log_prob)
+        fields = (*done, per_agent, self.normaliser.normalise(target), raw_value)
         flags = {"action_mask": rollout.action_mask, "alive": rollout.alive}
         known = {name: self._as_sequences(flag) for name, flag in flags.items() if flag is not None}
         batch = Batch(*(self._as_sequences(x) for x in fields), **known)
@@ -174,7 +204,7 @@ class Mappo(Learner):
         """Return copies with old log-probability and old value under the networks that collected the rollout.
 
         The old log-probability stays that of the original unless the prior recomputes it. The old value, which only
-        value clipping reads, is always recomputed. Recurrent networks are unrolled over the transformed history.
+        value clipping reads, is always recomputed.
         """
         if self._old is None:
             return copied

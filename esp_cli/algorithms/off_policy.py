@@ -10,12 +10,11 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
-from esp_cli.algorithms.episodes import EpisodeCollector
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
 from esp_cli.algorithms.losses import td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import value_loss
-from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
+from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ExploringHead
 from esp_cli.networks.joint_q import SharedCriticInput

@@ -1,13 +1,18 @@
-"""Off-policy experience: whole episodes, kept per seed until newer ones take their place."""
+"""Off-policy experience: whole episodes, played from start to end, kept per seed until newer ones take their place."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from esp_cli.algorithms.learner import below
+from esp_cli.algorithms.rollout import stacked
+from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import SeedBatch
+from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
@@ -51,34 +56,28 @@ class EpisodeBatch(SeedBatch):
 
 
 class EpisodeReplay:
-    """The last `capacity` episodes of every seed, allocated at once on the training device.
+    """The last `capacity` episodes of each of S seeds, allocated at once on the training device.
 
     All seeds write in step, so one cursor serves them all; nothing else is shared between seeds.
-
-    Args:
-        spec: the task.
-        num_seeds: S.
-        capacity: episodes per seed.
-        device: where the episodes lie.
     """
 
     def __init__(self, spec: TaskSpec, num_seeds: int, capacity: int, device: torch.device) -> None:
         self.capacity, self.size, self.cursor = capacity, 0, 0
-        lead = (num_seeds, capacity)
-        steps, agents = spec.horizon, spec.num_agents
-        space, allowed = spec.action, None
-        discrete = isinstance(space, Discrete)
-        action = (agents,) if isinstance(space, Discrete) else (agents, space.width)
+        steps, agents, space = spec.horizon, spec.num_agents, spec.action
 
         def room(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.empty(*lead, *shape, dtype=dtype, device=device)
+            return torch.empty(num_seeds, capacity, *shape, dtype=dtype, device=device)
 
-        if spec.masks and isinstance(space, Discrete):
-            allowed = room(steps + 1, agents, space.count, dtype=torch.bool)
+        allowed = None
+        if isinstance(space, Discrete):
+            action = room(steps, agents, dtype=torch.int16)
+            allowed = room(steps + 1, agents, space.count, dtype=torch.bool) if spec.masks else None
+        else:
+            action = room(steps, agents, space.width)
         self._store = EpisodeBatch(
             obs=room(steps + 1, agents, spec.observation.width),
             state=room(steps + 1, spec.state.width),
-            action=room(steps, *action, dtype=torch.int16 if discrete else torch.float32),
+            action=action,
             reward=room(steps, 1 if spec.shared_reward else agents),
             terminated=room(steps, dtype=torch.bool),
             valid=room(steps, dtype=torch.bool),
@@ -138,3 +137,64 @@ class EpisodeReplay:
                 raise UserError("the saved episodes do not fit into the replay of this configuration")
             tensor[:, :size] = saved
         self.size, self.cursor = size, int(tensors["cursor"]) % self.capacity
+
+
+class EpisodeCollector:
+    """Plays one episode in every world at a time, each from a fresh start.
+
+    What a world does after its episode has ended before the horizon is marked as not valid.
+
+    Args:
+        env: the worlds.
+        policy: the behaviour policy.
+        generators: one CPU generator per seed for action noise.
+    """
+
+    def __init__(self, env: Environment, policy: HistoryPolicy, generators: Sequence[torch.Generator]) -> None:
+        self.env, self.policy, self.generators = env, policy, generators
+
+    @torch.no_grad()
+    def collect(self) -> tuple[EpisodeBatch, Tensor]:
+        """Play one episode in every world and return all, and their mean return [S]: of agents, summed over time."""
+        env, policy, head = self.env, self.policy, self.policy.head
+        steps, agents = env.spec.horizon, env.spec.num_agents
+        noise = head.noise((steps, env.num_envs, agents), self.generators).to(env.device, non_blocking=True)
+        observation = env.reset()
+        memory = policy.initial_memory(env.num_envs, observation.obs)
+        running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
+        seen = [observation]
+        actions, rewards, terminated, valid = [], [], [], []
+        for t in range(steps):
+            outputs, memory = policy.step(observation.obs, memory, observation.action_mask)
+            action = head.sample(outputs, noise[:, t])
+            memory = policy.remember(memory, action)
+            step = env.step(head.to_environment(action))
+            observation = step.next
+            seen.append(step.reached)
+            actions.append(action)
+            rewards.append(step.reward)
+            terminated.append(step.terminated)
+            valid.append(running)
+            running = running & ~step.ended
+        reward, mask = torch.stack(rewards, 2), torch.stack(valid, 2)
+        returns = torch.where(mask, reward.mean(-1), 0.0).sum(2).mean(1)
+        shared = reward[..., :1] if env.spec.shared_reward else reward
+        batch = EpisodeBatch(
+            torch.stack([x.obs for x in seen], 2),
+            torch.stack([x.state for x in seen], 2),
+            torch.stack(actions, 2),
+            shared,
+            torch.stack(terminated, 2),
+            mask,
+            action_mask=stacked([x.action_mask for x in seen]),
+            alive=stacked([x.alive for x in seen]),
+        )
+        return batch, returns
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a resumed run needs: between episodes that is the worlds' own state."""
+        return {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self.env.load_state_dict(below(tensors, "env"))

@@ -114,18 +114,9 @@ class Collector:
             self.observation = step.next
         action_rows = torch.stack(actions, 2)
         log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
-        return Rollout(
-            obs,
-            state,
-            action_rows,
-            log_prob,
-            reward,
-            terminated,
-            ended,
-            self.observation,
-            finals,
-            *(stacked(flags) for flags in (masks, alive, gone)),
-        )
+        flags = (stacked(flags) for flags in (masks, alive, gone))
+        seen, done = (obs, state, action_rows, log_prob), (reward, terminated, ended)
+        return Rollout(*seen, *done, self.observation, finals, *flags)
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
         """Add up returns (mean over agents of the sum over time) and empty the memory of ended episodes."""
@@ -151,15 +142,9 @@ class Collector:
         worlds = {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
         if not self.env.has("state_dict"):
             return worlds
-        own = {
-            "obs": self.observation.obs,
-            "state": self.observation.state,
-            "memory": self.memory,
-            "episode_return": self.episode_return,
-        }
-        flags = {"action_mask": self.observation.action_mask, "alive": self.observation.alive}
-        own |= {name: tensor for name, tensor in flags.items() if tensor is not None}
-        return own | worlds
+        seen = {name: getattr(self.observation, name) for name in ("obs", "state", "action_mask", "alive")}
+        own = {**seen, "memory": self.memory, "episode_return": self.episode_return}
+        return {name: tensor for name, tensor in own.items() if tensor is not None} | worlds
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
@@ -190,7 +175,7 @@ def values_along(
 
     Args:
         critic: the networks.
-        rollout: what they are asked about.
+        rollout: their inputs.
         episode: steps of the whole episodes that a recurrent critic is unrolled over; None of one without memory.
         terminates: whether an episode may terminate before the horizon; asking which did makes a GPU be waited for.
     """

@@ -46,9 +46,10 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
     there, here = _bare(there), _bare(here)
     if transform.action_index is not None:
         if all(isinstance(p, Tensor | td.Categorical | td.OneHotCategorical) for p in (there, here)):
-            return policy_consistency_loss(_choices_apart, *_both(transform, _logits(there), _logits(here)))
+            logits = (p if isinstance(p, Tensor) else p.logits for p in (there, here))
+            return policy_consistency_loss(_choices_apart, *_both(transform, *logits))
     elif isinstance(there, Tensor) and isinstance(here, Tensor):
-        return policy_consistency_loss(_half_squared_distance, *_both(transform, there, here))
+        return policy_consistency_loss(lambda p, q: 0.5 * (p - q).square().sum(-1), *_both(transform, there, here))
     elif isinstance(there, td.Normal) and isinstance(here, td.Normal):
         return _normals_apart(transform, there, here)
     elif _is_squashed(there) and _is_squashed(here):
@@ -101,7 +102,7 @@ def _is_squashed(policy: Policy) -> bool:
 
 
 def _pulled(transform: Transform, outputs: Tensor) -> Tensor:
-    """Return what a policy says at L_g s, pulled back, after checking its width."""
+    """Pull back outputs at L_g s, after checking their width."""
     width = transform.num_outputs
     if outputs.shape[-1:] != (width,):
         what = "actions" if transform.action_index is not None else "numbers in an action"
@@ -110,24 +111,16 @@ def _pulled(transform: Transform, outputs: Tensor) -> Tensor:
 
 
 def _both(transform: Transform, there: Tensor, here: Tensor) -> tuple[Tensor, Tensor]:
-    """Return what a policy says at L_g s, pulled back, and what it says at s, after checking both shapes."""
+    """Return outputs at L_g s, pulled back, and those at s, after checking both shapes."""
     pulled = _pulled(transform, there)
     check_alike("policy", [pulled], here)
     return pulled, here
-
-
-def _logits(policy: Policy) -> Tensor:
-    return policy if isinstance(policy, Tensor) else policy.logits
 
 
 def _choices_apart(p: Tensor, q: Tensor) -> Tensor:
     """Return KL[softmax(p) || softmax(q)]; what p excludes by a logit of -inf adds nothing."""
     p, q = p.log_softmax(-1), q.log_softmax(-1)
     return (p.exp() * (p - q).masked_fill(p.isneginf(), 0.0)).sum(-1)
-
-
-def _half_squared_distance(p: Tensor, q: Tensor) -> Tensor:
-    return 0.5 * (p - q).square().sum(-1)
 
 
 def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> Tensor:

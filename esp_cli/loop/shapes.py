@@ -1,4 +1,7 @@
-"""The tensors of a foreign loop: their shapes, checked in one sentence, and how actions and numbers of agents move."""
+"""The tensors of a foreign loop: their shapes, and how actions and numbers of agents move.
+
+Whatever does not fit is refused by a `UserError` of one sentence.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,9 @@ from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces
 
 # what messages advise where numbers look like memory
 HIDDEN = "a stored hidden state cannot be transformed; give whole histories from their first step instead"
-
-
 # what messages advise where actions and layouts carry no group of the plane
 ANOTHER = "give another group, or fields that say what the numbers are"
+# what arguments of a symmetry are, and what a message says to give
 _ARGUMENTS = {
     "observation": (Layout, "layout(Field(...), ...)"),
     "action": (Discrete | Continuous, "discrete_moves(...), Discrete or Continuous"),
@@ -25,17 +27,12 @@ _ARGUMENTS = {
     "state": (Layout | None, "layout(Field(...), ...)"),
     "seed": (int, "a number"),
 }
-"""What arguments of a symmetry are, and what a message says to give."""
 
 
 def check_arguments(
     observation: Layout, action: ActionSpace, group: str, num_agents: int, state: Layout | None, copies: str, seed: int
 ) -> None:
-    """Refuse arguments of a symmetry that are of another kind or out of range.
-
-    Raises:
-        UserError: one is.
-    """
+    """Refuse arguments of a symmetry that are of another kind or out of range."""
     given = (observation, action, group, num_agents, state, seed)
     for value, (name, (kind, example)) in zip(given, _ARGUMENTS.items(), strict=True):
         if not isinstance(value, kind):
@@ -49,29 +46,17 @@ def check_arguments(
 
 
 def lead_of(spaces: Spaces, obs: Tensor) -> torch.Size:
-    """Return the leading axes of observations.
-
-    Raises:
-        UserError: their shape or type does not fit.
-    """
+    """Return the leading axes of observations."""
     return _check_rows("obs", obs, spaces.observation, agents=_agents(spaces))
 
 
 def check_state(spaces: Spaces, state: Tensor, lead: torch.Size | None = None) -> torch.Size:
-    """Return the leading axes of states.
-
-    Raises:
-        UserError: their shape or type does not fit, or the leading axes are not those of the observations.
-    """
+    """Return the leading axes of states."""
     return _check_rows("state", state, spaces.state, lead)
 
 
 def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) -> Tensor:
-    """Return K_g a; shapes as of `augment`.
-
-    Raises:
-        UserError: another shape or type, or an action outside.
-    """
+    """Return K_g a; shapes as of `augment`."""
     _check_tensor("action", action)
     space, axes, shape = spaces.action, (*lead, *_agents(spaces)), list(action.shape)
     if not isinstance(space, Discrete):
@@ -94,11 +79,7 @@ def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) 
 
 
 def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: torch.Size, name: str) -> Tensor:
-    """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`.
-
-    Raises:
-        UserError: another shape.
-    """
+    """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`."""
     _check_tensor(name, x)
     agents, tail = (*lead, *_agents(spaces)), x.shape[len(lead) :]
     if x.shape[: len(lead)] == lead and tail.numel() == 1:
@@ -110,11 +91,7 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
 
 
 def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Size, name: str) -> Tensor:
-    """Move what goes with its agent: a number as by `carry`, or an action mask.
-
-    Raises:
-        UserError: another shape.
-    """
+    """Move what goes with its agent: a number as by `carry`, or an action mask."""
     _check_tensor(name, x)
     space = spaces.action
     if isinstance(space, Discrete) and x.dtype == torch.bool and x.shape == (*lead, *_agents(spaces), space.count):
@@ -123,11 +100,7 @@ def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Siz
 
 
 def check_mask(spaces: Spaces, mask: Tensor | None, lead: torch.Size) -> None:
-    """Refuse what is no mask of discrete actions [..., N, A], if there is one.
-
-    Raises:
-        UserError: another shape or type, or continuous actions.
-    """
+    """Refuse what is no mask of discrete actions [..., N, A], if there is one."""
     if mask is None:
         return
     if not isinstance(spaces.action, Discrete):
@@ -138,11 +111,7 @@ def check_mask(spaces: Spaces, mask: Tensor | None, lead: torch.Size) -> None:
 
 
 def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
-    """Refuse to compare what was said of moved and of original data in different shapes, such as [B, 1] and [B].
-
-    Raises:
-        UserError: the shapes differ.
-    """
+    """Refuse to compare outputs for moved and for original data in different shapes, such as [B, 1] and [B]."""
     for x in moved:
         if x.shape != here.shape:
             raise UserError(

@@ -14,25 +14,22 @@ from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
+# what the numbers under a key are: rows of a layout, actions (or one number per action), ids of trajectories, of which
+# each copy has its own, unchanged, left out
 Role = Literal["observation", "state", "action", "trajectory", "same", "drop"]
-"""What the numbers under a key are: rows of a layout, actions (or one number per action), ids of trajectories, of which
-each copy has its own, unchanged, left out."""
 _COPY_NUMBERS = count(1)
 Key = str | tuple[str, ...]
 
+_DROPPED: dict[str, Role] = dict.fromkeys(("action_value", "logits", "loc", "scale", "info"), "drop")
 ROLES: Mapping[str, Role] = {
     "observation": "observation",
     "obs": "observation",
     "state": "state",
     "action": "action",
     "action_mask": "action",
-    "action_value": "drop",
-    "logits": "drop",
-    "loc": "drop",
-    "scale": "drop",
-    "info": "drop",
     "index": "same",
     "traj_ids": "trajectory",
+    **_DROPPED,
 }
 """The role of a key by its last part; "drop" applies to whatever lies below it too.
 

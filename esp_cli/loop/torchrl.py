@@ -40,7 +40,7 @@ class SymmetricCopies(TorchRLTransform):
         self.symmetry, self.roles = symmetry, roles
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the data with its copies behind it; see `Symmetry.augment_tensordict`."""
+        """Return the data with its copies; see `Symmetry.augment_tensordict`."""
         return self.symmetry.augment_tensordict(tensordict, self.roles)
 
 
@@ -90,10 +90,7 @@ class SymmetricLoss(nn.Module):
         self.augment, self.roles = augment, roles
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses, with consistency inside, and "policy_symmetry" and "value_symmetry" beside them.
-
-        Args:
-            tensordict: [B, ...] as the loss takes it.
+        """Return the losses of data [B, ...], with consistency inside, "policy_symmetry" and "value_symmetry" beside.
 
         Raises:
             UserError: the numbers under a key do not fit.
@@ -104,15 +101,15 @@ class SymmetricLoss(nn.Module):
             self.symmetry.spaces, self._needed(tensordict), self.symmetry.transforms, self.roles
         )
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
-        said = [self._ask(batch) for batch in batches]
-        losses, size = said[0].losses, len(tensordict)
+        answers = [self._ask(batch) for batch in batches]
+        losses, size = answers[0].losses, len(tensordict)
         if (priority := self._priority_key) in batches[0].keys(True):
             tensordict.set(priority, batches[0].get(priority)[:size])
         gaps = {}
         if not self.mixes:
-            here, *there = (part for answer in said for part in split_policy(answer.policy, size))
+            here, *there = (part for answer in answers for part in split_policy(answer.policy, size))
             gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
-        own, *moved = (part for answer in said for part in answer.value.split(size))
+        own, *moved = (part for answer in answers for part in answer.value.split(size))
         gaps["value"] = [
             value_consistency_loss(carry(self.symmetry.spaces, g.values, v, tensordict.batch_size, "the value"), own)
             for g, v in zip(transforms, moved, strict=True)

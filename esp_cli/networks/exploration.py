@@ -63,7 +63,6 @@ class EpsilonGreedy(ExploringChoice):
         return torch.where(whether < self._epsilon(whether), anything, self.mode(outputs))
 
     def mode(self, outputs: Tensor) -> Tensor:
-        """Return the action of the largest value."""
         return best(outputs)
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
@@ -89,14 +88,10 @@ class ExploringCategorical(ExploringChoice, Categorical):
         return torch.eye(self.num_outputs, device=self.epsilon.device)
 
     def relaxed(self, log_probs: Tensor, noise: Tensor) -> Tensor:
-        """Draw one-hot actions [..., A] through which gradients flow (straight-through Gumbel-softmax).
+        """Draw one-hot actions [..., A] through which gradients flow, by noise uniform in [0, 1).
 
-        Forward: the one-hot of argmax(log p + Gumbel), which is a draw from p. Backward: the gradient of
-        softmax(log p + Gumbel) (Jang et al., 2017, at temperature 1).
-
-        Args:
-            log_probs: normalised outputs.
-            noise: uniform in [0, 1), of the same shape.
+        Straight-through Gumbel-softmax (Jang et al., 2017, at temperature 1). Forward: the one-hot of argmax(log p +
+        Gumbel), which is a draw from p. Backward: the gradient of softmax(log p + Gumbel).
         """
         gumbel = noise.clamp(1e-7, 1 - 1e-7).log_().neg_().log_().neg_()
         return _StraightThrough.apply(log_probs + gumbel)  # type: ignore[no-untyped-call]
@@ -148,7 +143,6 @@ class BoundedPoint(ExploringHead):
         self.register_buffer("disc", same_disc(space), False)
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-        """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
         return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
@@ -157,7 +151,6 @@ class BoundedPoint(ExploringHead):
         return noisy / (noisy.square() @ self.disc).sqrt().clamp_min(1.0)
 
     def mode(self, outputs: Tensor) -> Tensor:
-        """Return the action itself."""
         return squash(outputs, self.disc)
 
     def divergence(self, p: Tensor, q: Tensor) -> Tensor:
@@ -165,7 +158,6 @@ class BoundedPoint(ExploringHead):
         return 0.5 * (self.mode(p) - self.mode(q)).square().sum(-1)
 
     def relaxed(self, outputs: Tensor, noise: Tensor) -> Tensor:
-        """Return the action itself, through which gradients flow."""
         return self.mode(outputs)
 
     def penalty(self, outputs: Tensor) -> Tensor:

@@ -88,7 +88,6 @@ class Choice(Head):
         self.num_outputs = space.count
 
     def encode(self, action: Tensor) -> Tensor:
-        """Return one-hot rows."""
         return embedding(action, torch.eye(self.num_outputs, device=action.device))
 
 
@@ -96,15 +95,12 @@ class Categorical(Choice):
     """One of A actions with probabilities softmax(outputs)."""
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-        """Draw what `sample` needs for actions of `shape`, per seed from its own generator: uniform [S, *shape]."""
         return drawn(torch.rand, shape, generators)
 
     def normalise(self, outputs: Tensor) -> Tensor:
-        """Return log-probabilities, which are what all other methods take.
-
-        The result lies in memory with the action axis outermost: over so few actions, softmax along the contiguous
-        axis is 25 times slower on a CPU than over vectors of rows.
-        """
+        """Return log-probabilities."""
+        # With the action axis outermost in memory: over so few actions, softmax along the contiguous axis is 25 times
+        # slower on a CPU than over vectors of rows.
         return torch.log_softmax(outputs.movedim(-1, 1).contiguous(), 1).movedim(1, -1)
 
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
@@ -117,7 +113,6 @@ class Categorical(Choice):
         return (cumulative < inside).sum(-1)
 
     def mode(self, log_probs: Tensor) -> Tensor:
-        """Return the most probable action."""
         return best(log_probs)
 
     def log_prob(self, log_probs: Tensor, action: Tensor) -> Tensor:
@@ -152,9 +147,8 @@ class BoundedGaussian(Head):
         items = [f.kind for f in space.layout.fields for _ in range(f.count)]
         self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(_INITIAL_STD)))
         self.item: Tensor
-        self.register_buffer(
-            "item", torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)]), False
-        )
+        item = torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)])
+        self.register_buffer("item", item, False)
         self.disc: Tensor
         self.register_buffer("disc", same_disc(space), False)
 
@@ -167,7 +161,6 @@ class BoundedGaussian(Head):
         return GaussianPolicies(outputs, frame, self.log_std, self.item)
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-        """Draw standard normal noise [S, *shape, width], per seed from its own generator."""
         return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
@@ -175,7 +168,6 @@ class BoundedGaussian(Head):
         return outputs + self.log_deviation(outputs).exp() * noise
 
     def mode(self, outputs: Tensor) -> Tensor:
-        """Return the mean."""
         return outputs
 
     def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
@@ -194,7 +186,6 @@ class BoundedGaussian(Head):
         return (0.5 * ((p - q) * (-self.log_deviation(p)).exp()).square()).sum(-1)
 
     def to_environment(self, action: Tensor) -> Tensor:
-        """Squash the latent action to the task's bounds."""
         return squash(action, self.disc)
 
 

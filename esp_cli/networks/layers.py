@@ -20,21 +20,13 @@ GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
 
 
 def orthogonal(generators: Sequence[torch.Generator], rows: int, columns: int, gain: float) -> Tensor:
-    """Draw one orthogonal matrix per seed (Saxe et al., 2014).
-
-    Returns:
-        [S, rows, columns] on the CPU, whatever the later device, so that a seed starts the same everywhere.
-    """
+    """Draw one orthogonal matrix per seed (Saxe et al., 2014): [S, rows, columns] on the CPU, whatever the device."""
     stack = [nn.init.orthogonal_(torch.empty(columns, rows), gain, generator=g).T for g in generators]
     return torch.stack([matrix.contiguous() for matrix in stack])
 
 
 class SeedLinear(nn.Module):
-    """y = x W + b for S seeds.
-
-    Shape:
-        x: [S, B, in] -> [S, B, out].
-    """
+    """y = x W + b for S seeds: [S, B, in] -> [S, B, out]."""
 
     def __init__(self, generators: Sequence[torch.Generator], inputs: int, outputs: int, gain: float) -> None:
         super().__init__()

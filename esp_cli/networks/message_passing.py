@@ -129,17 +129,12 @@ class _Patches(Function):
 
 
 def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
-    """Find the different rows; a batch of thousands of pictures of a torus with 49 cells has 49.
+    """Find the different rows of [S, B, D]; a batch of thousands of pictures of a torus with 49 cells has 49.
 
-    Two fixed random projections identify a row; two different rows collide with probability 2^-46.
-
-    Args:
-        rows: [S, B, D].
-        keys: [2, D].
+    Two fixed random projections, `keys` [2, D], identify a row; two different rows collide with probability 2^-46.
 
     Returns:
-        which: [S, U] for each seed the index of one row of each kind; the rest is padding.
-        place: [S, B] the kind of each row.
+        For each seed the index of one row of each kind [S, U], padded, and the kind of each row [S, B].
     """
     num_seeds, batch, width = rows.shape
     flat = rows.reshape(-1, width)

@@ -75,10 +75,6 @@ def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], 
     return _Pass(shape, inputs, parameters, keep)
 
 
-def _flat(inputs: Sequence[Tensor]) -> list[Tensor]:
-    return [x.flatten(1, -2) for x in inputs]
-
-
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
     """Return rows whose numbers lie side by side, some at a time."""
     for parts in zip(*(_split(x, _size(x)) for x in inputs), strict=True):
@@ -86,7 +82,6 @@ def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
 
 
 def _split(x: Tensor, size: int) -> Sequence[Tensor]:
-    """Return pieces of at most `size` rows per seed."""
     return x.split(size, 1) if x.shape[1] > size else (x,)
 
 
@@ -122,7 +117,7 @@ class _Pass:
     def __init__(self, shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> None:
         if shape.precision != torch.float32:
             parameters = [p.to(shape.precision) for p in parameters]
-        inputs = _flat(inputs)
+        inputs = [x.flatten(1, -2) for x in inputs]
         self._shape, self._size, self._weights = shape, _size(inputs[0]), parameters[::2]
         runs = (_run(shape, piece, parameters) for piece in _pieces(shape, inputs))
         self._runs = list(runs) if keep else [run[-1:] for run in runs]
@@ -182,13 +177,8 @@ def _backward(
 ) -> Tensor:
     """Return the gradient by what the first layer gives before its activation, and add those by the parameters.
 
-    Args:
-        shape: see there.
-        run: inputs of every layer, and the output where it is activated.
-        here: gradient by the output.
-        weights: of every layer.
-        learns: which parameters want a gradient; not where a critic only passes one on to the actor.
-        grads: the sums of the gradients by the parameters so far.
+    `run` holds the inputs of every layer, and the output where it is activated; `here` is the gradient by the output.
+    Parameters that do not learn, as where a critic only passes a gradient on to the actor, get none.
     """
     if shape.activate_output:
         here = _activation_backward(here.clone(), run[-1], shape.activation)

@@ -69,16 +69,9 @@ def _gates(weight: Tensor) -> Tensor:
 
 
 class _Unroll:
-    """All steps of a gated recurrent unit from empty memory by torch; `backward` needs what is kept where asked.
+    """All steps of a gated recurrent unit from empty memory by torch, of x [S, T, B, in].
 
-    Args:
-        x: [S, T, B, in].
-        layers: W, its bias, U and its bias.
-        truncation: steps after which gradients through time are cut; 0: never.
-        keep: whether there will be a backward.
-
-    Attributes:
-        memories: [S, T, B, H] after every step.
+    `layers` are W, its bias, U and its bias. There is a `backward` where `keep` asks for one.
     """
 
     def __init__(self, x: Tensor, layers: Sequence[Tensor], truncation: int, keep: bool) -> None:

@@ -22,11 +22,8 @@ def action_parts(space: ActionSpace) -> Tensor:
         columns = list(zip(*space.points, strict=True))
         values = [sorted(set(column)) for column in columns]
         if len(values) > 1 and math.prod(map(len, values)) == space.count:
-            has = [
-                [x == value for x in column]
-                for column, choices in zip(columns, values, strict=True)
-                for value in choices
-            ]
+            parts = [(column, value) for column, choices in zip(columns, values, strict=True) for value in choices]
+            has = [[x == value for x in column] for column, value in parts]
             return torch.tensor(has, dtype=torch.float32)
     raise UserError(
         "network.separate_parts is for discrete actions that are all combinations of part values, "

@@ -18,11 +18,6 @@ class Symmetrised(Network):
 
     What a recurrent f remembers of each image is kept apart.
 
-    Args:
-        network: f.
-        io: what it reads and writes.
-        group: name of the group.
-
     Raises:
         UserError: see `IoSpec.group`.
     """
@@ -34,18 +29,10 @@ class Symmetrised(Network):
         self.memory_width = network.memory_width * self.group.order
         self.team = network.team
         self.image = map_of(layout_operator(io.layout, self.group.elements))
-        back = [
-            torch.block_diag(
-                *(
-                    torch.as_tensor(b.matrices[g], dtype=torch.float32)
-                    for b in io.outputs(self.group)
-                    for _ in range(b.copies)
-                )
-            )
-            for g in range(self.group.order)
-        ]
+        blocks = [b for b in io.outputs(self.group) for _ in range(b.copies)]
+        matrices = zip(*(torch.as_tensor(b.matrices, dtype=torch.float32) for b in blocks), strict=True)
         self.back: Tensor
-        self.register_buffer("back", torch.stack(back), False)
+        self.register_buffer("back", torch.stack([torch.block_diag(*each) for each in matrices]), False)
 
     def _images(self, x: Tensor) -> Tensor:
         """Return all images of rows x [S, B, D], one behind the other: [S, G * B, D]."""

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.algorithms.episodes import EpisodeCollector
-from esp_cli.algorithms.replay import EpisodeBatch, EpisodeReplay
+from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
 from esp_cli.symmetry import transform_set
 from esp_cli.training.streams import generators
 from esp_envs.base import Step

@@ -19,20 +19,10 @@ class _Mixer(ctypes.Structure):
 
 
 class CompiledMixer(CompiledPass):
-    """A pass through hypernetwork and mixer that keeps what its `unmix` needs.
+    """A pass through hypernetwork and mixer to the team's values [S, B]; see `CompiledPass`.
 
-    Args:
-        own: [S, B, N] contiguous values of the agents.
-        inputs: parts of what the hypernetwork sees; see `CompiledPass`.
-        parameters: of the hypernetwork, two layers or more, whose outputs are W_1 [N M], b_1 [M], w_2 [M] and b_2.
-        width: M, hidden units.
-        keep: whether there will be an `unmix`.
-
-    Attributes:
-        outputs: the team's values [S, B].
-
-    Raises:
-        UserError: other numbers of rows.
+    `own` [S, B, N] are the agents' values, contiguous. The hypernetwork has two layers or more, whose outputs are W_1
+    [N M], b_1 [M], w_2 [M] and b_2 for a mixer of M = `width` hidden units. There is an `unmix` where `keep` asks.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Perceptrons compiled for the processor at hand: what `perceptron.Pass` does, in one call each way."""
+"""Perceptrons compiled for the processor at hand: what `networks.perceptron` does, in one call each way."""
 
 from __future__ import annotations
 
@@ -85,19 +85,10 @@ def _tables(
 
 
 class CompiledPass:
-    """A pass through a perceptron that keeps its activations until its `backward`; see `perceptron.Pass`.
+    """A pass through a perceptron to its outputs [S, B, out] that keeps its activations until its `backward`.
 
-    Args:
-        inputs: [S, ..., d] parts of x, side by side, on the CPU; they may lie anyhow in memory, and are read again by
-            the backward.
-        parameters: W_1, b_1, ..., W_n, b_n.
-        activation: "relu" or "tanh".
-        activate_output: whether it ends with an activation.
-        rows_innermost: whether the outputs [S, B, out] lie in memory as [S, out, B]; those of thin outputs always do.
-        keep: whether there will be a backward.
-
-    Attributes:
-        outputs: y [S, B, out].
+    Arguments as of `networks.perceptron.perceptron` and `Shape`. The inputs may lie anyhow in memory, and are read
+    again by the backward.
 
     Raises:
         UserError: inputs of other shapes or numbers than the parameters take.

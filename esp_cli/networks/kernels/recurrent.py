@@ -24,16 +24,10 @@ class _Unit(ctypes.Structure):
 
 
 class CompiledUnroll:
-    """A run through whole episodes from empty memory that keeps what its `backward` needs.
+    """A run through whole episodes x [S, T, B, in] from empty memory; `memories` are [S, T, B, H] after every step.
 
-    Args:
-        x: [S, T, B, in], on the CPU.
-        parameters: W [S, in, 3H] and its bias [S, 1, 3H], U [S, H, 3H] and its bias.
-        truncation: steps after which gradients through time are cut; 0: never.
-        keep: whether there will be a backward.
-
-    Attributes:
-        memories: [S, T, B, H] after every step.
+    The parameters are W [S, in, 3H] and its bias [S, 1, 3H], U [S, H, 3H] and its bias. There is a `backward` where
+    `keep` asks for one.
     """
 
     @torch.no_grad()
