@@ -72,16 +72,6 @@ def test_lambda_targets_by_hand_on_two_transitions():
     assert cut.flatten().tolist() == pytest.approx([10.0, 20.0]), "after a cut the value counts, and no later step"
 
 
-def test_lambda_one_is_the_discounted_return_and_lambda_zero_the_one_step_target():
-    reward, following = torch.randn(2, 3, 6, 1), torch.randn(2, 3, 6, 1)
-    ended = torch.zeros(2, 3, 6, 1, dtype=torch.bool)
-    ended[:, :, -1] = True
-    returns = sum(0.9**t * reward[:, :, t] for t in range(6))
-    torch.testing.assert_close(td_targets(reward, following, ended, 0.9, 1.0)[:, :, 0], returns)
-    tiny = td_targets(reward, following, ended, 0.9, 1e-9)
-    torch.testing.assert_close(td_targets(reward, following, ended, 0.9, 0.0), tiny)
-
-
 def test_a_masked_mean_counts_what_is_valid_alone():
     x = torch.tensor([[[1.0, 2.0], [3.0, torch.nan]], [[5.0, 5.0], [7.0, 7.0]]])
     valid = torch.tensor([[[True, True], [True, False]], [[False, False], [False, False]]])

@@ -181,23 +181,6 @@ def test_stored_copies_share_the_replay_and_sampled_ones_do_not(algorithm):
     assert torch.equal(copies.obs[:, 2], g.obs(original.obs[:, 2])), "and behind them their copies"
 
 
-@both
-def test_the_value_consistency_vanishes_for_a_symmetric_function_alone(algorithm):
-    trained = learner(algorithm, prior__transforms="rot90")
-    trained.iterate(0.0)
-    batch = trained.replay.sample(3, trained.generators["learner"])
-    copies = trained.prior.copies(batch, trained.generators["prior"])
-    rows = copies.rows
-    length = rows.state[:, :, :-1].square().sum(-1, keepdim=True)
-    first_number = rows.state[:, :, :-1, :1]
-    assert copies.gaps(value=length)["value"].max() < 1e-6
-    assert copies.gaps(value=first_number)["value"].min() > 1e-4
-    errors = trained.prior.errors(batch, trained.answers)
-    assert all((error > 0).all() for error in errors.values()), "negative control: a fresh network is not symmetric"
-    by_hand = (first_number[:, :3] - first_number[:, 3:]).square().flatten(1).mean(1)
-    torch.testing.assert_close(copies.gaps(value=first_number)["value"], by_hand)
-
-
 def test_qmix_refuses_continuous_actions_in_one_sentence():
     with pytest.raises(ValueError, match="qmix chooses among discrete actions"):
         learner("qmix", task__actions="continuous")
@@ -245,29 +228,6 @@ def test_a_gradient_that_is_not_finite_stops_its_seed(algorithm, optimiser):
     result = trained.iterate(0.0)
     assert result.finite.tolist() == [True, False]
     assert all(value.isfinite().all() for name, value in result.metrics.items() if name.endswith("loss"))
-
-
-@both
-def test_a_tiny_largest_norm_of_the_gradient_keeps_the_weights_where_they_are(algorithm):
-    """Adam moves a weight by the rate times g / (g + 1e-5), which is 4e-3 x 1e-7 at most."""
-    for norm, moves in ((1e-12, False), (10.0, True)):
-        trained = learner(algorithm, algo__max_grad_norm=norm)
-        buffers = [optimiser.parameters.buffer for optimiser in trained.optimisers.values()]
-        before = [buffer.clone() for buffer in buffers]
-        trained.iterate(0.0)
-        moved = [float((now - then).abs().max()) for now, then in zip(buffers, before, strict=True)]
-        assert [size > 1e-7 for size in moved] == [moves] * len(moved)
-
-
-@both
-@pytest.mark.parametrize(("delta", "loss"), [(1.0, 2.5), (2.0, 4.0), (10.0, 4.5)])
-def test_the_td_loss_is_linear_beyond_the_chosen_error(algorithm, delta, loss):
-    """Of an error of 3: 1 x (3 - 1/2), 2 x (3 - 1), and 3^2 / 2 within."""
-    trained = learner(algorithm, algo__huber_delta=delta, prior__kind="none")
-    episodes, _ = trained.collector.collect()
-    values = torch.full((2, 2, 25, 1), 4.0)
-    metrics = trained.td_metrics(values, values - 3, episodes)
-    assert metrics["td_loss"].tolist() == [loss, loss]
 
 
 @both

@@ -64,7 +64,7 @@ def test_like_items_change_places_in_observation_and_state() -> None:
         obs, _, moved, () = symmetry.augment(row, action, state=seen)
         assert obs.tolist() == [[3.0, 4.0], [4.0, 3.0]]
         assert moved[1].tolist() == ([4.0, 3.0] if state is None else [9.0, 4.0, 3.0])
-    with pytest.raises(ValueError, match="it has no field 'islands', but marks"):
+    with pytest.raises(ValueError, match="the task has no field 'islands', but marks"):
         Symmetry(observation=marks, action=MOVES, group="islands-2")
 
 

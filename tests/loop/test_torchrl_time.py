@@ -135,12 +135,6 @@ def test_slices_of_a_replay_buffer_hold_one_trajectory_under_one_element() -> No
     assert step.abs().max() < 1e-5
 
 
-def test_rows_of_a_sample_have_copies_behind_them() -> None:
-    buffer = ReplayBuffer(storage=LazyTensorStorage(FRAMES), batch_size=8, transform=SymmetricCopies(mirrored()))
-    buffer.extend(collected())
-    assert buffer.sample().shape == (16,)
-
-
 @pytest.mark.parametrize("num_envs", [1, 2])
 def test_a_loss_estimates_advantages_before_it_makes_copies(num_envs) -> None:
     """As TorchRL documents it: a loss of PPO is given what the collector delivers."""

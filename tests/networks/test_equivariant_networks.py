@@ -147,29 +147,6 @@ def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(ta
     assert errors(spec, plain.model_copy(update={"symmetrise": group}), obs, state, group, reads) < EXACT
 
 
-@pytest.mark.parametrize(
-    ("task", "network"),
-    [("wildlife", {"name": "empn"}), ("navigation", {"name": "equivariant"}), ("navigation", {"symmetrise": "c4"})],
-    ids=str,
-)
-def test_equivariance_survives_training(task, network) -> None:
-    overrides = {"mappo.num_envs": 4, "mappo.num_steps": 5, "mappo.num_epochs": 2, "prior.kind": "none"}
-    overrides |= {"mappo.learning_rate": 0.01, "network.hidden": [16]}
-    overrides |= {f"network.{name}": value for name, value in network.items()}
-    learner = build_learner(resolve_config(task, seeds=(0, 1), overrides=overrides))
-    before = [parameter.clone() for parameter in learner.policy.parameters()]
-    for _ in range(2):
-        metrics = learner.iterate(0.0).metrics
-    assert not any(torch.equal(a, b) for a, b in zip(before, learner.policy.parameters(), strict=True))
-    spec, obs, _ = scene(task)
-    memory = learner.policy.initial_memory(WORLDS, obs)
-    for transform in transform_set("c4", spec).each():
-        here = learner.policy.step(obs, memory)[0]
-        there = learner.policy.step(transform.obs(obs), memory)[0]
-        torch.testing.assert_close(transform.pull_back(there), here, atol=EXACT, rtol=EXACT)
-    assert metrics["train/value_symmetry_error"].isfinite().all()
-
-
 def test_a_recurrent_ensemble_keeps_the_memories_of_its_images_apart() -> None:
     spec, obs, _ = scene("navigation")
     config = NETWORKS["gru"](hidden=(8,), symmetrise="c4")
@@ -265,13 +242,6 @@ def test_a_stride_that_would_leave_out_the_last_pixels_is_not_taken() -> None:
     here, there = (x.unflatten(-1, (-1, 4)).sum(-1) for x in features)  # over the four turns of each feature
     torch.testing.assert_close(there, here, atol=EXACT, rtol=EXACT)
     assert not torch.allclose(*features, atol=0.1), "each by itself goes to another place"
-
-
-def test_pictures_that_all_differ_are_all_encoded() -> None:
-    pictures = torch.rand(1, 50, 441)
-    which, place = distinct(pictures, torch.randn(2, 441))
-    assert torch.equal(pictures[0][which[0][place[0]]], pictures[0])
-    assert len(place.unique()) == 50
 
 
 @pytest.mark.parametrize("name", ["mpn", "empn"])

@@ -32,11 +32,6 @@ def test_categorical_samples_by_inverting_the_cumulative_distribution():
     assert head.sample(p, noise).flatten().tolist() == [0, 0, 1, 2, 3, 4]
 
 
-def test_categorical_normalisation_equals_torch():
-    logits = torch.randn(3, 7, 2, 5) * 10
-    torch.testing.assert_close(Categorical(SPEC.action).normalise(logits), logits.log_softmax(-1))
-
-
 def test_gaussian_log_probability_entropy_and_divergence_equal_torch():
     head = BoundedGaussian(Continuous(WHEELS), 2)
     with torch.no_grad():

@@ -55,31 +55,6 @@ def test_the_hand_written_backward_equals_autograd_through_the_formula(cached, m
         assert_same_gradients(mix(values, state), unbounded, weight, [values])
 
 
-def test_the_best_joint_action_is_made_of_the_best_own_actions():
-    g = torch.Generator().manual_seed(1)
-    utilities, state = torch.randn(2, 50, AGENTS, 4, generator=g), torch.randn(2, 50, STATE, generator=g)
-    joint = torch.cartesian_prod(*[torch.arange(4)] * AGENTS)
-    picked = utilities.unsqueeze(2).expand(-1, -1, len(joint), -1, -1)
-    rows = picked.gather(-1, joint.expand(2, 50, -1, -1).unsqueeze(-1)).squeeze(-1)
-    totals = mixer()(rows, state.unsqueeze(2).expand(-1, -1, len(joint), -1))
-    chosen = joint[totals.argmax(-1)]
-    assert torch.equal(chosen, utilities.argmax(-1))
-
-
-def test_against_its_formula():
-    mix = mixer()
-    values, state = torch.randn(2, 4, AGENTS), torch.randn(2, 4, STATE)
-    raw = mix.hypernetwork(state)
-    total = mix(values, state)
-    for s in range(2):
-        for b in range(4):
-            row = raw[s, b]
-            first, rest = row[: AGENTS * WIDTH].view(AGENTS, WIDTH).abs(), row[AGENTS * WIDTH :]
-            hidden = elu(values[s, b] @ first + rest[:WIDTH])
-            by_hand = hidden @ rest[WIDTH : 2 * WIDTH].abs() + rest[-1]
-            torch.testing.assert_close(total[s, b], by_hand)
-
-
 def test_a_seed_mixes_the_same_alone_and_among_others():
     values, state = torch.randn(2, 40, AGENTS), torch.randn(2, 40, STATE)
     torch.testing.assert_close(mixer()(values, state)[1:], mixer((1,))(values[1:], state[1:]))

@@ -233,17 +233,6 @@ def test_a_gate_is_asked_about_what_the_task_was_given() -> None:
     assert float(kept) == pytest.approx(math.exp(-0.5))
 
 
-def test_a_gate_that_keeps_nothing_trains_as_the_plain_learner_with_every_row_twice(tmp_path: Path) -> None:
-    """The copies equal their originals, so a mean loss is the plain learner's up to rounding."""
-    few = ("--set", "task.wind=3", "--set", "prior.transforms=rot180", "--set", "mappo.num_minibatches=1")
-    few += ("--set", "prior.doubt=1000")
-    train_small(tmp_path / "gate", "mappo", *few, "--set", "prior.trust=gate")
-    train_small(tmp_path / "plain", "mappo", *few, "--set", "prior.kind=none")
-    first, second = (read_policy(tmp_path / name / "policy.safetensors")[0] for name in ("gate", "plain"))
-    for name, tensor in first.items():
-        torch.testing.assert_close(tensor, second[name], rtol=1e-3, atol=2e-4)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -89,11 +89,6 @@ def test_a_single_element_can_be_declared(make_spec) -> None:
     assert transform_set("flip-y*agents-1-0-2", spec).names == ("flip-y*agents-1-0-2",)
 
 
-def test_agents_that_may_not_be_exchanged_are_not_among_the_carried(make_spec) -> None:
-    assert carried_groups(make_spec(symmetry="d4")) == UP_TO_D4
-    assert carried_groups(make_spec(symmetry="d4*agents")) == (*UP_TO_D4, "agents")
-
-
 def test_declared_orders_of_items_are_carried(make_spec) -> None:
     spec = make_spec(symmetry="d4*agents*landmarks-2")
     assert carried_groups(spec) == (*UP_TO_D4, "agents", "landmarks-2")
@@ -147,13 +142,6 @@ def test_a_picture_carries_what_moves_its_pixels_onto_pixels(make_spec) -> None:
         assert carried_groups(spec) == groups
         with pytest.raises(ValueError, match=r"pixels of a picture of . x . do not come to lie .*; use a group within"):
             transform_set("o2", spec)
-
-
-def test_each_carried_group_makes_a_set(make_spec) -> None:
-    for action in (FORCE, WHEEL_PAIRS):
-        spec = make_spec(action=action)
-        for name in carried_groups(spec):
-            assert transform_set(name, spec).names
 
 
 @pytest.mark.parametrize(

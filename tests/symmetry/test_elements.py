@@ -12,11 +12,6 @@ from esp_cli.symmetry import Element, PlaneElement, mirror, rotation
 RIGHT, UP = np.array([1.0, 0.0]), np.array([0.0, 1.0])
 
 
-def test_rot90_is_counter_clockwise() -> None:
-    np.testing.assert_array_equal(PlaneElement.of(rotation(90)).matrix @ RIGHT, UP)
-    np.testing.assert_array_equal(PlaneElement.of(rotation(90)).matrix, [[0, -1], [1, 0]])
-
-
 @pytest.mark.parametrize(
     ("element", "name", "image"),
     [

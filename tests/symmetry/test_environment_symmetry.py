@@ -194,17 +194,6 @@ def test_square_bounds_of_a_learning_prey_break_eq_5_under_45_degrees() -> None:
     assert errors["reward"] > 0.1
 
 
-def test_real_tasks_refuse_what_their_actions_cannot_carry() -> None:
-    spec = worlds("navigation", {}, 1).spec
-    assert carried_groups(spec) == ("c2", "d2", "c4", "d4", "agents")
-    with pytest.raises(ValueError, match="cannot act") as caught:
-        transform_set("c8", spec)
-    assert str(caught.value) == (
-        "c8 cannot act on navigation: action 'left' turned by 45 degrees is no action; "
-        "use continuous actions or a group within d4"
-    )
-
-
 def test_heuristics_are_equivariant_where_the_rules_are() -> None:
     env = worlds("navigation", {"actions": "continuous"}, len(D8))
     transform = build_transform(D8, env.spec)

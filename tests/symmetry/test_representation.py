@@ -17,7 +17,7 @@ from esp_cli.symmetry.representation import (
     rows_operator,
     state_operator,
 )
-from esp_envs.spec import Discrete, Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
+from esp_envs.spec import Field, Items, Kind, Layout, Spaces, joint_layout, layout, others_of
 from tests.symmetry.toy_actions import FOUR_DIRECTIONS, WHEEL_PAIRS
 
 KINDS = [kind for kind in vars(Kind).values() if isinstance(kind, Kind)]
@@ -58,20 +58,6 @@ def test_kinds_are_orthogonal_homomorphisms(kind: Kind) -> None:
     np.testing.assert_allclose(matrices[:, None] @ matrices, matrices[group.product], atol=1e-15)
     identity = np.tile(np.eye(field.width), (group.order, 1, 1))
     np.testing.assert_allclose(matrices @ matrices.transpose(0, 2, 1), identity, atol=1e-15)
-
-
-def test_a_row_by_hand() -> None:
-    row_layout = layout(
-        Field("velocity", Kind.VECTOR),
-        Field("battery", Kind.SCALAR),
-        Field("rate", Kind.PSEUDOSCALAR),
-        Field("wheels", Kind.WHEELS),
-        Field("landmarks", Kind.VECTOR, 2),
-    )
-    row = np.array([1.0, 2.0, 7.0, 3.0, 0.25, 0.5, 1.0, 0.0, 0.0, 1.0])
-    turned, mirrored = layout_operator(row_layout, [rotation(90), mirror(0)]).matrix @ row
-    np.testing.assert_array_equal(turned, [-2, 1, 7, 3, 0.25, 0.5, 0, 1, -1, 0])
-    np.testing.assert_array_equal(mirrored, [1, -2, 7, -3, 0.5, 0.25, 1, 0, 0, -1])
 
 
 MARKED = layout(
@@ -161,15 +147,6 @@ def test_transforming_rows_equals_observing_the_transformed_world() -> None:
         np.testing.assert_allclose((matrix @ observe(positions, landmark).ravel()).reshape(3, -1), expected, atol=1e-15)
 
 
-def test_forgetting_that_items_are_others_is_noticed() -> None:
-    wrong = replace(WORLD, fields=tuple(replace(f, items=Items.FIXED) for f in WORLD.fields))
-    rng = np.random.default_rng(0)
-    positions, landmark = rng.normal(size=(3, 2)), rng.normal(size=2)
-    swap = joint(wrong, Element(permutation=(1, 0, 2)))[0]
-    got = (swap @ observe(positions, landmark).ravel()).reshape(3, -1)
-    assert np.abs(got - observe(positions[[1, 0, 2]], landmark)).max() > 0.1
-
-
 def random_layout(rng: np.random.Generator, num_agents: int):
     """Return a random layout of one to six fields of all kinds and ways of counting."""
     counts = {Items.FIXED: None, Items.OTHERS: num_agents - 1, Items.AGENTS: num_agents}
@@ -222,26 +199,6 @@ def test_wheel_pairs_ignore_turns_and_swap_in_a_mirror() -> None:
     turned, mirrored = action_map(WHEEL_PAIRS, [rotation("33.3"), mirror("12.5")])
     assert turned.tolist() == [0, 1, 2, 3]
     assert mirrored.tolist() == [0, 1, 3, 2]
-
-
-def test_actions_are_a_homomorphism_in_any_order_of_actions() -> None:
-    order = np.random.default_rng(0).permutation(5)
-    shuffled = Discrete(
-        Kind.VECTOR,
-        tuple(FOUR_DIRECTIONS.points[i] for i in order),
-        tuple(FOUR_DIRECTIONS.names[i] for i in order),
-    )
-    k = action_map(shuffled, D4.elements)
-    for g in range(8):
-        for h in range(8):
-            np.testing.assert_array_equal(k[g][k[h]], k[D4.product[g, h]])
-
-
-def test_an_action_without_an_image_is_named() -> None:
-    with pytest.raises(ValueError, match=r"^action 'left' turned by 45 degrees is no action$"):
-        action_map(FOUR_DIRECTIONS, [rotation(90), rotation(45)])
-    with pytest.raises(ValueError, match=r"mirrored by flip22\.5 is no action$"):
-        action_map(FOUR_DIRECTIONS, [mirror("22.5")])
 
 
 def test_items_that_cannot_follow_are_refused(make_spec) -> None:

@@ -81,6 +81,8 @@ def test_records_and_rings_stand_beside_pictures() -> None:
         ({"kind": Kind.VECTOR, "rays": 4}, "a ring, and nothing else"),
         ({"kind": Kind.VECTOR, "rays": -1}, "a ring, and nothing else"),
         ({"kind": Kind.PICTURE, "pixels": (0, 4)}, r"pixels are \(0, 4\); give at least one row"),
+        ({"kind": Kind.PICTURE}, "a picture, and nothing else"),
+        ({"kind": Kind.VECTOR, "pixels": (2, 2)}, "a picture, and nothing else"),
         ({"kind": Kind.RECORD}, "a record, and nothing else, says what parts"),
         ({"kind": Kind.SCALAR, "parts": SEEN}, "a record, and nothing else"),
         ({"kind": Kind.RECORD, "parts": (Field("x", Kind.SCALAR, items=Items.OTHERS),)}, "count over no agents"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from esp_cli.symmetry import FiniteGroup, Group, dihedral, mirror, parse, parse_elements, parse_group
+from esp_cli.symmetry import FiniteGroup, Group, mirror, parse, parse_elements, parse_group
 from esp_cli.symmetry.admission import scene_of
 from esp_envs.errors import UserError
 
@@ -50,12 +50,6 @@ def test_large_products_are_sampled() -> None:
     group = parse_elements("d4*agents", 8)
     assert isinstance(group, Group)
     assert group.name == "d4*agents"
-
-
-def test_parse_group() -> None:
-    d4 = parse_group("d4", 3)
-    assert isinstance(d4, FiniteGroup)
-    assert d4.elements == dihedral(4).elements
 
 
 @pytest.mark.parametrize(

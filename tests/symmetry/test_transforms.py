@@ -99,14 +99,6 @@ def test_actions_and_pull_back_against_their_definitions(make_spec, elements, le
             assert torch.equal(one_hot[s, ..., there, :][..., k], logits[s, ..., n, :])
 
 
-@pytest.mark.parametrize("elements", [ELEMENTS, MOVING], ids=["plane", "agents"])
-def test_one_hots_move_as_actions_do(make_spec, elements) -> None:
-    transform = build_transform(elements, make_spec())
-    action = torch.randint(5, (3, 6, 3), generator=torch.Generator().manual_seed(0))
-    one_hot = torch.nn.functional.one_hot
-    assert torch.equal(per_action(transform, one_hot(action, 5)), one_hot(transform.action(action), 5))
-
-
 @pytest.mark.parametrize("action", [FORCE, WHEELS, EVERYTHING], ids=["force", "wheels", "everything"])
 @pytest.mark.parametrize("elements", [ELEMENTS, MOVING], ids=["plane", "agents"])
 def test_continuous_actions_come_home(make_spec, elements, action) -> None:

@@ -17,12 +17,10 @@ from esp_cli.symmetry import (
     mirror,
     parse_elements,
     rotation,
-    transform_set,
 )
 from esp_cli.symmetry.maps import Gather
 from esp_cli.symmetry.plane import PlaneElement, picture_sources
-from esp_cli.symmetry.representation import rows_operator
-from esp_envs import Environment, Field, Items, Kind, layout, make
+from esp_envs import Environment, make
 
 STEPS = 6
 
@@ -39,33 +37,6 @@ def test_a_picture_turns_counter_clockwise() -> None:
     odd = torch.arange(15.0).view(3, 5)
     assert torch.equal(turn_picture(odd, rotation(180)), odd.flip((0, 1)))
     assert torch.equal(turn_picture(torch.arange(9.0).view(3, 3), rotation(90)), torch.arange(9.0).view(3, 3).rot90())
-
-
-def test_pixels_that_find_no_place_are_refused() -> None:
-    for pixels, element in (((3, 3), rotation(45)), ((3, 5), rotation(90))):
-        with pytest.raises(ValueError, match="do not come to lie on pixels"):
-            picture_sources(pixels, PlaneElement.of(element).matrix)
-
-
-def test_only_pictures_have_pixels() -> None:
-    for kind, pixels in ((Kind.PICTURE, None), (Kind.VECTOR, (2, 2))):
-        with pytest.raises(ValueError, match="a picture, and nothing else"):
-            Field("field", kind, pixels=pixels)
-
-
-def test_the_permutation_is_the_matrix() -> None:
-    row = layout(
-        Field("speed", Kind.SCALAR),
-        Field("picture", Kind.PICTURE, 2, pixels=(3, 3)),
-        Field("others", Kind.VECTOR, 2, items=Items.OTHERS),
-        Field("spin", Kind.PSEUDOSCALAR),
-        Field("wheels", Kind.WHEELS),
-    )
-    for text in ("d4", "d4*agents"):
-        operator = rows_operator(row, parse_elements(text, 3), 3)
-        numbers = np.arange(1.0, operator.width + 1)
-        assert operator.terms == 1
-        np.testing.assert_array_equal(operator.push(numbers), operator.matrix @ numbers)
 
 
 def worlds(elements: str, seeds: int | None = None, **settings) -> tuple[Environment, Transform]:
@@ -137,9 +108,3 @@ def test_pictures_that_do_not_turn_along_are_noticed() -> None:
 def test_a_poacher_whose_moves_are_not_turned_along_is_noticed() -> None:
     env, transform = worlds("d4")
     assert errors(env, transform, turn_chance=False)["next_state"] >= 1
-
-
-def test_quarter_turns_of_a_grid_that_is_no_square_are_refused() -> None:
-    spec = make("wildlife", 1, [0], {"width": 5, "height": 7}).spec
-    with pytest.raises(ValueError, match="rot90 is no symmetry of its dynamics and reward, which carry d2"):
-        transform_set("rot90", spec)
