@@ -155,10 +155,7 @@ class OffPolicyLearner(Learner):
 
     def critic_rows(self, batch: EpisodeBatch) -> Tensor:
         """Return what the critic or the mixer sees of every state: [S, B, T + 1(, N), critic width]."""
-        return self._with_time(self.joint.rows(batch.obs, batch.state))
-
-    def _with_time(self, rows: Tensor) -> Tensor:
-        """Append the share of the horizon gone, where the critic sees it, to rows [S, B, T + 1, ..., width]."""
+        rows = self.joint.rows(batch.obs, batch.state)
         if not self.config.critic_sees_time:
             return rows
         time = self._time.view(-1, *[1] * (rows.dim() - 3))
@@ -243,7 +240,10 @@ class ExploringLearner(OffPolicyLearner):
     config: ExploringConfig
 
     def explore(self) -> None:
-        self._schedule.explore(self._epsilon())
+        config = self.config
+        share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
+        fallen = config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
+        self._schedule.explore(1.0 if self.episodes < config.warmup_episodes else fallen)
 
     def exploration(self) -> dict[str, Tensor]:
         return {"train/epsilon": self._schedule.epsilon.clone()}
@@ -251,14 +251,6 @@ class ExploringLearner(OffPolicyLearner):
     @property
     def _schedule(self) -> ExploringHead:
         return self.policy.head  # type: ignore[return-value]
-
-    def _epsilon(self) -> float:
-        """Return the exploration of the next round."""
-        config = self.config
-        if self.episodes < config.warmup_episodes:
-            return 1.0
-        share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
-        return config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
 
 
 PROBE_EPISODES = 4  # episodes per seed on which the symmetry errors are measured once an iteration

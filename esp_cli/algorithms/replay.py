@@ -143,11 +143,6 @@ class EpisodeCollector:
     """Plays one episode in every world at a time, each from a fresh start.
 
     What a world does after its episode has ended before the horizon is marked as not valid.
-
-    Args:
-        env: the worlds.
-        policy: the behaviour policy.
-        generators: one CPU generator per seed for action noise.
     """
 
     def __init__(self, env: Environment, policy: HistoryPolicy, generators: Sequence[torch.Generator]) -> None:

@@ -60,13 +60,7 @@ class Batch(SeedBatch):
 
 
 class Collector:
-    """Acts in the worlds and remembers, between rollouts, where each stands.
-
-    Args:
-        env: the worlds.
-        policy: the behaviour policy.
-        generators: one CPU generator per seed for action noise.
-    """
+    """Acts in the worlds and remembers, between rollouts, where each stands."""
 
     def __init__(self, env: Environment, policy: StochasticPolicy, generators: Sequence[torch.Generator]) -> None:
         self.env, self.policy, self.generators = env, policy, generators

@@ -20,12 +20,6 @@ class Critic(nn.Module):
     It reads the global "state" or all agents' "observations" in a row and returns one value for a shared reward, else
     one per agent; or it reads each agent's "own" observation and returns that agent's value, with weights that all
     share.
-
-    Args:
-        spec: the task.
-        reads: see above.
-        network: shape.
-        generators: one CPU generator per seed, for the initial weights.
     """
 
     def __init__(

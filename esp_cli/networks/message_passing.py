@@ -38,11 +38,6 @@ _LOT = 16  # the number of encoded pictures is a multiple of this, so that few s
 class PictureEncoder(nn.Module):
     """Convolutions for S seeds, each followed by relu, then a maximum over all places.
 
-    Args:
-        generators: one CPU generator per seed.
-        field: the pictures.
-        group: that acts on the pictures.
-
     Shape:
         [S, B, pixels of all channels] -> [S, B, width].
     """

@@ -8,7 +8,8 @@ originals.
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from abc import ABC, abstractmethod
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -30,40 +31,42 @@ class Frame(Protocol):
         """Undo `pull_outputs`."""
 
 
-class Policies(Protocol):
+class Policies(ABC):
     """What a network outputs for originals and copies, as policies.
 
     A slope is None at first; `add_...` return it with more added.
     """
 
+    @abstractmethod
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
 
+    @abstractmethod
     def entropy(self, learned: int) -> Tensor:
         """Return the entropies [S, L, R]."""
 
+    @abstractmethod
     def divergence(self, copies: slice, originals: slice) -> Tensor:
         """Return KL[copy || original] [S, K, R] of some parts."""
 
-    def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
+    @abstractmethod
+    def add_slope(self, slope: Any, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Any:
         """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
 
-    def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
+    @abstractmethod
+    def add_divergence_slope(self, slope: Any, weights: Weights, stop_gradient: str) -> Any:
         """Add the slope of the sum of divergences times weights; see `PriorConfig` for `stop_gradient`."""
 
-    def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
+    @abstractmethod
+    def back(self, slope: Any) -> list[tuple[WithVJP, Tensor]]:
         """Return what networks returned, and the slopes by it."""
 
 
-class CategoricalPolicies:
+class CategoricalPolicies(Policies):
     """Choices among A actions with probabilities softmax(outputs).
 
     A slope is by the log-probabilities [S, A, P, R], up to a multiple of the probabilities, which the softmax takes
     away. The action axis comes first; see `Categorical.normalise`.
-
-    Args:
-        outputs: [S, P B, T, N, A] logits, under autograd.
-        frame: of the originals.
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame) -> None:
@@ -75,21 +78,17 @@ class CategoricalPolicies:
         self._inner = self.probs * self.log_probs
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        """Return log pi(action) [S, L, R]."""
         return self.log_probs.gather(1, _index(action, learned)).squeeze(1)
 
     def entropy(self, learned: int) -> Tensor:
-        """Return - sum_a pi(a) log pi(a): [S, L, R]."""
         return self._inner[:, :, :learned].sum(1).neg_()
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
-        """Return KL[copy || original] [S, K, R] of some parts."""
         p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
         self._gap = divergence_by_choice(log_p, log_q, p)
         return self._gap.sum(1)
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
-        """Add the slope by the log-probabilities; see `Policies.add_slope`."""
         learned = by_log_prob.shape[1]
         if slope is None and learned == self._shape[1]:
             slope = self._inner * -_beside(by_entropy)
@@ -99,7 +98,6 @@ class CategoricalPolicies:
         return slope.scatter_add_(1, _index(action, learned), by_log_prob.unsqueeze(1))
 
     def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
-        """Add p (log p - log q) by log p, and -p by log q; see `Policies.add_divergence_slope`."""
         slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
         if stop_gradient != "transformed":
             slope[:, :, 1:].add_(self._gap * weights)
@@ -108,7 +106,6 @@ class CategoricalPolicies:
         return slope
 
     def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
-        """Return the outputs and the slope by them."""
         by_logits = torch.addcmul(slope, self.probs, slope.sum(1, keepdim=True), value=-1)
         return [(self._outputs, self._frame.push_outputs(by_logits.unflatten(3, self._shape[2:5]).movedim(1, -1)))]
 
@@ -128,7 +125,7 @@ def _beside(weights: Weights) -> Weights:
     return weights.unsqueeze(1) if isinstance(weights, Tensor) else weights
 
 
-class GaussianPolicies:
+class GaussianPolicies(Policies):
     """Gaussians whose means are the outputs, with one log deviation for all rows.
 
     A slope is that by the means [S, P, R, W] and that by the log deviation [S, W].
@@ -149,23 +146,19 @@ class GaussianPolicies:
         self._precision = (-self._log_std).exp()
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        """Return the log density [S, L, R] of latent actions [S, B, T, N, W]."""
         square = self._standardised(action, learned).square()
         return -(0.5 * square + self._log_std + _HALF_LOG_TAU).sum(-1)
 
     def entropy(self, learned: int) -> Tensor:
-        """Return the entropies [S, L, R], equal for all rows."""
         return (self._log_std + (0.5 + _HALF_LOG_TAU)).sum(-1).expand(self._means[:, :learned].shape[:-1])
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
-        """Return |m - m'|^2 / (2 std^2) [S, K, R] of some parts."""
         self._gap = (self._means[:, copies] - self._means[:, originals]) * self._precision
         return 0.5 * self._gap.square().sum(-1)
 
     def add_slope(
         self, slope: tuple[Tensor, Tensor] | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights
     ) -> tuple[Tensor, Tensor]:
-        """Add the slopes by the means and by the log deviation; see `Policies.add_slope`."""
         by_means, by_log_std = slope or self._no_slope()
         learned, above = by_log_prob.shape[1], by_log_prob.unsqueeze(-1)
         z = self._standardised(action, learned)
@@ -177,7 +170,6 @@ class GaussianPolicies:
     def add_divergence_slope(
         self, slope: tuple[Tensor, Tensor] | None, weights: Weights, stop_gradient: str
     ) -> tuple[Tensor, Tensor]:
-        """Add the slopes by the means and by the log deviation; see `Policies.add_divergence_slope`."""
         by_means, by_log_std = slope or self._no_slope()
         weighted = self._gap * (weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights)
         by_log_std -= (weighted * self._gap).flatten(1, -2).sum(1)
@@ -189,7 +181,6 @@ class GaussianPolicies:
         return by_means, by_log_std
 
     def back(self, slope: tuple[Tensor, Tensor]) -> list[tuple[WithVJP, Tensor]]:
-        """Return the outputs and the parameter, and the slope by each."""
         by_means, by_log_std = slope
         by_parameter = torch.zeros_like(self._parameter).index_add_(1, self._item, by_log_std)
         by_outputs = self._frame.push_outputs(by_means.unflatten(2, self._shape[2:-1]))

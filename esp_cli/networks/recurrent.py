@@ -18,12 +18,6 @@ class SeedGRU(nn.Module):
     """A gated recurrent unit (Cho et al., 2014) for S seeds.
 
     r = s(x W_r + h U_r), z = s(x W_z + h U_z), n = tanh(x W_n + r * (h U_n + b_n)), h' = (1 - z) n + z h.
-
-    Args:
-        generators: one per seed; they draw the initial weights.
-        inputs: width of an input row.
-        hidden: H, width of the memory.
-        compiled: whether it is unrolled by the compiled kernel on the CPU.
     """
 
     def __init__(self, generators: Sequence[torch.Generator], inputs: int, hidden: int, compiled: bool = False) -> None:

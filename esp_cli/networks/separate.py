@@ -36,10 +36,6 @@ class Separate(Network):
 
     Greedy parts make the greedy action, and a softmax of the sums is a product of one distribution per part. A
     permutation of the parts, such as a mirror that swaps the wheels, permutes the sums.
-
-    Args:
-        network: f, with one output per value of each part.
-        parts: see `action_parts`.
     """
 
     def __init__(self, network: Network, parts: Tensor) -> None:

@@ -63,10 +63,6 @@ class Frame:
 class Values:
     """What a critic outputs for originals and copies; a slope is by `rows`.
 
-    Args:
-        values: [S, (1 + K) B, T, C] under autograd.
-        frame: of the originals.
-
     Attributes:
         count: C.
         rows: [S, 1 + K, B T C] in the frame.
