@@ -152,14 +152,6 @@ def test_a_rollout_has_a_row_for_every_minibatch():
         learner(mappo__num_minibatches=101)
 
 
-def test_the_old_value_of_value_clipping_is_what_the_critic_said():
-    trained = learner(mappo__clip_value=True)
-    trained.iterate(0.0)
-    batch, _ = trained.prepare(trained.collector.collect(25))
-    now = trained.critic.unroll(batch.obs, batch.state)
-    torch.testing.assert_close(batch.value, now, rtol=1e-4, atol=1e-5)
-
-
 def test_a_restored_learner_goes_on_bit_for_bit():
     straight = learner()
     for _ in range(2):

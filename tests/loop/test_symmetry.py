@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.distributions import Normal
 
 from esp_cli import Continuous, Field, Items, Kind, Symmetry, Transitions, discrete_moves, layout
 from esp_cli.networks.heads import Categorical
@@ -295,6 +296,22 @@ def test_what_does_not_fit_is_told_in_one_sentence(call, sentence: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda s: s.augment(random(5, 3), zeros(5, 2)), r"the action is torch\.int64; give floating-point numbers"),
+        (lambda s: s.augment(random(5, 3), random(5, 3)), r"the action has shape \[5, 3\], but \[5, 2\] is needed"),
+        (
+            lambda s: s.policy_loss(lambda o: Normal(o[..., :2], 1.0), random(5, 3), here=random(5, 2)),
+            r"Normal of the moved data, but of the originals \(here\) there is Tensor",
+        ),
+    ],
+)
+def test_what_does_not_fit_forces_is_told(call, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        call(Symmetry(observation=SEEN, action=FORCE, group="rot45"))
+
+
+@pytest.mark.parametrize(
     ("changed", "sentence"),
     [
         ({"observation": SEEN.fields}, r"observation is \(Field.*; give layout\(Field"),
@@ -347,64 +364,12 @@ def test_a_check_says_which_shape_is_needed_and_takes_other_precisions() -> None
         symmetry.check(Transitions(*(part[:, 0] for part in (data.obs, data.action, data.reward, data.next_obs))))
 
 
-def test_a_check_sees_a_wrong_order_of_agents() -> None:
-    """Each sees where the others are; a layout that forgets who they are holds nothing that exchanges agents."""
-    generator = torch.Generator().manual_seed(0)
-    place = torch.rand(400, 3, 2, generator=generator) * 2 - 1
-    ways = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    action = torch.randint(4, (400, 3), generator=generator)
-
-    def seen(position: Tensor) -> Tensor:
-        others = [[position[:, j] - position[:, i] for j in range(3) if j != i] for i in range(3)]
-        return torch.stack([torch.cat([position[:, i], *others[i]], -1) for i in range(3)], 1)
-
-    after = place + 0.2 * ways[action]
-    data = Transitions(*(x.unsqueeze(1) for x in (seen(place), action, -after.norm(dim=-1), seen(after))))
-    for items, outcomes in ((Items.OTHERS, {"holds"}), (Items.FIXED, {"holds", "broken"})):
-        shown = layout(Field("own", Kind.VECTOR), Field("others", Kind.VECTOR, 2, items=items))
-        found = Symmetry(observation=shown, action=MOVES, group="d4*agents", num_agents=3).check(data)
-        assert {verdict.outcome for verdict in found} == outcomes
-        if items is Items.FIXED:
-            assert {v.outcome for v in found if v.element in ("agents-1-2-0", "agents-2-0-1")} == {"broken"}
-
-
-def test_whole_numbers_are_no_forces() -> None:
-    with pytest.raises(ValueError, match=r"the action is torch\.int64; give floating-point numbers"):
-        Symmetry(observation=SEEN, action=FORCE, group="rot45").augment(random(5, 3), zeros(5, 2))
-
-
-def test_a_distribution_is_not_compared_with_a_tensor() -> None:
-    with pytest.raises(ValueError, match=r"Normal of the moved data, but of the originals \(here\) there is Tensor"):
-        Symmetry(observation=SEEN, action=FORCE).policy_loss(
-            lambda o: torch.distributions.Normal(o[..., :2], 1.0), random(5, 3), here=random(5, 2)
-        )
-
-
-def test_continuous_actions_of_another_width_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"the action has shape \[5, 3\], but \[5, 2\] is needed"):
-        Symmetry(observation=SEEN, action=FORCE).augment(random(5, 3), random(5, 3))
-
-
 def test_a_group_that_the_actions_cannot_carry_is_refused() -> None:
     with pytest.raises(ValueError, match="c8 cannot act on the task: action 'right' turned by 45 degrees is no action"):
         Symmetry(observation=SEEN, action=MOVES, group="c8")
     assert Symmetry(observation=SEEN, action=FORCE, group="c8")
     with pytest.raises(ValueError, match="copies='all' needs a finite group, but 'so2' is infinite"):
         Symmetry(observation=SEEN, action=FORCE, group="so2", copies="all")
-
-
-def test_moves_are_named_or_counted() -> None:
-    assert MOVES.names == ("right", "up", "left", "down")
-    assert discrete_moves(["stay", "left", "right"]).points == ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0))
-    assert discrete_moves(8).points[2] == pytest.approx((0, 1))
-    assert Symmetry(observation=SEEN, action=discrete_moves(8), group="d8")
-    for wrong, sentence in (
-        (["jump"], "does not know 'jump'"),
-        (0, "has no direction"),
-        (["up", "up"], "twice 'up'"),
-    ):
-        with pytest.raises(ValueError, match=sentence):
-            discrete_moves(wrong)
 
 
 IMPORTED = """

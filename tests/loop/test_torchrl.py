@@ -205,19 +205,6 @@ def test_without_copies_the_loss_is_that_of_the_originals() -> None:
     assert both["loss_objective"].item() != pytest.approx(plain["loss_objective"].item(), rel=1e-3)
 
 
-def test_training_on_the_loss_makes_the_policy_symmetric() -> None:
-    data, loss = rows(), SymmetricLoss(ppo(ClipPPOLoss), symmetry("d4", copies="all"), 10.0)
-    optimiser = torch.optim.Adam(loss.parameters(), 0.03)
-    gaps = []
-    for _ in range(60):
-        losses = loss(data.clone())
-        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-        optimiser.step()
-        optimiser.zero_grad()
-        gaps.append(losses["policy_symmetry"].item() + losses["value_symmetry"].item())
-    assert gaps[-1] < 0.05 * gaps[0]
-
-
 def mixer_loss() -> QMixerLoss:
     torch.manual_seed(0)
     q = TensorDictModule(nn.Linear(WIDTH, 4), [("agents", "observation")], [("agents", "action_value")])
