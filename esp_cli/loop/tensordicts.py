@@ -38,10 +38,7 @@ Other keys hold numbers that go with their agents, or one for each row (rewards,
 
 
 def with_copies(
-    spaces: Spaces,
-    data: Any,
-    choose: Callable[[Tensor], list[Transform]],
-    roles: Mapping[str, Role] | None = None,
+    spaces: Spaces, data: Any, choose: Callable[[Tensor], list[Transform]], roles: Mapping[str, Role] | None = None
 ) -> tuple[list[Any], list[Transform]]:
     """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
 

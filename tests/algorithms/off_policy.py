@@ -7,13 +7,7 @@ from esp_cli.symmetry import transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
-SMALL = {
-    "num_envs": 2,
-    "rounds": 2,
-    "batch_episodes": 3,
-    "replay_episodes": 7,
-    "warmup_episodes": 2,
-}
+SMALL = {"num_envs": 2, "rounds": 2, "batch_episodes": 3, "replay_episodes": 7, "warmup_episodes": 2}
 
 
 def learner(algorithm, task="navigation", seeds=(0, 1), **overrides):

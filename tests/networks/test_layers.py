@@ -58,10 +58,7 @@ def test_parts_side_by_side_equal_whole_rows_and_get_gradients_where_they_ask(ro
     monkeypatch.setattr(perceptron, "CACHED_ROWS", 8)  # pieces of four, four and three rows
     mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0)
     fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
-    ours, theirs = (
-        mlp(fixed, moving, rows_innermost=rows_innermost),
-        reference(mlp, torch.cat([fixed, moving], -1)),
-    )
+    ours, theirs = (mlp(fixed, moving, rows_innermost=rows_innermost), reference(mlp, torch.cat([fixed, moving], -1)))
     torch.testing.assert_close(ours, theirs)
     assert ours.transpose(1, 2).is_contiguous() == rows_innermost
     assert_same_gradients(ours, theirs, torch.randn(2, 11, 20), [moving, *mlp.parameters()])

@@ -12,11 +12,7 @@ from esp_envs.spec import Field, Items, Kind, Spaces, joint_layout, layout
 from tests.symmetry.toy_actions import EVERYTHING, FORCE, FOUR_DIRECTIONS, WHEELS
 
 ELEMENTS = [rotation(90), mirror(0), rotation(270)]
-MOVING = [
-    rotation(90) @ Element(permutation=(1, 2, 0)),
-    mirror(45),
-    Element(permutation=(0, 2, 1)),
-]
+MOVING = [rotation(90) @ Element(permutation=(1, 2, 0)), mirror(45), Element(permutation=(0, 2, 1))]
 BATCHES = [(4,), (2, 3), (0,), ()]
 
 
