@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.autograd import Function
-from torch.nn.functional import elu_
+from torch.nn.functional import elu
 
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.perceptron import CACHED_ROWS
+
+HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer
 
 
 class MonotonicMixer(nn.Module):
@@ -61,45 +63,15 @@ class MonotonicMixer(nn.Module):
 
     def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
         """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
-        rows = self.hypernetwork(seen, rows_innermost=True)
-        return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
-
-
-class _Mixed(Function):
-    """What the hypernetwork says, applied: own [S, N, B] and rows [S, N M + M + M + 1, B] to [S, B].
-
-    Autograd through the formula is the reference in the tests.
-    """
-
-    @staticmethod
-    def forward(ctx, own, rows, width):  # type: ignore[no-untyped-def]
-        first, bias, second, offset = _parts(rows, own.shape[1], width)
-        hidden = bias
-        for weight, value in zip(first.unbind(1), own.unsqueeze(2).unbind(1), strict=True):
-            hidden = torch.addcmul(hidden, weight.abs(), value)
-        hidden = elu_(hidden)
-        ctx.save_for_backward(own, rows, hidden)
-        return (hidden * second.abs()).sum(1).add_(offset.squeeze(1))
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        own, rows, hidden = ctx.saved_tensors
-        by_rows, above = torch.empty_like(rows), grad.unsqueeze(1)
-        first, _, second, _ = _parts(rows, own.shape[1], hidden.shape[1])
-        by_first, by_bias, by_second, by_offset = _parts(by_rows, own.shape[1], hidden.shape[1])
-        by_offset.copy_(above)
-        torch.sgn(second, out=by_second).mul_(above)  # of w_2, where the team's value goes by |w_2|
-        inner = by_second * second  # = |w_2| times the gradient above: by the hidden units
-        by_second.mul_(hidden)
-        torch.ops.aten.elu_backward.grad_input(inner, 1.0, 1.0, 1.0, True, hidden, grad_input=by_bias)
-        torch.sgn(first, out=by_first).mul_(by_bias.unsqueeze(1))
-        by_own = (by_first * first).sum(2)
-        by_first.mul_(own.unsqueeze(2))
-        return by_own, by_rows, None
+        rows = self.hypernetwork(seen, rows_innermost=True).transpose(1, 2)
+        first, bias, second, offset = rows.split((self.num_agents * self.width, self.width, self.width, 1), 1)
+        weighed = first.unflatten(1, (self.num_agents, self.width)).abs() * own.transpose(1, 2).unsqueeze(2)
+        hidden = elu(weighed.sum(1) + bias)
+        return (hidden * second.abs()).sum(1) + offset.squeeze(1)
 
 
 class _CompiledMixed(Function):
-    """The same by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
+    """The mixer by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
 
     @staticmethod
     def forward(ctx, width, keep, own, state, *parameters):  # type: ignore[no-untyped-def]
@@ -112,12 +84,3 @@ class _CompiledMixed(Function):
         _, state, *_ = ctx.saved_tensors
         by_own, grads, (by_state,) = ctx.run.unmix(grad, ctx.needs_input_grad[4:], ctx.needs_input_grad[3:4])
         return None, None, by_own, None if by_state is None else by_state.view(state.shape), *grads
-
-
-def _parts(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return W_1 [S, N, M, B], b_1 [S, M, B], w_2 [S, M, B] and b_2 [S, 1, B]."""
-    first, bias, second, offset = rows.split((num_agents * width, width, width, 1), 1)
-    return first.unflatten(1, (num_agents, width)), bias, second, offset
-
-
-HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer

@@ -43,16 +43,13 @@ def test_without_absolute_values_it_would_not():
 
 
 @pytest.mark.parametrize("cached", [4096, 8])  # at once, and in pieces of four, four and two rows
-def test_the_hand_written_backward_equals_autograd_through_the_formula(cached, monkeypatch):
+def test_values_and_gradients_are_those_of_the_formula(cached, monkeypatch):
     monkeypatch.setattr(mixing, "CACHED_ROWS", cached)
     mix, weight = mixer(), torch.randn(2, 10)
     values, state = torch.randn(2, 10, AGENTS, requires_grad=True), torch.randn(2, 10, STATE, requires_grad=True)
     ours, theirs = mix(values, state), by_formula(mix, values, state)
     torch.testing.assert_close(ours, theirs)
     assert_same_gradients(ours, theirs, weight, [values, state, *mix.parameters()])
-    unbounded = by_formula(mix, values, state, lambda x: x)
-    with pytest.raises(AssertionError):
-        assert_same_gradients(mix(values, state), unbounded, weight, [values])
 
 
 def test_a_seed_mixes_the_same_alone_and_among_others():
