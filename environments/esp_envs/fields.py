@@ -242,8 +242,15 @@ class Layout:
 
     @property
     def without_counts(self) -> Layout:
-        """The same with one thing in each family, which tells layouts apart up to how many there are."""
-        return Layout(tuple(replace(f, count=1) if f.family_name and f.count else f for f in self.fields))
+        """The same with one thing in each family, which tells layouts apart up to how many there are, in any order."""
+        return Layout(
+            tuple(
+                replace(f, name=f"{f.family_name} {k}", count=1, items=Items.FIXED, family=f.family_name)
+                if f.family_name and f.count
+                else f
+                for k, f in enumerate(self.fields)
+            )
+        )
 
     @property
     def _placed(self) -> Iterator[tuple[Field, slice]]:

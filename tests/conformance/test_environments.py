@@ -24,6 +24,7 @@ SETTINGS: dict[str, list[dict[str, object]]] = {
         {"num_agents": 2, "actions": "continuous"},
         {"num_agents": 4, "num_landmarks": 3, "convention": "pettingzoo"},
         {"num_agents": 1, "horizon": 3},
+        {"num_agents": 10, "sees": 3, "density": 8.0},
     ],
     "predator-prey": [
         {},

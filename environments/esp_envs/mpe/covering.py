@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 LOOKAHEAD_S = 0.2
@@ -16,6 +17,8 @@ FULL_FORCE_DISTANCE = 0.2
 """How far one step of full force carries an agent in all (0.5 length/s, fading by a quarter a step, 0.1 s each)."""
 MAX_SHARINGS = 4096
 """Most ways of sharing out landmarks that `shared_out` should try."""
+MOST_ASSIGNED = 2000
+"""Agents or landmarks up to which `assigned` shares them out by the Hungarian method, whose time is cubic."""
 TRAVEL_WEIGHT = 0.25
 """Weight of the distance to travel against the distance that remains, in `shared_out`; found by search."""
 
@@ -47,6 +50,46 @@ def one_each(position: Tensor, landmark: Tensor) -> Tensor:
         choice[[a, b]] = torch.where(swapped < own, pair.flip(0), pair)
     goals = landmark.gather(0, choice.clamp_max(landmarks - 1).unsqueeze(1).expand(-1, 2, -1))
     return torch.where((choice < landmarks).unsqueeze(1), goals, position)
+
+
+def assigned(position: Tensor, landmark: Tensor) -> Tensor:
+    """Give each agent a landmark of its own so that the sum of distances is least (Hungarian method).
+
+    With more than `MOST_ASSIGNED` of them an agent takes the nearest landmark that no nearer agent wants, round after
+    round.
+
+    Args:
+        position: [N, 2, W].
+        landmark: [L, 2, W].
+
+    Returns:
+        The goals [N, 2, W]; agents left over when all landmarks are taken stay where they are.
+    """
+    goals = position.clone()
+    for world in range(position.shape[2]):
+        here, there = position[:, :, world], landmark[:, :, world]
+        if max(len(here), len(there)) <= MOST_ASSIGNED:
+            agents, taken = (torch.from_numpy(x) for x in linear_sum_assignment(torch.cdist(here, there).cpu().numpy()))
+        else:
+            agents, taken = _wanted_most(here, there)
+        goals[agents, :, world] = there[taken]
+    return goals
+
+
+def _wanted_most(here: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Return pairs of agents and landmarks: each round an agent asks for the nearest free landmark."""
+    agents, free, pairs = torch.arange(len(here)), torch.arange(len(there)), []
+    while len(agents) and len(free):
+        distance, asked = torch.cdist(here[agents], there[free]).min(1)
+        nearest_first = distance.argsort()
+        first = torch.full((len(free),), len(agents))
+        first.scatter_reduce_(0, asked[nearest_first], torch.arange(len(agents)), "amin")
+        got = nearest_first[first[first < len(agents)]]
+        pairs.append(torch.stack([agents[got], free[asked[got]]]))
+        agents = agents[~torch.isin(agents, pairs[-1][0])]
+        free = free[~torch.isin(free, pairs[-1][1])]
+    agents, taken = torch.cat(pairs, 1)
+    return agents, taken
 
 
 def _nearest_pairs_first(distance: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -11,7 +13,8 @@ from torch import Tensor
 
 from esp_envs.batched import World, to_others
 from esp_envs.mpe import covering
-from esp_envs.mpe.particles import Bodies
+from esp_envs.mpe.many import MOST_BODIES, ManyWorlds
+from esp_envs.mpe.particles import Bodies, ParticleWorlds
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
 from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
@@ -30,17 +33,26 @@ _LANDMARK_COLOR = "#404040"
 class NavigationSettings(ParticleSettings):
     """What a user may change of `navigation`."""
 
-    num_agents: int = Setting(3, ge=1, le=8, description="N, learning agents; the paper has 2, 3 and 4")
+    num_agents: int = Setting(3, ge=1, le=100_000, description="N, learning agents; the paper has 2, 3 and 4")
     num_landmarks: int | None = Setting(
         None,
         ge=1,
-        le=8,
+        le=100_000,
         description="L, landmarks; by default as many as agents, but 3 for 2 agents, which the paper's row fits",
     )
     landmark_extent: float | None = Setting(
         None,
         gt=0,
         description="landmarks start in the square [-extent, extent]^2 (lengths); 0.8 by default, 1.0 for pettingzoo",
+    )
+    sees: int = Setting(
+        0, ge=0, description="of the other agents and of the landmarks, how many nearest ones an agent sees; 0: all"
+    )
+    density: float | None = Setting(
+        None,
+        gt=0,
+        description="agents per 2 x 2 lengths at the start, however many there are, landmarks in the same square; by "
+        "default agents start in [-1, 1]^2",
     )
     local_ratio: float = Setting(
         0.5, ge=0, le=1, description="pettingzoo convention only: weight of the own collisions against the team's term"
@@ -54,7 +66,23 @@ class NavigationSettings(ParticleSettings):
     @property
     def extent(self) -> float:
         """The landmark extent with its default filled in."""
-        return self.landmark_extent or LANDMARK_EXTENT[self.convention]
+        return self.landmark_extent or (self.half_side if self.density else LANDMARK_EXTENT[self.convention])
+
+    @property
+    def half_side(self) -> float:
+        """Half the side of the square in which agents start, lengths."""
+        return math.sqrt(self.num_agents / self.density) if self.density else 1.0
+
+    @property
+    def seen(self) -> tuple[int, int]:
+        """Landmarks and other agents that an agent sees."""
+        landmarks, others = self.landmarks, self.num_agents - 1
+        return (min(self.sees, landmarks), min(self.sees, others)) if self.sees else (landmarks, others)
+
+    @property
+    def many(self) -> bool:
+        """Whether pairs are too many to be listed, or only the nearest are seen."""
+        return self.sees > 0 or self.num_agents > MOST_BODIES
 
     def without_effect(self) -> frozenset[str]:
         """Return the names of settings that change nothing beside the others."""
@@ -95,16 +123,20 @@ class Navigation(ParticleTask):
 
     Terminated: never. Truncated: after `horizon` = 25 steps; bootstrap there.
 
-    Metrics a step: `collisions` (touching pairs of agents), `landmark_distance` (mean over landmarks of the distance to
-    the nearest agent, length), `coverage` (share of landmarks with an agent within 0.1).
+    Many agents: with `sees` = k an agent sees the k nearest landmarks and others, sorted by distance, so that its row
+    does not grow with N; `density` makes the square at the start grow with N.
+
+    Metrics a step: `collisions` (touching pairs of agents), `collisions_per_agent` (other agents that touch one),
+    `landmark_distance` (mean over landmarks of the distance to the nearest agent, length), `coverage` (share of
+    landmarks with an agent within 0.1).
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections of the plane; five discrete moves
     carry those of the square (`d4`), a planar force carries all (`o2`). Settings that break it leave: `wind` and `mud`
     the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents,
     `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the landmarks) `flip-x`.
 
-    Heuristics: `greedy` (each agent takes a landmark of its own), `cover` (agents share out all landmarks
-    between them, for L > N; where there are at most 4096 ways, N^L, to do so).
+    Heuristics: `greedy` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
+    (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so).
 
     Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, greedy -112,
     cover -109.
@@ -120,13 +152,15 @@ class Navigation(ParticleTask):
     def __init__(self, settings: NavigationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
-        if agents**landmarks > covering.MAX_SHARINGS:
+        if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS):
             self.heuristics = ("greedy",)
+        if self.settings.many:
+            return
         self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
-        contacts = self.worlds.bodies.contacts
         # [N, pairs]: which agents take part in which pair
-        self._takes_part = torch.zeros(agents, len(contacts), device=self.device)
-        for pair, (a, b) in enumerate(contacts):
+        pairs = self.worlds.bodies.contacts
+        self._takes_part = torch.zeros(agents, len(pairs), device=self.device)
+        for pair, (a, b) in enumerate(pairs):
             self._takes_part[a, pair] = self._takes_part[b, pair] = 1.0
 
     def _describe(self) -> TaskSpec:
@@ -145,8 +179,7 @@ class Navigation(ParticleTask):
             observation=filled_layout(
                 Field("velocity", Kind.VECTOR, 1, "length/s"),
                 Field("position", Kind.VECTOR, 1, "length", is_point=True),
-                Field("landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
-                Field("others", Kind.VECTOR, agents - 1, "length", Items.OTHERS),
+                *_seen_fields(*settings.seen, sorts=settings.sees > 0),
             ),
             state=layout(
                 Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
@@ -167,21 +200,38 @@ class Navigation(ParticleTask):
             radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
             gain=(SENSITIVITY,) * agents,
             max_speed=None,
-            contacts=tuple((a, b) for a in range(agents) for b in range(a + 1, agents)),
-            watched=tuple((a, agents + k) for a in range(agents) for k in range(landmarks)),
-            extent=(1.0,) * agents + (self.settings.extent,) * landmarks,
+            contacts=() if self.settings.many else tuple(itertools.combinations(range(agents), 2)),
+            watched=()
+            if self.settings.many
+            else tuple(itertools.product(range(agents), range(agents, agents + landmarks))),
+            extent=(self.settings.half_side,) * agents + (self.settings.extent,) * landmarks,
         )
 
+    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
+        if not self.settings.many:
+            return super()._make_worlds(bodies, num_worlds, velocity_first)
+        return ManyWorlds(bodies, num_worlds, self.device, velocity_first, self.settings.sees)
+
     def _observe(self, world: World) -> Tensor:
-        velocity, position = world["velocity"], world["position"]
-        landmarks = world["landmarks"].unsqueeze(-3) - position.unsqueeze(-2)
-        return torch.cat([velocity, position, landmarks.flatten(-2), to_others(position).flatten(-2)], -1)
+        velocity, position, landmarks = world["velocity"], world["position"], world["landmarks"]
+        if self.settings.sees:
+            seen = (self._nearest("seen_landmarks", landmarks), self._nearest("seen_agents", position))
+        else:
+            seen = (landmarks.unsqueeze(-3) - position.unsqueeze(-2), to_others(position))
+        return torch.cat([velocity, position, *(ways.flatten(-2) for ways in seen)], -1)
+
+    def _nearest(self, index: str, places: Tensor) -> Tensor:
+        """Return where each agent sees the nearest of places [S, E, K, 2]: [S, E, N, k, 2]."""
+        which = getattr(self.worlds, index).view(*self._worlds_shape, -1, 1).expand(-1, -1, -1, 2)
+        ways = places.gather(2, which).unflatten(2, (self.settings.num_agents, -1))
+        return ways - self.world["position"].unsqueeze(3)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `greedy` (default) or `cover`."""
         worlds, agents = self.worlds, self.settings.num_agents
         position, landmark = worlds.position, worlds.entity[agents:] + self._shift
-        assign = covering.one_each if self.named_heuristic(name) == "greedy" else covering.shared_out
+        one_each = covering.assigned if self.settings.many else covering.one_each
+        assign = one_each if self.named_heuristic(name) == "greedy" else covering.shared_out
         goal = assign(position, landmark)
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 
@@ -192,27 +242,50 @@ class Navigation(ParticleTask):
         agents = self.settings.num_agents
         bodies = [
             Body((x, y), AGENT_RADIUS, color, trail=True, label="agent")
-            for (x, y), color in zip(places[:agents], COLORS, strict=False)
+            for (x, y), color in zip(places[:agents], itertools.cycle(COLORS), strict=False)
         ]
         bodies += [
             Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, "cross", label="landmark", reach=OCCUPIED_WITHIN)
             for x, y in places[agents:]
         ]
-        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
+        half = 1.4 * self.settings.half_side
+        return Scene(tuple(bodies), (-half, half, -half, half), unit="length units")
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
-        bumps = (self.worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
-        collisions = bumps.sum(0)
-        nearest = self._to_landmarks.amin(0).sqrt_()
+        worlds, esp = self.worlds, self.settings.convention == "esp"
+        if isinstance(worlds, ManyWorlds):
+            touching, nearest = worlds.touching, worlds.squared_to_landmarks.sqrt()
+            collisions = 0.5 * touching.sum(0)
+        else:
+            bumps = (worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
+            touching, collisions, nearest = bumps, bumps.sum(0), self._to_landmarks.amin(0).sqrt_()
         distance = paid = nearest.sum(0)
         if self.settings.reward_offset:
-            paid = self._squared_to(self.worlds.entity[agents:]).amin(0).sqrt_().sum(0)
-        if self.settings.convention == "esp":
+            paid = self._squared_to(worlds.entity[agents:]).amin(0).sqrt_().sum(0)
+        ratio = self.settings.local_ratio
+        if esp:
             reward = (paid * -agents).sub_(collisions, alpha=2).sub_(agents)
+        elif self.settings.many:
+            reward = paid * (ratio - 1) - ratio * touching
         else:
-            ratio = self.settings.local_ratio
-            reward = torch.addmm(paid.expand(agents, -1), self._takes_part, bumps, beta=ratio - 1, alpha=-ratio)
-        coverage = (nearest < OCCUPIED_WITHIN).float().mean(0)
-        metrics = {"collisions": collisions, "landmark_distance": distance / landmarks, "coverage": coverage}
-        return reward, metrics
+            reward = torch.addmm(paid.expand(agents, -1), self._takes_part, touching, beta=ratio - 1, alpha=-ratio)
+        return reward, {
+            "collisions": collisions,
+            "collisions_per_agent": collisions * (2 / agents),
+            "landmark_distance": distance / landmarks,
+            "coverage": (nearest < OCCUPIED_WITHIN).float().mean(0),
+        }
+
+
+def _seen_fields(landmarks: int, others: int, sorts: bool) -> tuple[Field, ...]:
+    """Return the fields of landmarks and of other agents; sorted by distance, no order of agents moves them."""
+    if not sorts:
+        return (
+            Field("landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
+            Field("others", Kind.VECTOR, others, "length", Items.OTHERS),
+        )
+    return (
+        Field("near_landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
+        Field("near_others", Kind.VECTOR, others, "length", family="others"),
+    )

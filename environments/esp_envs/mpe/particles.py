@@ -90,7 +90,7 @@ class ParticleWorlds:
         self.bodies = bodies
         self.velocity_first = velocity_first
         self.num_worlds = num_worlds
-        self.num_lanes = -(-num_worlds // LANE_MULTIPLE) * LANE_MULTIPLE
+        self.num_lanes = lanes_of(num_worlds)
         agents, lanes = bodies.num_agents, self.num_lanes
         self.physics = torch.zeros(2 * agents + bodies.num_landmarks, 2, lanes, device=device)
         self.velocity = self.physics[:agents]
@@ -150,14 +150,29 @@ class ParticleWorlds:
 
     def _contact_impulses(self) -> Tensor:
         """Return the velocity change [A, 2, W'] that contacts cause in one step, from the measured pairs."""
-        distance = self.squared_contact_distance.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
-        overlap = torch.add(self._touching, distance, alpha=-1 / CONTACT_MARGIN)
-        # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.
-        softplus = overlap.clamp(*_SOFTPLUS_RANGE).exp_().log1p_()
-        torch.maximum(softplus, overlap, out=softplus)
-        strength = softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
+        strength = contact_strength(self.squared_contact_distance, self._touching)
         push = self._contact_offset * strength.unsqueeze(1)
         return exact_matmul(self._pushes, push.flatten(1)).view_as(self.velocity)
+
+
+def lanes_of(num_worlds: int) -> int:
+    """Return W', the worlds filled up to a multiple of `LANE_MULTIPLE`."""
+    return -(-num_worlds // LANE_MULTIPLE) * LANE_MULTIPLE
+
+
+def contact_strength(squared_distance: Tensor, touching: Tensor) -> Tensor:
+    """Return the velocity change per length between two centres that a contact causes in one step.
+
+    Args:
+        squared_distance: between the centres.
+        touching: distance at which both touch, in units of `CONTACT_MARGIN`.
+    """
+    distance = squared_distance.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
+    overlap = torch.add(touching, distance, alpha=-1 / CONTACT_MARGIN)
+    # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.
+    softplus = overlap.clamp(*_SOFTPLUS_RANGE).exp_().log1p_()
+    torch.maximum(softplus, overlap, out=softplus)
+    return softplus.div_(distance).mul_(CONTACT_FORCE * CONTACT_MARGIN * DT_S)
 
 
 def exact_matmul(left: Tensor, right: Tensor, out: Tensor | None = None) -> Tensor:

@@ -85,7 +85,7 @@ class ParticleTask(BatchedTask):
         gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
         weak = (bodies.gain[0] * (1 - settings.weak_agent), *bodies.gain[1:])
         num_worlds, velocity_first = self.num_seeds * num_envs, settings.convention == "esp"
-        self.worlds = ParticleWorlds(replace(bodies, gain=weak), num_worlds, self.device, velocity_first)
+        self.worlds = self._make_worlds(replace(bodies, gain=weak), num_worlds, velocity_first)
         lanes = self.worlds.num_lanes
         counts = [field.count for field in spec.state.fields]
         rows = self._by_world(self.worlds.physics).split(counts, 2)
@@ -103,9 +103,15 @@ class ParticleTask(BatchedTask):
             self._gusts = torch.zeros(spec.horizon, bodies.num_agents, 2, lanes, device=self.device)
             self.world["gusts"] = self._by_world(self._gusts)
         self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
-        # the matrix of a linear function is what it gives for the basis vectors
-        readout = self._observe(self._split(torch.eye(spec.state.width)))
-        self._readout = readout.flatten(1).to(self.device)
+        self._readout: Tensor | None = None
+        if type(self.worlds) is ParticleWorlds:
+            # the matrix of a linear function is what it gives for the basis vectors
+            readout = self._observe(self._split(torch.eye(spec.state.width)))
+            self._readout = readout.flatten(1).to(self.device)
+
+    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
+        """Return the worlds; those of another class have observations that are no matrix product."""
+        return ParticleWorlds(bodies, num_worlds, self.device, velocity_first)
 
     @abstractmethod
     def _bodies(self) -> Bodies:
@@ -161,7 +167,10 @@ class ParticleTask(BatchedTask):
     def _seen(self) -> Observation:
         rows = self.worlds.rows().t()
         lead = (self.num_seeds, self.num_envs)
-        obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
+        if self._readout is None:
+            obs = self._observe(self.world).flatten(3)
+        else:
+            obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
         return Observation(obs, rows.contiguous().view(*lead, -1))
 
     def _put(self, state: Tensor) -> None:

@@ -1,0 +1,78 @@
+"""Worlds of many bodies: all pairs at once by broadcasting, of which only what grows with N k is kept."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from esp_envs.mpe.particles import CONTACT_MARGIN, Bodies, ParticleWorlds, contact_strength, lanes_of
+
+MOST_BODIES = 8
+"""Agents up to which pairs are listed and observations are one matrix product, which is faster for few of them."""
+_PAIRS = 1 << 21
+"""Pairs that are looked at together."""
+_NO_PUSH = 60 * CONTACT_MARGIN
+"""Gap between two rims from which on a push is 0 in float32."""
+
+
+class ManyWorlds(ParticleWorlds):
+    """W worlds in which all agents push each other apart; arguments as of `ParticleWorlds`, without lists of pairs.
+
+    Args:
+        sees: of the other agents and of the landmarks, how many nearest ones each agent sees; 0 for all.
+
+    Attributes:
+        touching: [A, W'] other agents that touch each agent.
+        squared_to_landmarks: [L, W'] from each landmark to its nearest agent.
+        seen_agents: [W, A, k] index of the nearest others, the nearest first; None where all are seen.
+        seen_landmarks: [W, A, k] likewise.
+    """
+
+    def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool, sees: int) -> None:
+        agents, landmarks = bodies.num_agents, bodies.num_landmarks
+        self._sees = (min(sees, agents - 1), min(sees, landmarks))
+        self._reach = 2 * bodies.radius[0]
+        size = max(1, _PAIRS // (agents * (agents + landmarks)))
+        self._chunks = [slice(k, min(k + size, num_worlds)) for k in range(0, num_worlds, size)]
+        lanes, index = lanes_of(num_worlds), torch.int64
+        self.touching = torch.zeros(agents, lanes, device=device)
+        self.squared_to_landmarks = torch.zeros(landmarks, lanes, device=device)
+        self.seen_agents, self.seen_landmarks = (
+            torch.zeros(num_worlds, agents, count, dtype=index, device=device) if sees else None for count in self._sees
+        )
+        super().__init__(bodies, num_worlds, device, velocity_first)
+
+    def measure(self) -> None:
+        """Look at all pairs in their present positions."""
+        agents, near = self.bodies.num_agents, []
+        for worlds in self._chunks:
+            x, y = self.entity[:, :, worlds].permute(1, 2, 0).contiguous()  # [w, bodies] each
+            square = (x[:, :agents, None] - x[:, None]).square_()
+            square += (y[:, :agents, None] - y[:, None]).square_()
+            others, landmarks = square[:, :, :agents], square[:, :, agents:]
+            others.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+            self.touching[:, worlds] = (others < self._reach**2).sum(2).t().to(x.dtype)
+            self.squared_to_landmarks[:, worlds] = landmarks.amin(1).t()
+            world, first, second = (others < (self._reach + _NO_PUSH) ** 2).nonzero().unbind(1)
+            near.append(torch.stack([world + worlds.start, first, second]))
+            if self.seen_agents is not None and self.seen_landmarks is not None:
+                self.seen_agents[worlds] = _nearest(others, self._sees[0])
+                self.seen_landmarks[worlds] = _nearest(landmarks, self._sees[1])
+        self._near = torch.cat(near, 1)
+
+    def _contact_impulses(self) -> Tensor:
+        """Return the velocity change [A, 2, W'] that contacts cause in one step."""
+        (world, first, second), position = self._near, self.position
+        offset = position[first, :, world] - position[second, :, world]
+        padding = (0, -len(offset) % 64)  # vector code and its scalar tail round otherwise
+        square = torch.nn.functional.pad(offset.square().sum(1), padding, value=1.0)
+        touching = square.new_tensor(self._reach / CONTACT_MARGIN)
+        push = offset * contact_strength(square, touching)[: len(offset), None]
+        change = torch.zeros(2, self.velocity[:, 0].numel(), device=push.device)
+        change.scatter_add_(1, (first * self.num_lanes + world).expand(2, -1), push.t())
+        return change.view(2, *self.velocity[:, 0].shape).transpose(0, 1)
+
+
+def _nearest(square: Tensor, count: int) -> Tensor:
+    """Return the index [..., count] of the least numbers along the last axis, the least first."""
+    return square.topk(count, -1, largest=False).indices
