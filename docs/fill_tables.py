@@ -25,9 +25,8 @@ from esp_cli.files.formatting import NOTHING
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import Floats, difference, summarise
-from esp_cli.reporting.results import CellResult, Results, Side, read_results
+from esp_cli.reporting.results import CellResult, Results, Side, floats, read_results, returns_of, side_of, summarised
 from esp_cli.reporting.study_figures import Series, series_of
-from esp_cli.reporting.summary import floats, returns_of, side_of, summarised
 from esp_cli.reporting.tables import TABLES as REPORT_TABLES
 from esp_cli.reporting.tables import Table, mean_text, on_the_way
 from esp_cli.studies.catalogue import paper_cells

@@ -18,9 +18,8 @@ from matplotlib.ticker import EngFormatter
 
 from esp_cli.policies.statistics import median_steps
 from esp_cli.reporting.figures import appearance, dots
-from esp_cli.reporting.results import read_results
+from esp_cli.reporting.results import floats, read_results
 from esp_cli.reporting.study_figures import draw_over_setting
-from esp_cli.reporting.summary import floats
 
 DOCS = Path(__file__).parent
 join = runpy.run_path(str(DOCS / "fill_tables.py"))["join"]

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from esp_cli.policies.statistics import mean_and_sem
-from esp_cli.reporting.results import read_results
+from esp_cli.reporting.results import read_results, summarised
 from esp_cli.reporting.study_figures import series_of
-from esp_cli.reporting.summary import summarised
 from esp_cli.reporting.tables import returns_table
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import run_study
+from esp_cli.commands.studying import run_or_forecast
 from esp_envs.errors import UserError
 
 EPILOG = """Examples:\n
@@ -35,17 +35,13 @@ def ablate(
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            "--methods",
-            help="What is compared, by the names in the table: 'plain,ESP,gate'; by default all.",
-            metavar="NAMES",
+            "--methods", help="What is compared, by the names in the table: 'plain,ESP,gate'; by default all."
         ),
     ] = None,
     broken_by: Annotated[
         list[str] | None,
         typer.Option(
-            "--broken-by",
-            help="For breaking: the settings that break symmetry, as wind,mud; by default all.",
-            metavar="SETTINGS",
+            "--broken-by", help="For breaking: the settings that break symmetry, as wind,mud; by default all."
         ),
     ] = None,
 ) -> None:
@@ -56,9 +52,4 @@ def ablate(
     names = parse_names(methods, KINDS[kind].variants)
     if settings and part != "breaking":
         raise UserError("--broken-by is for esp ablate breaking; leave it out")
-    words = [
-        *(("--methods", ",".join(names)) if names else ()),
-        *(("--broken-by", ",".join(settings)) if settings else ()),
-    ]
-    request = choices.request(kind, "ablate", part, *words)
-    run_study(kind, replace(request, variants=names, breakings=settings), choices)
+    run_or_forecast(kind, replace(choices.request(kind), variants=names, breakings=settings), choices)

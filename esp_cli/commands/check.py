@@ -39,8 +39,7 @@ def check(
     what: Annotated[Literal["task", "symmetry"], typer.Argument(help="What to check.", metavar="task|symmetry")],
     task: Annotated[str, typer.Argument(help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")],
     transforms: Annotated[
-        str | None,
-        typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.", metavar="LIST"),
+        str | None, typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.")
     ] = None,
     settings: TaskSetOption = None,
     policy: Annotated[

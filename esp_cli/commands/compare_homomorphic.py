@@ -9,7 +9,7 @@ import typer
 
 from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import run_study
+from esp_cli.commands.studying import forecast_study, run_study
 from esp_cli.defaults import Mode
 from esp_envs.errors import UserError
 
@@ -18,22 +18,18 @@ EPILOG = """Examples:\n
     esp compare-homomorphic --methods mpn,empn --steps 100k --seeds 3 --out runs/quick\n
     esp compare-homomorphic --grid 9 --drones 4 --group d4"""
 
-DRONES, GRID, GROUP = 3, 7, "c4"
-
 
 @study_command
 def compare_homomorphic(
     choices: StudyChoices,
-    drones: Annotated[int, typer.Option("--drones", min=2, help="N, drones.")] = DRONES,
-    grid: Annotated[int, typer.Option("--grid", min=3, help="Cells along each side, an odd number.")] = GRID,
+    drones: Annotated[int, typer.Option("--drones", min=2, help="N, drones.")] = 3,
+    grid: Annotated[int, typer.Option("--grid", min=3, help="Cells along each side, an odd number.")] = 7,
     methods: Annotated[
-        str | None,
-        typer.Option("--methods", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order."),
+        str | None, typer.Option("--methods", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order.")
     ] = None,
-    group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = GROUP,
+    group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = "c4",
     mode: Annotated[
-        Mode | None,
-        typer.Option("--mode", help="Which evaluations the tables state; by default stochastic."),
+        Mode | None, typer.Option("--mode", help="Which evaluations the tables state; by default stochastic.")
     ] = None,
     threshold: Annotated[
         float | None, typer.Option("--threshold", help="State when this return is first reached; by default 2.")
@@ -46,13 +42,12 @@ def compare_homomorphic(
     names = parse_names([methods]) if methods is not None else None
     limits = [] if threshold is None else [threshold]
     check_finite("--threshold", *limits)
-    given = {"--drones": (drones, DRONES), "--grid": (grid, GRID), "--group": (group, GROUP), "--mode": (mode, None)}
-    words = ["--methods", ",".join(names)] if names else []
-    words += [word for flag, (value, default) in given.items() if value != default for word in (flag, str(value))]
-    words += [word for limit in limits for word in ("--threshold", f"{limit:g}")]
-    request = choices.request("homomorphic", "compare-homomorphic", *words)
+    request = choices.request("homomorphic")
     board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
     if twice := sorted(board.keys() & request.overrides.keys()):
         raise UserError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
     request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
-    run_study("homomorphic", request, choices, mode, limits)
+    if choices.dry_run:
+        forecast_study("homomorphic", request, choices)
+    else:
+        run_study("homomorphic", request, choices, mode, limits)

@@ -16,14 +16,14 @@ _SEED_LIST = re.compile(r"\d+(\s*,\s*\d+)*\s*,?")
 
 
 def parse_count(value: str | int) -> int:
-    """Read a positive number of steps: 20000, 20_000, 500k, 1.5M, 2e6."""
+    """Read a positive number of steps, at most `MAX_STEPS`: 20000, 20_000, 500k, 1.5M, 2e6."""
     text = str(value).strip()
-    match = _COUNT.fullmatch(text)
+    match, how = _COUNT.fullmatch(text), "write for example 20000, 500k or 1.5M"
     if match is None:
-        raise UserError(f"'{text}' is not a number of steps; write for example 20000, 500k or 1.5M")
+        raise UserError(f"'{text}' is not a number of steps; {how}")
     count = Decimal(match["number"].replace("_", "")) * _MULTIPLIERS[match["letter"].lower()]
     if count != count.to_integral_value() or count < 1:
-        raise UserError(f"'{text}' is not a whole, positive number of steps; write for example 20000, 500k or 1.5M")
+        raise UserError(f"'{text}' is not a whole, positive number of steps; {how}")
     if count > MAX_STEPS:
         raise UserError(f"'{text}' is more than the {MAX_STEPS:.0e} steps that can be asked for; write for example 3M")
     return int(count)
@@ -35,12 +35,11 @@ def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
         return tuple(value)
     text = str(value).strip()
     if re.fullmatch(r"\d{1,9}", text):
-        count = int(text)
-        if not 1 <= count <= MAX_SEEDS:
+        if not 1 <= int(text) <= MAX_SEEDS:
             raise UserError(
                 f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one by --seed-list {text}"
             )
-        return tuple(range(count))
+        return tuple(range(int(text)))
     if not _SEED_LIST.fullmatch(text):
         raise UserError(f"'{text}' does not name seeds; write how many, as --seeds 10, or which, as --seed-list 3,7")
     seeds = parse_seed_list(text)
@@ -66,7 +65,7 @@ def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:
 def chosen_seeds(
     counted: tuple[int, ...] | None, named: tuple[int, ...] | None, default: tuple[int, ...]
 ) -> tuple[int, ...]:
-    """Return the seeds that `--seeds` and `--seed-list` ask for."""
+    """Return the seeds that `--seeds` or `--seed-list` asks for."""
     if named is not None and counted is not None:
         raise UserError("--seeds and --seed-list both say which seeds to train; leave one of them out")
     return counted or named or default

@@ -31,15 +31,11 @@ def discover(
     task: Annotated[
         str | None,
         typer.Option(
-            "--task",
-            "-t",
-            help="Task whose layout the transitions of a file have, or a run's own module:Class.",
-            metavar="TASK",
+            "--task", "-t", help="Task whose layout the transitions of a file have, or a run's own module:Class."
         ),
     ] = None,
     transforms: Annotated[
-        str | None,
-        typer.Option("--transforms", help="Elements to try, as d8; by default many.", metavar="LIST"),
+        str | None, typer.Option("--transforms", help="Elements to try, as d8; by default many.")
     ] = None,
     settings: TaskSetOption = None,
     logs: Annotated[

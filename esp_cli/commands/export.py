@@ -41,10 +41,7 @@ def export(
     formats: Annotated[
         list[str],
         typer.Option(
-            "--format",
-            "-f",
-            help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy: bundle it.",
-            metavar="FORMAT",
+            "--format", "-f", help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy: bundle it."
         ),
     ],
     out: OutOption,

@@ -146,9 +146,7 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     return path
 
 
-TaskOption = Annotated[
-    str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")
-]
+TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.")]
 OwnTaskOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -159,8 +157,7 @@ OwnTaskOption = Annotated[
     ),
 ]
 AlgoOption = Annotated[
-    str,
-    typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.", metavar="ALGO"),
+    str, typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.")
 ]
 OwnAlgoOption = Annotated[
     list[str] | None,
@@ -180,8 +177,7 @@ OwnNetworkOption = Annotated[
 PresetOption = Annotated[
     str,
     typer.Option(
-        "--preset",
-        help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings).",
+        "--preset", help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings)."
     ),
 ]
 StepsOption = Annotated[
@@ -218,21 +214,17 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
             parser=_option_parser(parse_seed_list, "SEEDS"),
         ),
     ]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.", metavar="PATH")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.")]
 Device = Literal["auto", "cpu", "cuda"]
 NoCheckOption = Annotated[
     bool, typer.Option("--no-check", help="Leave out the short look, of 2 s, at a task that is not built in.")
 ]
-DeviceOption = Annotated[
-    Device,
-    typer.Option("--device", help="cpu, cuda, or auto: a GPU if there is one."),
-]
+DeviceOption = Annotated[Device, typer.Option("--device", help="cpu, cuda, or auto: a GPU if there is one.")]
 JsonOption = Annotated[
     str | None,
     typer.Option(
         "--json",
         help="Also write the result as JSON to this file; - writes it to standard output instead.",
-        metavar="FILE",
         callback=not_over_a_run,
     ),
 ]
@@ -251,15 +243,12 @@ TaskSetOption = Annotated[
     ),
 ]
 PhysicsOption = Annotated[
-    str | None,
-    typer.Option("--physics", help="Short for --set task.physics=NAME: mujoco, mujoco-3d, pymunk.", metavar="NAME"),
+    str | None, typer.Option("--physics", help="Short for --set task.physics=NAME: mujoco, mujoco-3d, pymunk.")
 ]
 TransformsOption = Annotated[
     str | None,
     typer.Option(
-        "--transforms",
-        help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses, or discovered.",
-        metavar="LIST",
+        "--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses, or discovered."
     ),
 ]
 PolicyArgument = Annotated[
@@ -275,7 +264,6 @@ BundledAlgoOption = Annotated[
         "--algo",
         "-a",
         help="Choose the bundled policy that this algorithm trained; or import module:Class, which trained the run.",
-        metavar="ALGO",
     ),
 ]
 BundledPriorOption = Annotated[

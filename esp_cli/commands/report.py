@@ -43,18 +43,18 @@ OutOption = Annotated[
     Path | None,
     typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
 ]
-_FILE = {"metavar": "FILE", "callback": not_over_a_run}
 ResultsOption = Annotated[
     Path | None,
-    typer.Option("--results", help="Also write every seed's numbers and the configurations as JSON.", **_FILE),
+    typer.Option(
+        "--results", help="Also write every seed's numbers and the configurations as JSON.", callback=not_over_a_run
+    ),
 ]
 AtOption = Annotated[
     list[str] | None,
     typer.Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
 ]
 ReferenceOption = Annotated[
-    list[str] | None,
-    typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE"),
+    list[str] | None, typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE")
 ]
 ThresholdOption = Annotated[
     list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
@@ -67,9 +67,10 @@ LimitsOption = Annotated[
     typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
 ]
 CsvOption = Annotated[
-    Path | None, typer.Option("--csv", help="Write every logged number of every seed as a table.", **_FILE)
+    Path | None,
+    typer.Option("--csv", help="Write every logged number of every seed as a table.", callback=not_over_a_run),
 ]
-PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.", metavar="FILE")]
+PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")]
 
 
 def report(
@@ -120,7 +121,14 @@ def report(
             print_tables(material.results)
 
     console.result(json, material.results.document(statistics=True), show)
-    _write(material, out, films, results, csv)
+    if csv is not None:
+        from esp_cli.reporting.page import write_csv
+
+        console.note(f"{write_csv(csv, material)} rows -> {csv}")
+    _write_page(material, out, films)
+    if results is not None:
+        console.write_json(results, material.results.document())
+        console.note(f"results -> {results}")
     if plot is not None:
         from esp_cli.reporting.study_figures import draw_curves
 
@@ -141,8 +149,7 @@ def _side_by_side(
     runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: Mode | None, out: Path | None
 ) -> Material:
     """Read runs that are given by hand, each as PATH or LABEL=PATH."""
-    from esp_cli.reporting.collect import collect_runs
-    from esp_cli.reporting.curves import read_curve
+    from esp_cli.reporting.collect import collect_runs, read_curve
 
     steps, curves = [parse_count(text) for text in at], []
     for text in runs:
@@ -169,13 +176,9 @@ def threshold_words(thresholds: Sequence[float]) -> list[str]:
     return [word for limit in thresholds for word in ("--threshold", repr(limit).removesuffix(".0"))]
 
 
-def _write(material: Material, out: Path | None, films: bool, small: Path | None, csv: Path | None) -> None:
-    """Write what was asked for beside the tables."""
-    from esp_cli.reporting.exports import write_csv
+def _write_page(material: Material, out: Path | None, films: bool) -> None:
     from esp_cli.reporting.page import draw_films, write_report
 
-    if csv is not None:
-        console.note(f"{write_csv(csv, material)} rows -> {csv}")
     if films:
         with console.TrainingProgress(len(material.runs), description="draw") as progress:
             draw_films(material.runs, progress.update)
@@ -184,9 +187,6 @@ def _write(material: Material, out: Path | None, films: bool, small: Path | None
             console.note(f"report -> {file}")
     elif out is not None:
         console.note("no run has an evaluation yet, so there is nothing to draw")
-    if small is not None:
-        console.write_json(small, material.results.document())
-        console.note(f"results -> {small}")
 
 
 def _labelled(text: str) -> tuple[str | None, Path]:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from esp_cli.commands.study_options import StudyChoices, study_command
-from esp_cli.commands.studying import run_study
+from esp_cli.commands.studying import run_or_forecast
 
 EPILOG = """Examples:\n
     esp reproduce table1 --dry-run\n
@@ -25,4 +25,4 @@ def reproduce(
     choices: StudyChoices,
 ) -> None:
     """Train, evaluate and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    run_study(table, choices.request(table, "reproduce", table), choices)
+    run_or_forecast(table, choices.request(table), choices)

@@ -14,13 +14,8 @@ from esp_cli import console
 def stop_requests(sentence: str) -> Iterator[list[int]]:
     """Turn the first Ctrl-C (or SIGTERM, or the SIGHUP of a closed terminal) into a request; a second one interrupts.
 
-    A SIGHUP that `nohup` ignores stays ignored.
-
-    Args:
-        sentence: what the first one is answered with.
-
-    Yields:
-        A list that is empty until the request comes.
+    A SIGHUP that `nohup` ignores stays ignored. The list that is yielded is empty until the request comes, which is
+    answered with the sentence.
     """
     requests: list[int] = []
 

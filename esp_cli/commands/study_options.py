@@ -6,8 +6,8 @@ import copy
 import functools
 import inspect
 import shlex
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -32,8 +32,6 @@ from esp_envs.errors import UserError
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
 
-DEFAULT_PRESET = "default"
-
 
 def _changed(annotation: Any, **changes: object) -> Any:
     """Return an annotation whose option of typer has other attributes."""
@@ -50,13 +48,10 @@ else:
 
 TasksOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's.", metavar="TASK"
-    ),
+    typer.Option("--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's."),
 ]
 AlgosOption = Annotated[
-    list[str] | None,
-    typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's.", metavar="ALGO"),
+    list[str] | None, typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's.")
 ]
 StudyStepsOption = Annotated[
     list[str] | None,
@@ -68,9 +63,7 @@ StudyStepsOption = Annotated[
         metavar="STEPS",
     ),
 ]
-StudyOutOption = Annotated[
-    Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.", metavar="DIR")
-]
+StudyOutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.")]
 JobsOption = Annotated[
     int | None,
     typer.Option("--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."),
@@ -84,7 +77,6 @@ AddressOption = Annotated[
     typer.Option(
         "--address",
         help="Of the Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a cluster of this machine.",
-        metavar="ADDRESS",
     ),
 ]
 GpuShareOption = Annotated[
@@ -99,7 +91,6 @@ ReuseOption = Annotated[
         "--reuse",
         help="Take finished runs of the same configuration from this study instead of training them again; may be "
         "repeated.",
-        metavar="STUDY",
     ),
 ]
 
@@ -107,9 +98,7 @@ ReuseOption = Annotated[
 def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
     """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix").
 
-    Args:
-        items: as the option was given.
-        known: names that may have ", " in them; of those that fit, the longest is taken.
+    Names that are `known` may have ", " in them; of those that fit, the longest is taken.
     """
     names: list[str] = []
     for item in items or ():
@@ -133,7 +122,7 @@ def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, in
     return tuple(dict.fromkeys(found)) or None
 
 
-@dataclass(frozen=True)
+@dataclass
 class StudyChoices:
     """The options that all study commands share: annotations hold flags and help, values what was given."""
 
@@ -143,7 +132,7 @@ class StudyChoices:
     seeds: StudySeedsOption = None
     seed_list: SeedListOption = None
     out: StudyOutOption = None
-    preset: PresetOption = DEFAULT_PRESET
+    preset: PresetOption = "default"
     settings: SetOption = None
     device: DeviceOption = "cpu"
     episodes: EpisodesOption = EPISODES
@@ -155,11 +144,7 @@ class StudyChoices:
     reuse: ReuseOption = None
     no_check: NoCheckOption = False
     json: JsonOption = None
-
-    @property
-    def all_seeds(self) -> tuple[int, ...]:
-        """The seeds of every run."""
-        return chosen_seeds(self.seeds, self.seed_list, STUDY_SEEDS)
+    words: Sequence[str] = field(init=False, default=())  # the command without these options: "reproduce", "table1"
 
     def folder(self, kind: str) -> Path:
         """Return the study folder of a kind of study."""
@@ -167,64 +152,60 @@ class StudyChoices:
 
     def running_words(self) -> str:
         """Return the options that say how the study is run and not what, as the end of a command line."""
-        words = [] if self.jobs is None else ["--jobs", str(self.jobs)]
-        words += [word for path in self.reuse or () for word in ("--reuse", str(path))]
-        words += [] if self.engine == "local" else ["--engine", self.engine]
-        words += ["--address", self.address] if self.address is not None else []
-        words += ["--gpu-share", f"{self.gpu_share:g}"] if self.gpu_share != 1.0 else []
-        words += ["--no-check"] if self.no_check else []
-        return "".join(f" {word}" for word in map(shlex.quote, words))
+        words = self._given("jobs", "reuse", "engine", "address", "gpu_share", "no_check")
+        return "".join(f" {shlex.quote(word)}" for word in words)
 
-    def device_of_runs(self) -> str:
-        """Return the device on which the runs train; that of a cluster need not be here."""
+    def _given(self, *names: str) -> list[str]:
+        shared = inspect.signature(StudyChoices, eval_str=True).parameters
+        return _words({name: shared[name] for name in names}, vars(self))
+
+    def request(self, kind: str) -> Request:
+        """Return what a study of a kind is asked for."""
         from esp_cli.machine import resolve_device
-
-        return "cuda" if (self.engine, self.device) == ("ray", "cuda") else resolve_device(self.device)
-
-    def request(self, kind: str, *words: str) -> Request:
-        """Return what a study is asked for.
-
-        Args:
-            kind: of the study.
-            words: the command without these options, such as "reproduce", "table1".
-        """
         from esp_cli.studies.catalogue import Request
 
         overrides = parse_assignments(self.settings or [])
         register_named(parse_names(self.tasks), parse_names(self.algos), [overrides.get("network.name")])
+        asked = self._given("tasks", "algos", "steps", "seeds", "seed_list", "preset", "settings", "device", "episodes")
+        on_cluster = (self.engine, self.device) == ("ray", "cuda")  # whose GPU need not be here
         return Request(
             tasks=parse_names(self.tasks),
             algorithms=parse_names(self.algos),
             steps=parse_study_steps(self.steps),
-            seeds=self.all_seeds,
+            seeds=chosen_seeds(self.seeds, self.seed_list, STUDY_SEEDS),
             preset=self.preset,
             overrides=overrides,
-            device=self.device_of_runs(),
+            device="cuda" if on_cluster else resolve_device(self.device),
             episodes=self.episodes,
-            command=shlex.join(["esp", *words, *self._options(), "--out", str(self.folder(kind))]),
+            command=shlex.join(["esp", *self.words, *asked, "--out", str(self.folder(kind))]),
         )
 
-    def _options(self) -> list[str]:
-        """Return the options that decide what is run, in the form in which they are written."""
-        from esp_cli.training.config import seed_words
 
-        words: list[str] = []
-        for flag, items in (("--tasks", self.tasks), ("--algos", self.algos), ("--steps", self.steps)):
-            names = parse_names(items)
-            words += [flag, ",".join(names)] if names else []
-        words += seed_words(self.all_seeds) if self.all_seeds != STUDY_SEEDS else []
-        words += ["--preset", self.preset] if self.preset != DEFAULT_PRESET else []
-        words += [word for item in self.settings or [] for word in ("--set", item)]
-        words += ["--device", self.device] if self.device != "cpu" else []
-        return words + (["--episodes", str(self.episodes)] if self.episodes != EPISODES else [])
+def _words(parameters: Mapping[str, inspect.Parameter], values: Mapping[str, Any]) -> list[str]:
+    """Return the parameters of a command that are not at their defaults, as its command line has them."""
+    from esp_cli.training.config import seed_words
+
+    words = list[str]()
+    for name, parameter in parameters.items():
+        value, option = values[name], get_args(parameter.annotation)[1]
+        flags = [flag for flag in (option.default, *(option.param_decls or ())) if str(flag).startswith("-")]
+        if value == parameter.default:
+            continue
+        if name in ("seeds", "seed_list"):
+            words += seed_words(value)
+            continue
+        flag = [max(flags, key=len)] if flags else []
+        if value is True:
+            words += flag
+            continue
+        words += [word for item in (value if isinstance(value, list) else [value]) for word in (*flag, str(item))]
+    return words
 
 
 def study_command(command: Callable[..., None] | None = None, **helps: str) -> Callable[..., Any]:
     """Give a command an option for each field of its parameter `choices: StudyChoices`, where typer looks for them.
 
-    Args:
-        command: the command; without one, a decorator comes back.
-        helps: by the name of a field, the help of an option that means something else in this command.
+    `helps` has, by the name of a field, the help of an option that means something else in this command.
     """
     if command is None:
         return lambda given: study_command(given, **helps)
@@ -238,7 +219,9 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     @functools.wraps(command)
     def with_options(**given: Any) -> None:
         arguments = {name: given.pop(name) for name in own}
-        command(choices=StudyChoices(**given), **arguments)
+        choices = StudyChoices(**given)
+        choices.words = [command.__name__.replace("_", "-"), *_words(own, arguments)]
+        command(choices=choices, **arguments)
 
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}

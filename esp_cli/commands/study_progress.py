@@ -20,24 +20,18 @@ _SAID = {"training": "training", "evaluating": "evaluating", "elsewhere": "waiti
 
 
 class StudyProgress:
-    """Shows snapshots of a scheduler.
-
-    Args:
-        clock: seconds; of a test.
-    """
+    """Shows snapshots of a scheduler; a test has a clock of its own."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+        self._clock, self._last_line_s = clock, -math.inf
         self._seen: dict[str, str] = {}
         self._bars: dict[str, TaskID] = {}
-        self._last_line_s = -math.inf
         self._live: Progress | None = None
 
     def __enter__(self) -> StudyProgress:
-        self._live = console.live_progress()
-        if self._live is not None:
-            self._total = self._live.add_task("whole study", total=1.0, status=[])
-            self._live.start()
+        if (live := console.live_progress()) is not None:
+            self._total, self._live = live.add_task("whole study", total=1.0, status=[]), live
+            live.start()
         return self
 
     def __exit__(self, *_: object) -> None:

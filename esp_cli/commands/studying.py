@@ -47,60 +47,46 @@ class Resources:
 
 @contextmanager
 def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Resources]:
-    """Yield what a study is run with.
-
-    Args:
-        choices: how the study is run.
-        out: its folder.
-        device: of its runs.
-    """
+    """Yield what a study in the folder `out` is run with, whose runs train on a device."""
+    from esp_cli.studies.engine import LocalEngine
     from esp_cli.studies.study import StudyFolder
 
-    reused = [StudyFolder.open(path) for path in choices.reuse or ()]
-    with _open_engine(choices, out) as engine:
-        yield Resources(engine, choices.jobs or engine.places(device), reused, not choices.no_check)
-
-
-@contextmanager
-def _open_engine(choices: StudyChoices, out: Path) -> Iterator[Engine]:
-    from esp_cli.studies.engine import LocalEngine
-
+    reused, check = [StudyFolder.open(path) for path in choices.reuse or ()], not choices.no_check
     if choices.engine == "local":
         if choices.address is not None:
             raise UserError("--address is that of a Ray cluster; add --engine ray, or leave it out")
         if choices.gpu_share != 1.0:
             raise UserError("--gpu-share is for GPUs of a Ray cluster; add --engine ray, or leave it out")
-        yield LocalEngine()
+        local = LocalEngine()
+        yield Resources(local, choices.jobs or local.places(device), reused, check)
         return
     try:
         from esp_cli.studies.engine_ray import RayEngine
     except ImportError:
         raise UserError(f"Ray is not installed: {install('cluster')}, or use --engine local") from None
     with RayEngine(out, choices.address, choices.gpu_share) as engine:
-        yield engine
+        yield Resources(engine, choices.jobs or engine.places(device), reused, check)
+
+
+def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
+    """Run a study of a kind of `studies.kinds`, or say what that costs, where only that was asked for."""
+    (forecast_study if choices.dry_run else run_study)(kind, request, choices)
 
 
 def run_study(
     kind: str, request: Request, choices: StudyChoices, mode: Mode | None = None, thresholds: Sequence[float] = ()
 ) -> None:
-    """Plan a study, run it, and report it; or say what that costs, where only that was asked for.
+    """Plan a study, run it, and report it.
 
-    Args:
-        kind: of `studies.kinds`.
-        request: what the user asks for.
-        choices: how it is run.
-        mode: which evaluations the tables state; by default those of this kind of study.
-        thresholds: returns whose first passing the tables state, likewise.
+    The tables state evaluations of the mode, and thresholds whose first passing is looked for: by default those of this
+    kind of study.
     """
     from esp_cli.studies.catalogue import plan, refuse_untrainable, without_effect
     from esp_cli.studies.study import StudyFolder
 
     out, study = choices.folder(kind), plan(kind, request)
-    note_without_effect(without_effect(kind, request))
-    if choices.dry_run:
-        _forecast_study(study, choices, out)
-        return
     refuse_untrainable(study)
+    note_without_effect(without_effect(kind, request))
     with (
         open_resources(choices, out, study.cells[0].config.device) as resources,
         StudyFolder.held(out),
@@ -116,15 +102,18 @@ def run_study(
     refuse_failed(failed, out)
 
 
-def _forecast_study(study: Study, choices: StudyChoices, out: Path) -> None:
+def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
     """Say what a study costs; what the study itself would refuse before its first run is refused."""
-    from esp_cli.studies.forecast import forecast_study
+    from esp_cli.studies import forecast
+    from esp_cli.studies.catalogue import plan, without_effect
     from esp_cli.studies.study import StudyFolder
 
+    out, study = choices.folder(kind), plan(kind, request)
+    note_without_effect(without_effect(kind, request))
     with open_resources(choices, out, study.cells[0].config.device) as resources:
         StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
         with measuring(len(study.cells)) as listener:
-            found = forecast_study(StudyFolder(out, study), resources.reused, resources.jobs, listener)
+            found = forecast.forecast_study(StudyFolder(out, study), resources.reused, resources.jobs, listener)
     print_forecast(found, choices.json, f"{sum(run.status != 'finished' for run in found.runs)} runs to do")
 
 
@@ -171,15 +160,10 @@ def print_forecast(found: Forecast, json: str | None, what: str) -> None:
 
 
 def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests: Sequence[int]) -> list[str]:
-    """Run the cells of a study; return the names of those that failed.
+    """Run the cells of a study in its folder, which the caller's lock holds; return the names of those that failed.
 
-    Of cells that train the same, the first is run, and the others take its run over.
-
-    Args:
-        folder: of the study, held by the caller's lock.
-        study: the cells that are wanted.
-        resources: what they are run with.
-        requests: not empty once the user asks to stop.
+    Of cells that train the same, the first is run, and the others take its run over. `requests` is not empty once the
+    user asks to stop.
     """
     from esp_cli.studies.scheduler import Scheduler
 
@@ -195,10 +179,10 @@ def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests:
 
 def follow(scheduler: Scheduler, requests: Sequence[int]) -> list[str]:
     """Run a scheduler with live progress until all runs have ended; return the names of those that failed."""
-    finished = sum(run.status == "finished" for run in scheduler.runs)
+    finished, folder = sum(run.status == "finished" for run in scheduler.runs), scheduler.folder
     console.note(
-        f"{scheduler.folder.title}: {len(scheduler.runs)} runs, {finished} of them finished, {scheduler.jobs} side by "
-        f"side -> {scheduler.folder.path}"
+        f"{folder.title}: {len(scheduler.runs)} runs, {finished} of them finished, {scheduler.jobs} side by side -> "
+        f"{folder.path}"
     )
     with StudyProgress() as progress:
 

@@ -70,18 +70,13 @@ def train(
         typer.Option(
             "--network",
             help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn), equivariant, or module:Class.",
-            metavar="NETWORK",
         ),
     ] = None,
     steps: StepsOption = STEPS,
     seeds: SeedsOption = None,
     seed_list: SeedListOption = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.", metavar="PATH")
-    ] = None,
-    resume: Annotated[
-        Path | None, typer.Option("--resume", help="Continue this run with its own settings.", metavar="RUN")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.")] = None,
+    resume: Annotated[Path | None, typer.Option("--resume", help="Continue this run with its own settings.")] = None,
     device: DeviceOption = "cpu",
     settings: SetOption = None,
     config: Annotated[
@@ -89,7 +84,6 @@ def train(
         typer.Option(
             "--config",
             help="Take what no option says from a run, its config.json, or a JSON or TOML file with what differs.",
-            metavar="FILE",
         ),
     ] = None,
     print_config: Annotated[
@@ -108,7 +102,6 @@ def train(
         typer.Option(
             "--track",
             help="Give the metrics to tensorboard, wandb or mlflow too; repeatable. Offline, in the run folder.",
-            metavar="TRACKER",
         ),
     ] = None,
     no_check: NoCheckOption = False,

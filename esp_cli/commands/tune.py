@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -28,8 +28,8 @@ from esp_envs.installed import install
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
-    from esp_cli.studies.search import Outcome, Search
-    from esp_cli.studies.tuning import Goal, Tuning
+    from esp_cli.studies.search import Search
+    from esp_cli.studies.tuning import Outcome, Tuning
 
 EPILOG = """Examples:\n
     esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
@@ -50,16 +50,13 @@ def tune(
     budget: Annotated[int, typer.Option("--budget", min=1, help="Trials, for each prior.")] = 30,
     space: Annotated[
         Path | None,
-        typer.Option(
-            "--space", help="What to try, as JSON or TOML; by default a space for each algorithm.", metavar="FILE"
-        ),
+        typer.Option("--space", help="What to try, as JSON or TOML; by default a space for each algorithm."),
     ] = None,
     prior: Annotated[
         list[str] | None,
         typer.Option(
             "--prior",
             help="esp (the default), none, auto, augment, consistency, or several as esp,none; a search each.",
-            metavar="PRIOR",
         ),
     ] = None,
     goal: Annotated[
@@ -72,29 +69,15 @@ def tune(
     """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
-    words = ["--budget", str(budget), *(("--space", str(space)) if space else ()), "--prior", ",".join(priors)]
-    words += ["--for", goal, *(("--reach", repr(reach)) if reach is not None else ())]
-    words += ["--trial-seeds", str(trial_seeds)]
-    request = choices.request("tune", "tune", *words)
-    tuning = _tuning(request, priors, budget, space, goal, reach, trial_seeds)
+    request = choices.request("tune")
+    tuning = _tuning(request, priors, space, trial_seeds, budget=budget, goal=goal, reach=reach)
     idle = frozenset.intersection(*map(tuning.without_effect, priors))
     note_without_effect([name for name in tuning.overrides if name in idle])
-    if choices.dry_run:
-        _forecast(tuning, request, choices)
-    else:
-        _tune(tuning, request, choices)
+    (_forecast if choices.dry_run else _tune)(tuning, request, choices)
 
 
-def _tuning(
-    request: Request,
-    priors: Sequence[str],
-    budget: int,
-    space: Path | None,
-    goal: Goal,
-    reach: float | None,
-    trial_seeds: int,
-) -> Tuning:
-    """Return what is asked for."""
+def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, **goal: Any) -> Tuning:
+    """Return what is asked for; one task and one algorithm."""
     from esp_cli.algorithms.registry import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
@@ -117,9 +100,7 @@ def _tuning(
         algorithm=algorithm,
         preset=request.preset,
         priors=tuple(priors),
-        budget=budget,
-        goal=goal,
-        reach=reach,
+        **goal,
         steps=steps,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
         overrides={task_setting(name, task): value for name, value in request.overrides.items()},

@@ -9,10 +9,15 @@ from __future__ import annotations
 import json
 import math
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 
+from rich import box
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
 from rich.text import Text
 
 from esp_cli.console.progress import TrainingProgress as TrainingProgress
@@ -26,7 +31,6 @@ from esp_cli.console.streams import out as out
 from esp_cli.console.streams import paged as paged
 from esp_cli.console.streams import say as say
 from esp_cli.console.streams import text as text
-from esp_cli.console.tables import lay_out
 from esp_cli.files.formatting import escaped
 from esp_cli.files.formatting import format_count as format_count  # also console's
 from esp_cli.files.formatting import format_duration as format_duration  # also console's
@@ -35,19 +39,16 @@ from esp_cli.files.formatting import format_mean as format_mean  # also console'
 from esp_cli.files.formatting import format_span as format_span  # also console's
 from esp_cli.files.writing import write_file
 
+_LEAST_TEXT = 14  # columns that a longer text gets at least; narrower ones are hard to read
 PIPE_WIDTH = 200  # columns of a table written to a file or a pipe, which has no width of its own
 
 
 def table(
     columns: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None, caption: str | None = None
 ) -> None:
-    """Print a table on standard output.
+    """Print a table on standard output, with a title above and a caption below.
 
-    Args:
-        columns: headings; a heading that ends in ">" (which is cut off) is aligned to the right.
-        rows: one sequence of cells per row; each cell is printed as `str(cell)`.
-        title: line above, such as what was measured.
-        caption: line below, such as the reward convention.
+    A heading that ends in ">" (which is cut off) is aligned to the right; cells are printed as `str(cell)`.
     """
     target = out if out.is_terminal else SafeConsole(highlight=False, width=PIPE_WIDTH)
     laid = lay_out(columns, [[escaped(str(cell)) for cell in row] for row in rows], target)
@@ -57,6 +58,43 @@ def table(
         target.print(part)
     if caption:
         target.print(Text(caption, style="dim"), soft_wrap=not out.is_terminal)
+
+
+def lay_out(columns: Sequence[str], rows: Sequence[Sequence[str]], console: Console) -> list[Table | Text]:
+    """Return what to print so that no line is longer than the console is wide and no name or number is cut.
+
+    A heading that ends in ">" is of numbers; the first column holds names. Where no table fits, each cell has a line.
+    """
+    plain = {"box": box.SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0), "pad_edge": False}
+    for style in ({}, plain):
+        table = Table(header_style="bold", **style)  # type: ignore[arg-type] # of several kinds
+        for k, heading in enumerate(columns):
+            name, fixed = heading.removesuffix(">"), heading.endswith(">") or k == 0
+            natural = max(map(len, (*([] if fixed else [name]), *(row[k] for row in rows))), default=1)
+            least = natural if fixed else min(_LEAST_TEXT, natural)
+            right = heading.endswith(">")
+            table.add_column(
+                Text(name), justify="right" if right else "left", min_width=least, no_wrap=fixed, overflow="fold"
+            )
+        for row in rows:
+            table.add_row(*map(Text, row))
+        if Measurement.get(console, console.options.update_width(10_000), table).minimum <= console.width:
+            return [table]
+    return list(_blocks([heading.removesuffix(">") for heading in columns], rows, console.width))
+
+
+def _blocks(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[Text]:
+    """Return every row as a name with a line per cell below it."""
+    lines, label = [], max(map(len, headings[1:]), default=0)
+    for name, *cells in rows:
+        lines.append(Text(name, style="bold"))
+        for heading, cell in zip(headings[1:], cells, strict=True):
+            text, indent = f"  {heading:<{label}}  {cell}", " " * (label + 4)
+            wrapped = textwrap.wrap(
+                text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+            )
+            lines += map(Text, wrapped)
+    return lines
 
 
 def result(json: str | None, value: object, show: Callable[[], object]) -> None:
@@ -72,14 +110,8 @@ def result(json: str | None, value: object, show: Callable[[], object]) -> None:
 def write_json(path: str | Path, value: object) -> None:
     """Write a value as JSON, to standard output where `path` is "-".
 
-    Numbers that JSON does not know (NaN, infinities) become null. See `write_file` for links and devices.
-
-    Args:
-        path: a file (missing folders are created) or "-".
-        value: dicts, sequences, numbers, texts; also arrays, tensors, dataclasses, pydantic models and paths.
-
-    Raises:
-        OSError: the file cannot be written.
+    Numbers that JSON does not know (NaN, infinities) become null; arrays, tensors, dataclasses, models and paths are
+    taken too. See `write_file` for links and devices.
     """
     shown = str(path) == "-"  # in ASCII, which every terminal shows and no control character leaves
     text = json.dumps(_plain(value), indent=2, ensure_ascii=shown, allow_nan=False) + "\n"

@@ -21,11 +21,7 @@ _WIDEST_BAR = 40
 def progress_line(description: str, share: float, status: Sequence[str], width: int) -> str:
     """Return a line of at most `width` characters; what matters least goes first.
 
-    Args:
-        description: what is computed.
-        share: of it that is done, for the bar.
-        status: what to say, most important first: the first two stay, then come description, bar and the rest.
-        width: of the terminal.
+    The first two items of the status stay; then come description, bar (the share that is done) and the other items.
     """
     shown = "  ".join(status[:2])
     head = f"{description} " if len(description) + 1 + len(shown) <= width else ""
@@ -102,12 +98,7 @@ class TrainingProgress:
             self._print_line()
 
     def update(self, done: int, metrics: Mapping[str, float] | None = None) -> None:
-        """Tell that `done` of the `total` steps per seed are behind us.
-
-        Args:
-            done: steps per seed so far, those before a resume included.
-            metrics: the latest values to show beside the bar; earlier ones stay until a new value is told.
-        """
+        """Tell that `done` of the `total` steps per seed are done, and the latest values to show beside the bar."""
         now = self._clock()
         self._done = done
         self._metrics.update(metrics or {})

@@ -11,12 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from esp_cli.defaults import SLOWEST
 from esp_cli.drawing.figures import summary
-from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, write_gif, write_mp4, write_png
-from esp_cli.drawing.frames import frame
+from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, beside, frame, write_gif, write_mp4, write_png
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode, Moment, framed, record
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
@@ -34,12 +31,7 @@ _SAMPLED_FRAMES = 8  # frames that the palette of a GIF is made for
 
 @dataclass(frozen=True)
 class Request:
-    """How a policy is drawn, and into what.
-
-    Raises:
-        UserError: another ending, no such view, no episodes, no speed, or what a picture does not have.
-        OSError: the file is a folder.
-    """
+    """How a policy is drawn, and into what."""
 
     out: Path  # a .gif or .mp4 for a film, a .png for a picture of one episode
     seed: int | None = None  # whose policy acts; by default the first
@@ -112,7 +104,8 @@ def draw(
         flat = isinstance(painter, TopPainter)
         recorded = record(acting, 1 if request.kind == PICTURE else request.episodes, request.greedy)
         recorded = framed(recorded) if flat else recorded
-        every = stride(spec.control_period_s, request.speed, request.rate)
+        # steps from one frame to the next: the fewest that keep to the frame rate
+        every = max(1, math.ceil(request.speed / (spec.control_period_s * request.rate) - 1e-9))
         taken = shots(recorded, every, spec.control_period_s, spec.name, titles)
         if request.kind != PICTURE:
             report = watch or (lambda *_: None)
@@ -121,7 +114,7 @@ def draw(
         elif flat:
             shown = zip(recorded, titles, strict=True)
             figures = [summary(own[0], title or spec.name, request.size, spec.control_period_s) for own, title in shown]
-            write_png(request.out, _beside(figures))
+            write_png(request.out, beside(figures, 0))
         else:
             write_png(request.out, taken[-1].draw(painter))
     steps = sum(episode.steps for episode in recorded[0])
@@ -141,25 +134,12 @@ def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[Trained
     return [policy.single_seed(seed) for policy, seed in zip(policies, seeds, strict=True)]
 
 
-def _beside(figures: Sequence[Frame]) -> Frame:
-    """Put figures side by side; a strip is as high as its episode is long."""
-    height = max(map(len, figures))
-    padded = [np.pad(f, ((0, height - len(f)), (0, 0), (0, 0)), constant_values=255) for f in figures]
-    return np.concatenate(padded, axis=1)
-
-
 @contextmanager
 def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
-    """Open what draws this task.
+    """Open what draws this task, with scenes of `size` pixels along the longer side.
 
-    Args:
-        env: the task.
-        view: "top" is the view from above, "3d" the task's own view in space, "auto" the latter where there is one and
-            the machine can draw it (else the painter's note says why not).
-        size: of the longer side, pixels.
-
-    Raises:
-        UserError: "3d", and the task has no view in space or the machine cannot draw it.
+    "top" is the view from above, "3d" the task's own view in space, "auto" the latter where there is one and this
+    machine can draw it; else the painter's note says why not.
     """
     own = None if view == "top" else env.painter(size)
     if own is None and view == "3d":
@@ -188,11 +168,6 @@ class Shot:
     def draw(self, painter: Painter) -> Frame:
         """Draw the moments with caption, axes and legend."""
         return frame(painter, self.moments, self.caption, self.time_s)
-
-
-def stride(control_period_s: float, speed: float, frames_per_second: float) -> int:
-    """Return the number of steps from one frame to the next: the smallest that keeps to the frame rate."""
-    return max(1, math.ceil(speed / (control_period_s * frames_per_second) - 1e-9))
 
 
 def shots(
@@ -225,14 +200,9 @@ def shots(
 def write_film(
     path: Path, painter: Painter, taken: Sequence[Shot], step_s: float, watch: Callable[[int], None]
 ) -> None:
-    """Draw a film and write it as an MP4 where the file is named so, else as a GIF.
+    """Draw shots in their order and write them as an MP4 where the file is named so, else as a GIF.
 
-    Args:
-        path: where to.
-        painter: draws the shots.
-        taken: the shots, in their order.
-        step_s: how long one step is in view, s; the last of an episode is in view for longer.
-        watch: called with the number of drawn frames, after each.
+    A step is in view for `step_s` seconds, the last of an episode longer; `watch` is told how many frames are drawn.
     """
     ends = [*(after.time_s == 0 for after in taken[1:]), True]
     seconds = [shot.steps * step_s + HOLD_SECONDS * end for shot, end in zip(taken, ends, strict=True)]

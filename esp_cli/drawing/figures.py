@@ -14,8 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from PIL import Image
 
-from esp_cli.drawing.films import Frame
-from esp_cli.drawing.frames import Mark, marks
+from esp_cli.drawing.films import Frame, Mark, marks
 from esp_cli.drawing.recording import Episode
 from esp_envs.drawing import GRID, trails
 from esp_envs.scene import Body, Scene
@@ -28,16 +27,10 @@ _MARKERS = {"disc": "o", "ring": "o", "square": "s", "cross": "x"}
 
 
 def summary(episode: Episode, title: str, size: int, period_s: float) -> Frame:
-    """Draw an episode as one picture.
+    """Draw an episode, whose steps take `period_s` seconds, as one picture that is `size` pixels wide.
 
     Bodies that want to be covered get a map of their coverage; bodies without paths get a strip of their last steps;
     everything else gets its paths.
-
-    Args:
-        episode: what happened.
-        title: above the picture.
-        size: width of the picture, pixels.
-        period_s: of a step, s.
     """
     last = episode.scenes[-1]
     title = f"{title}, return {episode.returns[-1]:.1f}"

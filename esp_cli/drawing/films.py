@@ -1,12 +1,10 @@
-"""Films and pictures as files: GIF, MP4 and PNG, each written whole or not at all.
-
-imageio writes MP4 and PNG. The GIFs are made here: with one palette for a whole film, and without pixels that do not
-change, they are smaller than imageio's at the same fidelity.
-"""
+"""Frames of films with caption, axes and legend, and films and pictures as files, each written whole or not at all."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,12 +14,158 @@ import imageio.v3 as iio
 import numpy as np
 from imageio.v2 import get_writer
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import cKDTree
 
+from esp_cli.drawing.recording import Moment
 from esp_cli.files.writing import write_file
+from esp_envs.drawing import TopPainter
+from esp_envs.scene import Painter, Scene
 
 Frame = NDArray[np.uint8]
+LEAST_WIDTH = 200  # pixels; narrower pictures have no room for text
+_PAPER, _TEXT, _FAINT = "#ffffff", "#202020", "#606060"
+_FONT_SHARE, _LEAST_FONT = 1 / 37, 10  # height of letters against the width of a picture, and the smallest, pixels
+_BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6
+"""Height of a bar of text, height of the numbers below and width of those beside a picture, in letters."""
+_OVERSAMPLING = 3
+_GAP = 8  # pixels between two pictures
+
+
+@dataclass(frozen=True)
+class Mark:
+    """An entry of a legend; bodies of several colours have two of them in their mark."""
+
+    label: str
+    shape: str
+    colors: tuple[str, ...]
+
+
+def marks(scene: Scene) -> tuple[Mark, ...]:
+    """Return what the bodies of a scene are called, in their order."""
+    by_label: dict[str, Mark] = {}
+    for body in scene.bodies:
+        if body.label is not None:
+            known = by_label.get(body.label, Mark(body.label, body.shape, (body.color,)))
+            colors = tuple(dict.fromkeys((*known.colors, body.color)))[:2]
+            by_label[body.label] = Mark(body.label, known.shape, colors)
+    return tuple(by_label.values())
+
+
+def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float) -> Frame:
+    """Draw one world, or two side by side, with axes, a legend, and a caption that ends with the time."""
+    pictures = [painter.draw(moment.scene, moment.scenes[:-1]) for moment in moments]
+    width = pictures[0].shape[1]
+    if width < LEAST_WIDTH:
+        return beside(pictures, 0)
+    size, flat = max(_LEAST_FONT, round(width * _FONT_SHARE)), isinstance(painter, TopPainter)
+    if flat:
+        pictures = [_with_axes(picture, moment.scene, size) for picture, moment in zip(pictures, moments, strict=True)]
+    time = f"{time_s:.1f} s"
+    if len(moments) > 1:
+        named = [_bar(p.shape[1], size, str(m.name), _total(m)) for p, m in zip(pictures, moments, strict=True)]
+        pictures = [np.concatenate(parts) for parts in zip(named, pictures, strict=True)]
+    else:
+        time = f"{time}, {_total(moments[0])}"
+    body = beside(pictures, _GAP)
+    scene = moments[0].scene
+    legend = _legend(marks(scene), body.shape[1], size, _scale(scene, flat))
+    return np.concatenate([_bar(body.shape[1], size, left, time), body, legend])
+
+
+def _total(moment: Moment) -> str:
+    return f"return {moment.total:.1f}"
+
+
+def _scale(scene: Scene, flat: bool) -> str:
+    if flat:
+        return f"axes in {scene.unit}" if scene.unit else ""
+    x_min, x_max, y_min, y_max = scene.window
+    return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
+
+
+def beside(pictures: Sequence[Frame], gap: int) -> Frame:
+    """Put pictures of any height side by side, with a gap in pixels between them."""
+    height = max(map(len, pictures))
+    margins = [(gap * (k > 0), height - len(picture)) for k, picture in enumerate(pictures)]
+    padded = [
+        np.pad(picture, ((0, below), (left, 0), (0, 0)), constant_values=255)
+        for picture, (left, below) in zip(pictures, margins, strict=True)
+    ]
+    return np.concatenate(padded, axis=1)
+
+
+@lru_cache(maxsize=8)
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+def _bar(width: int, size: int, left: str, right: str) -> Frame:
+    """Draw a line of text with its ends at both sides."""
+    image = Image.new("RGB", (width, round(_BAR * size)), _PAPER)
+    draw, middle = ImageDraw.Draw(image), image.height / 2
+    draw.text((size / 2, middle), left, _TEXT, _font(size), anchor="lm")
+    draw.text((width - size / 2, middle), right, _TEXT, _font(size), anchor="rm")
+    return np.asarray(image)
+
+
+@lru_cache(maxsize=8)
+def _legend(entries: tuple[Mark, ...], width: int, size: int, note: str) -> Frame:
+    """Draw marks with their labels, and a note at the right."""
+    fine = size * _OVERSAMPLING
+    image = Image.new("RGB", (width * _OVERSAMPLING, round(_BAR * size) * _OVERSAMPLING), _PAPER)
+    draw, font = ImageDraw.Draw(image), _font(fine)
+    x, y, r = fine / 2, image.height / 2, 0.4 * fine
+    for mark in entries:
+        _draw_mark(draw, mark, (x, y - r, x + 2 * r, y + r))
+        draw.text((x + 2.6 * r, y), mark.label, _TEXT, font, anchor="lm")
+        x += 2.6 * r + draw.textlength(mark.label, font) + fine
+    draw.text((image.width - fine / 2, y), note, _FAINT, font, anchor="rm")
+    return np.asarray(image.resize((width, image.height // _OVERSAMPLING), Image.Resampling.BOX))
+
+
+def _draw_mark(draw: ImageDraw.ImageDraw, mark: Mark, box: tuple[float, float, float, float]) -> None:
+    """Draw a mark into a box; two colours share a disc or a ring."""
+    left, top, right, bottom = box
+    first, second, thick = mark.colors[0], mark.colors[-1], round(0.18 * (right - left))
+    if mark.shape == "disc":
+        draw.pieslice(box, 90, 270, fill=first)
+        draw.pieslice(box, -90, 90, fill=second)
+    elif mark.shape == "ring":
+        draw.arc(box, 90, 270, fill=first, width=thick)
+        draw.arc(box, -90, 90, fill=second, width=thick)
+    elif mark.shape == "square":
+        draw.rectangle(box, fill=first)
+    else:
+        draw.line([(left, top), (right, bottom)], fill=first, width=thick)
+        draw.line([(left, bottom), (right, top)], fill=first, width=thick)
+
+
+def _with_axes(picture: Frame, scene: Scene, size: int) -> Frame:
+    """Add numbers at the left and below, where lines of the grid are or, of cells, their middles."""
+    x_min, x_max, y_min, y_max = scene.window
+    height, width = picture.shape[:2]
+    side, below = round(_SIDE * size), round(_TICKS * size)
+    image = Image.new("RGB", (width + side, height + below), _PAPER)
+    image.paste(Image.fromarray(picture), (side, 0))
+    draw, font, scale = ImageDraw.Draw(image), _font(size), width / (x_max - x_min)
+    for x in _ticks(x_min, x_max, scene.grid[0], scale, size):
+        place = min(side + (x - x_min) * scale, side + width - 0.8 * size)
+        draw.text((place, height + below / 2), f"{x:g}", _FAINT, font, anchor="mm")
+    for y in _ticks(y_min, y_max, scene.grid[0], scale, size):
+        place = min(max((y_max - y) * scale, 0.6 * size), height - 0.6 * size)
+        draw.text((side - 0.4 * size, place), f"{y:g}", _FAINT, font, anchor="rm")
+    return np.asarray(image)
+
+
+def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> list[float]:
+    """Return multiples of the spacing in a range, as dense as numbers fit."""
+    step = spacing
+    while step * scale < 3 * size:
+        step *= 2
+    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
+    return [k * step for k in range(first, last + 1)]
+
 
 GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
 _GIF_TICK_S = 0.01

@@ -5,28 +5,87 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from pydantic import JsonValue
+from numpy.typing import NDArray
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
 from esp_cli.files.formatting import format_exactly
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.statistics import area_under_curve, steps_to_threshold, summarise
-from esp_cli.reporting.curves import RunCurve, curve_of
-from esp_cli.reporting.results import CellResult, Results
-from esp_cli.reporting.summary import returns_of, summarised
+from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
-from esp_cli.studies.paper import reported
 from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study, StudyFolder, read_evaluation
+from esp_cli.training.build import spec_of
+from esp_cli.training.config import RunConfig
+from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import METRICS
-from esp_cli.training.metrics import NoMetricError, read_metrics
+from esp_cli.training.metrics import MetricsError, NoMetricError, column, elapsed_s, read_metrics
+from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
+from esp_envs.spec import TaskSpec
 
 _DIGITS = 4  # decimals that are kept of a return; the bootstrap and the tables need two
+
+
+@dataclass(frozen=True)
+class RunCurve:
+    """The evaluations of one run on the way."""
+
+    label: str  # its name in tables and pictures
+    config: RunConfig  # what was run
+    steps: NDArray[np.int64]  # [K] environment steps per seed
+    values: NDArray[np.float64]  # [K, S] returns; NaN where a seed stopped
+    seconds: float  # training time so far
+    path: Path  # the run folder
+    trained: int = 0  # environment steps per seed so far, where they are more than those of the last evaluation
+    task_version: int | None = None  # of the task that it was trained on; None where it is not known: that of today
+
+    @cached_property
+    def spec(self) -> TaskSpec:
+        """What the task says of itself, the convention of its returns among it; the version is that of the run."""
+        spec = spec_of(self.config.of_one_seed())
+        return spec if self.task_version is None else replace(spec, version=self.task_version)
+
+    @property
+    def last_step(self) -> int:
+        """Step of the last evaluation."""
+        return int(self.steps[-1])
+
+    def until(self, step: int) -> RunCurve | None:
+        """Return the curve up to the evaluation nearest to a step, or None where the run did not get there."""
+        if step > max(self.trained, self.last_step):
+            return None
+        end = int(np.abs(self.steps - step).argmin()) + 1
+        return replace(self, steps=self.steps[:end], values=self.values[:end])
+
+
+def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
+    """Read the evaluations of a run folder, which has to have one."""
+    folder = RunFolder.open(path)
+    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
+    rows = read_metrics(folder.metrics_path)
+    curve = _curve(rows, mode, path, label or name, parse_config(folder.config, path))
+    return replace(curve, task_version=folder.task_version())
+
+
+def _curve(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
+    """Return the evaluations among rows of metrics; NoMetricError where there is none yet."""
+    try:
+        steps, values = column(rows, f"eval/return_{mode}")
+    except MetricsError as error:
+        raise type(error)(f"{run / METRICS}: {error}") from None
+    if values.shape[1] != len(config.seeds):
+        raise UserError(
+            f"{run} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
+        )
+    trained = max((row["step"] for row in rows), default=0)
+    return RunCurve(label, config, steps, values, max(map(elapsed_s, rows), default=0.0), run, trained)
 
 
 @dataclass(frozen=True)
@@ -40,14 +99,13 @@ class Material:
 
 
 @dataclass(frozen=True)
-class RunState:
+class _State:
     """Where the run of a cell stands."""
 
     step: int  # environment steps per seed
     curve: RunCurve | None = None  # its evaluations, if there are any yet
-    final: FinalEvaluation | None = None  # the final evaluation of its policy, if there is one
-    # step at which a run put together with others by hand is compared; None for its final evaluation
-    at: int | None = None
+    final: FinalEvaluation | None = None  # of its policy, if there is one
+    at: int | None = None  # step at which runs put together by hand are compared; None for the final evaluation
 
 
 def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[float] = ()) -> Material:
@@ -63,10 +121,10 @@ def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Seq
         UserError: metrics or an evaluation are damaged, or have other seeds than the study.
     """
     study, kind = folder.study, kind_of(folder.study.kind)
-    runs = {cell.name: folder.run_path(cell) for cell in study.cells}
     mode = mode or kind.mode
     states = {cell.name: _state(folder, cell, mode) for cell in study.cells}
     curves = {name: state.curve for name, state in states.items() if state.curve is not None}
+    runs = {cell.name: folder.run_path(cell) for cell in study.cells}
     return Material(study, _results(study, states, mode, thresholds or kind.thresholds), curves, runs)
 
 
@@ -88,15 +146,13 @@ def collect_runs(
     """
     _refuse_unlike(curves)
     first, *_ = curves
-    steps = tuple(dict.fromkeys(at)) or (min(curve.last_step for curve in curves),)
     cells, states, by_name = [], {}, {}
-    for step in steps:
+    for step in tuple(dict.fromkeys(at)) or (min(curve.last_step for curve in curves),):
         for k, curve in enumerate(curves):
             name, reference = f"{k}-{curve.label}-{step}", f"0-{first.label}-{step}" if k else None
             panel = f"{curve.config.task}, {format_exactly(step)}"
             cells.append(Cell(name=name, panel=panel, variant=curve.label, config=curve.config, reference=reference))
-            states[name] = RunState(curve.last_step, curve, at=step)
-            by_name[name] = curve
+            states[name], by_name[name] = _State(curve.last_step, curve, at=step), curve
     study = Study(
         kind="runs",
         title=f"{' and '.join(curve.label for curve in curves)} on {first.config.task}",
@@ -125,8 +181,7 @@ def _refuse_unlike(curves: Sequence[RunCurve]) -> None:
         )
 
 
-def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> RunState:
-    """Read where the run of a cell stands."""
+def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
     run, final = folder.run_path(cell), None
     rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
     if folder.is_trained(cell) and (final := read_evaluation(run)) is not None:
@@ -134,13 +189,13 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> RunState:
         if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
     try:
-        curve = curve_of(rows, mode, run, cell.variant, cell.config)
+        curve = _curve(rows, mode, run, cell.variant, cell.config)
     except NoMetricError:  # it has only begun
         curve = None
-    return RunState(rows[-1]["step"] if rows else 0, curve, final)
+    return _State(rows[-1]["step"] if rows else 0, curve, final)
 
 
-def _results(study: Study, states: Mapping[str, RunState], mode: Mode, thresholds: Sequence[float]) -> Results:
+def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
     """Return the results of a study whose runs stand where these states say."""
     configs = {cell.name: dict(flat(cell.config.model_dump(mode="json"))) for cell in study.cells}
     first = next(iter(configs.values()))
@@ -148,56 +203,20 @@ def _results(study: Study, states: Mapping[str, RunState], mode: Mode, threshold
     cells = []
     for cell in study.cells:
         own = {key: value for key, value in configs[cell.name].items() if key not in shared}
-        cells.append(_cell(study, cell, states[cell.name], own, mode))
-    results = Results(
-        kind=study.kind,
-        title=study.title,
-        command=study.command,
-        esp_version=study.esp_version,
-        mode=mode,
-        rows=study.rows,
-        episodes=study.episodes,
-        config=shared,
-        cells=tuple(cells),
-    )
+        cells.append(_cell(study, cell, states[cell.name], mode).model_copy(update={"config": own}))
+    same = {name: getattr(study, name) for name in ("kind", "title", "command", "esp_version", "rows", "episodes")}
+    results = Results(**same, mode=mode, config=shared, cells=tuple(cells))
     timed = tuple(_timed(results, cell, states[cell.name].curve, thresholds) for cell in cells)
     return summarised(results.model_copy(update={"cells": timed}))
 
 
-def _cell(study: Study, cell: Cell, state: RunState, config: Mapping[str, JsonValue], mode: Mode) -> CellResult:
-    curve, number, kind = state.curve, reported(cell.paper), kind_of(study.kind)
+def _cell(study: Study, cell: Cell, state: _State, mode: Mode) -> CellResult:
+    """Return the result of a cell by its final evaluation, or at the step of comparison."""
+    curve, number, kind, final = state.curve, cell.reported, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
-    fields = _returns(study, cell, state, compared, mode)
-    if curve is not None:
-        fields["seconds"] = round(curve.seconds, 1)
-        if kind.breakings and (early := curve.until(cell.config.steps // 5)):
-            fields["early"] = _rounded(early.values[-1])
-    if "returns" in fields and compared is not None:
-        fields["evaluations"] = len(compared.steps)
-        if len(compared.steps) > 1:
-            fields["area_under_curve"] = _rounded(area_under_curve(compared.steps, compared.values))
-    if kind.network_cost and state.final is not None:
-        fields |= {"parameters": state.final.parameters, "flops_per_action": state.final.flops_per_action}
-    return CellResult(
-        name=cell.name,
-        panel=cell.panel,
-        variant=cell.variant,
-        reference=cell.reference,
-        paper=None if number is None else (number.mean, number.sem),
-        status="finished" if "returns" in fields else "unfinished" if curve is not None else "not run",
-        step=state.step,
-        at=state.at,
-        steps=cell.config.steps,
-        seeds=cell.config.seeds,
-        config=dict(config),
-        **fields,
-    )
-
-
-def _returns(study: Study, cell: Cell, state: RunState, compared: RunCurve | None, mode: Mode) -> dict[str, object]:
-    """Return the fields of a cell whose returns are known: by its final evaluation, or at the step of comparison."""
-    if (final := state.final) is not None:
-        return {
+    fields: dict[str, Any] = {}
+    if final is not None:
+        fields = {
             "esp_version": final.esp_version,
             "task_version": final.task_version,
             "convention": final.convention,
@@ -205,15 +224,29 @@ def _returns(study: Study, cell: Cell, state: RunState, compared: RunCurve | Non
             "anchors": {name: round(value, _DIGITS) for name, value in final.anchors.items()},
             "metrics": dict(zip(final.metrics, _rounded(final.metrics.values()), strict=True)),
         }
-    if compared is None or state.at is None:
-        return {}
-    return {
-        "esp_version": study.esp_version,
-        "task_version": compared.spec.version,
-        "convention": compared.spec.convention,
-        "episodes": cell.config.evaluation.episodes,
-        "returns": {mode: _rounded(compared.values[-1])},
-    }
+        if kind.network_cost:
+            fields |= {"parameters": final.parameters, "flops_per_action": final.flops_per_action}
+    elif compared is not None and state.at is not None:
+        fields = {
+            "esp_version": study.esp_version,
+            "task_version": compared.spec.version,
+            "convention": compared.spec.convention,
+            "episodes": cell.config.evaluation.episodes,
+            "returns": {mode: _rounded(compared.values[-1])},
+        }
+    status = "finished" if fields else "unfinished" if curve is not None else "not run"
+    if fields and compared is not None:
+        fields["evaluations"] = len(compared.steps)
+        if len(compared.steps) > 1:
+            fields["area_under_curve"] = _rounded(area_under_curve(compared.steps, compared.values))
+    if curve is not None:
+        fields["seconds"] = round(curve.seconds, 1)
+        if kind.breakings and (early := curve.until(cell.config.steps // 5)):
+            fields["early"] = _rounded(early.values[-1])
+    same = {name: getattr(cell, name) for name in ("name", "panel", "variant", "reference")}
+    fields |= {"step": state.step, "at": state.at, "steps": cell.config.steps, "seeds": cell.config.seeds}
+    paper = None if number is None else (number.mean, number.sem)
+    return CellResult(**same, **fields, paper=paper, status=status, config={})
 
 
 def _timed(results: Results, cell: CellResult, curve: RunCurve | None, thresholds: Sequence[float]) -> CellResult:

@@ -75,17 +75,12 @@ def dots(
     The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise.
 
     Args:
-        groups: name -> one number per seed [S]; at least one, drawn from top to bottom.
+        groups: name -> one number per seed [S]; drawn from top to bottom.
         path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
         title: heading.
         xlabel: what is plotted, with its convention.
         anchors: lines where they are in view: name -> value; the legend names the others.
-
-    Raises:
-        UserError: no group, a value that is not finite, or a file that cannot be written.
     """
-    if not groups:
-        raise UserError("there is no group to draw")
     with written_figure(path, (7.2, 2.1 + 0.5 * len(groups))) as (figure, picture):
         axes = _titled(figure, title)
         for index, group in enumerate(groups.values()):
@@ -99,7 +94,7 @@ def dots(
                 axes.plot(interval, [index, index], color=colour, linewidth=1.8, marker="|", markersize=10)
             axes.plot([mean], [index], "o", color=colour, markersize=8)
         counts = [np.size(group) for group in groups.values()]
-        names = [f"{label}\n({_seeds([count])})" for label, count in zip(groups, counts, strict=True)]
+        names = [f"{label}\n({count} seed{'s'[: count - 1]})" for label, count in zip(groups, counts, strict=True)]
         axes.set_yticks(range(len(groups)), names)
         axes.set_ylim(len(groups) - 0.4, -0.6)
         axes.grid(visible=False, axis="y")
@@ -135,12 +130,7 @@ def over_setting(
         labels: of the axes: the setting, whose values stand at equal distances as in figure 5c, and what is plotted.
         order: the setting's values from left to right, where not every line has all of them.
         paper: the paper's means: name -> value of the setting -> mean.
-
-    Raises:
-        UserError: nothing to draw, or a file that cannot be written.
     """
-    if not lines or not all(lines.values()):
-        raise UserError("there is no line to draw")
     known = dict.fromkeys(value for line in lines.values() for value in line)
     places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}
     apart = min(_JITTER, _WIDEST / len(lines))
@@ -172,14 +162,9 @@ def appearance(index: int) -> tuple[str, LineStyle]:
 
 @contextmanager
 def written_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[tuple[Figure, Picture]]:
-    """Set up a figure and write it at the end; no pyplot, so that no window and no state of the caller is touched.
+    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG.
 
-    Args:
-        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
-        size: width and height, inches.
-
-    Raises:
-        UserError: the files cannot be written.
+    No pyplot, so that no window and no state of the caller is touched.
     """
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg"} else path.name
@@ -201,10 +186,6 @@ def _titled(figure: Figure, title: str) -> Axes:
     return axes
 
 
-def _seeds(counts: Sequence[int]) -> str:
-    return "1 seed" if max(counts) == 1 else f"{format_span(counts)} seeds"
-
-
 def caption(counts: Sequence[int]) -> str | None:
     """Say what the bands and lines are; None where every run has one seed, and so none of them."""
-    return f"mean and 95 % bootstrap interval over {_seeds(counts)}" if max(counts) > 1 else None
+    return f"mean and 95 % bootstrap interval over {format_span(counts)} seeds" if max(counts) > 1 else None

@@ -1,60 +1,51 @@
-"""The report of a study or of some runs: Markdown with pictures, and one page that needs nothing but a browser."""
+"""What a report writes: Markdown with pictures, one page that needs nothing but a browser, CSV, and for marl-eval."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
+import csv
+import io
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
-from esp_cli.files.formatting import escaped
+from esp_cli.files.formatting import escaped, format_count
 from esp_cli.files.opening import read_regular
-from esp_cli.files.writing import replace_file
+from esp_cli.files.writing import replace_file, write_file
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.reporting.collect import Material
-from esp_cli.reporting.exports import marl_eval
+from esp_cli.reporting.collect import Material, RunCurve
 from esp_cli.reporting.results import RESULTS_FORMAT
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
-from esp_cli.reporting.tables import Table, all_tables, markdown_text
+from esp_cli.reporting.tables import all_tables, markdown_text
+from esp_cli.studies.run_set import Cell
 from esp_cli.training.folder_names import POLICY
+from esp_cli.training.metrics import read_metrics
+from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
+from esp_envs.registry import task_class
 
 PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
 CURVES = "curves"
 _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
-_FILM_SECONDS = 15.0  # A film is sped up to last no longer
+_FILM_SECONDS = 15.0  # a film is sped up to last no longer
 _MAX_FILM_BYTES = 2**26
 
 
-class RunText(NamedTuple):
-    """A run by itself: its name, the command that trains it, and its configuration as JSON."""
-
-    name: str
-    command: str
-    config: str
-
-
 def write_report(material: Material, out: Path) -> list[Path]:
-    """Write a report.
-
-    Args:
-        material: what it is made from.
-        out: folder; missing ones are made.
-
-    Returns:
-        The files: the page, the Markdown, the pictures, the results and the form for marl-eval.
+    """Write a report into a folder; return its files: page, Markdown, pictures, results and the form for marl-eval.
 
     Raises:
         UserError: no run has an evaluation yet, the folder has a report of something else, or a file cannot be
@@ -71,24 +62,39 @@ def write_report(material: Material, out: Path) -> list[Path]:
         images = [(picture.png.stem, _data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
         for file in (file for picture in pictures for file in (picture.png, picture.svg)):
             replace_file(out / file.name, file.read_bytes())
-    tables, runs = all_tables(material.results), _runs(material)
+    tables, study = all_tables(material.results), material.study
+    whole = {material.runs.get(cell.name, cell.name): cell for cell in study.cells}  # each run once
+    runs = [
+        {
+            "name": f"{cell.panel}: {cell.variant}",
+            "command": cell.config.command(),
+            "config": json.dumps(cell.config.model_dump(mode="json"), indent=1),
+        }
+        for cell in whole.values()
+    ]
+    titles = {material.runs[cell.name]: f"{cell.panel}: {cell.variant}" for cell in study.cells}
+    films = [(title, _data_uri(film, "image/gif")) for run, title in titles.items() if (film := _film(run / FILM))]
     content = {
-        "title": material.study.title,
+        "title": study.title,
         "version": __version__,
-        "command": material.study.command,
+        "command": study.command,
         "tables": tables,
         "size": curves.size,
         "hovers": [asdict(hover) for hover in hovers],
         "curves": images[0][1],
         "pictures": images[1:],
-        "films": _films(material),
+        "films": films,
         "runs": runs,
     }
     templates = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     names = [picture.png.stem for picture in pictures]
+    markdown = [f"# {markdown_text(study.title)}", _fenced(study.command)]
+    markdown += [f"## {markdown_text(table.title)}\n\n{table.markdown()}" for table in tables]
+    markdown += [f"![{name}]({name}.png)" for name in names]
+    markdown += ["## Each run by itself", _fenced("\n".join(run["command"] for run in runs))]
     files = {
         PAGE: escaped(templates.get_template("report.html").render(content)).encode(),
-        MARKDOWN: escaped(_markdown(material, tables, names, runs)).encode(),
+        MARKDOWN: (escaped("\n\n".join(markdown)) + "\n").encode(),
         RESULTS: encode(material.results.document(), out / RESULTS),
         MARL_EVAL: encode(marl_eval(material), out / MARL_EVAL),
     }
@@ -98,12 +104,7 @@ def write_report(material: Material, out: Path) -> list[Path]:
 
 
 def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
-    """Draw the policy of each trained run that has no film yet, into its folder.
-
-    Args:
-        runs: run folders by name.
-        watch: told how many are done.
-    """
+    """Draw the policy of each trained run that has no film yet, into its folder; tell `watch` how many are done."""
     for count, run in enumerate(runs.values(), start=1):
         if (run / POLICY).is_file() and not _film(run / FILM):
             trained = TrainedPolicy.read(run / POLICY)
@@ -123,13 +124,6 @@ def _refuse_foreign(out: Path) -> None:
         raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
 
 
-def _films(material: Material) -> list[tuple[str, str]]:
-    """Return the films that are drawn: what they show, and the film for a page."""
-    titles = {material.runs[cell.name]: f"{cell.panel}: {cell.variant}" for cell in material.study.cells}
-    films = [(title, _film(run / FILM)) for run, title in titles.items()]
-    return [(title, _data_uri(film, "image/gif")) for title, film in films if film]
-
-
 def _film(path: Path) -> bytes:
     """Return a film that was drawn before; empty where there is none. A link is not followed."""
     content = None
@@ -139,31 +133,88 @@ def _film(path: Path) -> bytes:
     return content if content and content.startswith(b"GIF8") else b""
 
 
-def _runs(material: Material) -> list[RunText]:
-    """Return every run once, whatever the number of steps at which it is compared."""
-    cells = {material.runs.get(cell.name, cell.name): cell for cell in material.study.cells}
-    return [
-        RunText(
-            f"{cell.panel}: {cell.variant}",
-            cell.config.command(),
-            json.dumps(cell.config.model_dump(mode="json"), indent=1),
-        )
-        for cell in cells.values()
-    ]
-
-
 def _data_uri(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _markdown(material: Material, tables: Sequence[Table], pictures: Sequence[str], runs: Sequence[RunText]) -> str:
-    parts = [f"# {markdown_text(material.study.title)}", _fenced(material.study.command)]
-    parts += [f"## {markdown_text(table.title)}\n\n{table.markdown()}" for table in tables]
-    parts += [f"![{name}]({name}.png)" for name in pictures]
-    return "\n\n".join([*parts, "## Each run by itself", _fenced("\n".join(run.command for run in runs))]) + "\n"
 
 
 def _fenced(command: str) -> str:
     """Return a block of shell commands, in a fence that is longer than any row of backticks in it."""
     fence = "`" * max(3, *(len(row) + 1 for row in re.findall("`+", command)), 0)
     return f"{fence}sh\n{command}\n{fence}"
+
+
+_KEYS = ("run", "seed", "step")
+SeedRun = dict[str, dict[str, int | list[float]]]  # step, or "absolute_metrics" -> metric -> numbers
+MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment -> task -> algorithm -> seed
+
+
+def write_csv(path: Path, material: Material) -> int:
+    """Write the metrics of runs that have begun; return the number of rows.
+
+    A cell without a number is empty; a number of the whole run stands with every seed. Runs compared by hand have their
+    labels as names.
+    """
+    runs = {cell.name if cell.at is None else cell.variant: material.runs[cell.name] for cell in material.results.cells}
+    rows = [row for name, folder in runs.items() for row in _rows(name, folder)]
+    names = sorted({key for row in rows for key in row} - set(_KEYS))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, (*_KEYS, *names), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_file(path, text.getvalue().encode())
+    return len(rows)
+
+
+def marl_eval(material: Material) -> MarlEval:
+    """Return the finished runs of a study in the form of marl-eval's README; it has no place for stopped seeds.
+
+    Environment -> task -> algorithm -> seed -> step -> metric. The tool wants as many evaluations of every task of an
+    environment, so the runs of one number of steps are an environment of their own. Each list holds one number, the
+    mean over episodes; `absolute_metrics` are those of the final evaluation of the trained policy.
+    """
+    out: MarlEval = {}
+    results = {entry.name: entry for entry in material.results.cells}
+    for cell in material.study.cells:
+        curve, finals = material.curves.get(cell.name), results[cell.name].returns.get(material.results.mode, ())
+        whole = [value for value in finals if value is not None]
+        if curve is None or not whole or len(whole) < len(finals) or not np.isfinite(curve.values).all():
+            continue
+        runs = {f"seed_{seed}": _seed_run(curve, k, whole[k]) for k, seed in enumerate(cell.config.seeds)}
+        out.setdefault(_environment(cell), {}).setdefault(_key(cell.panel), {})[_key(cell.variant)] = runs
+    return out
+
+
+def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:
+    opened = RunFolder.open(folder) if folder.is_dir() else None
+    if opened is None or not opened.metrics_path.is_file():
+        return
+    seeds = opened.config["seeds"]
+    for row in read_metrics(opened.metrics_path):
+        for index, seed in enumerate(seeds):
+            cells = {key: _of_seed(value, index) for key, value in row.items() if key != "step"}
+            yield {"run": name, "seed": seed, "step": row["step"], **cells}
+
+
+def _of_seed(value: Any, index: int) -> Any:
+    if not isinstance(value, list):
+        return value
+    return value[index] if index < len(value) else None
+
+
+def _environment(cell: Cell) -> str:
+    """Return the family of the task and the number of steps: "mpe_500k"."""
+    package, *inner = task_class(cell.config.task).__module__.split(".")
+    family = inner[0] if package == "esp_envs" and inner else package
+    return f"{family}_{format_count(cell.config.steps)}"
+
+
+def _key(text: str) -> str:
+    return "_".join(text.replace(",", " ").replace("=", " ").split())
+
+
+def _seed_run(curve: RunCurve, seed: int, final: float) -> SeedRun:
+    steps: SeedRun = {
+        f"step_{k}": {"step_count": int(step), "return": [float(value)]}
+        for k, (step, value) in enumerate(zip(curve.steps, curve.values[:, seed], strict=True), start=1)
+    }
+    return {**steps, "absolute_metrics": {"return": [float(final)]}}

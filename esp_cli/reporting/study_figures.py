@@ -1,16 +1,23 @@
-"""Which figures a report has: learning curves, and returns as dots or over what a study varies."""
+"""Which figures a report has: learning curves with bands over seeds, returns as dots or over what a study varies."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import fill
 
-from esp_cli.reporting.collect import Material
-from esp_cli.reporting.figures import Picture, dots, over_setting
-from esp_cli.reporting.learning_curves import Curve, Hover, Panel, learning_curves
-from esp_cli.reporting.results import CellResult, Results
-from esp_cli.reporting.summary import floats
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from esp_cli.policies.statistics import Floats, curve_band
+from esp_cli.reporting.collect import Material, RunCurve
+from esp_cli.reporting.figures import POINTS_PER_INCH, Picture, appearance, caption, dots, over_setting, written_figure
+from esp_cli.reporting.results import CellResult, Results, floats
 from esp_cli.studies.kinds import UNBROKEN, kind_of
 
 
@@ -49,13 +56,8 @@ def draw_curves(
 ) -> tuple[Picture, tuple[Hover, ...]]:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation.
 
-    Runs that are compared at several steps have the same curves at each, which are drawn once.
-
-    Args:
-        material: with a curve.
-        path: where to.
-        references: lines at numbers of others: name -> return.
-        view: the lowest and the highest return shown, by default all.
+    Runs that are compared at several steps have the same curves at each, which are drawn once. `references` are lines
+    at numbers of others, `view` the lowest and the highest return shown.
     """
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
@@ -69,20 +71,14 @@ def draw_curves(
         if drawn:
             title = cells[0].config.task if entries[cells[0].name].at is not None else name
             title = title.rpartition(":")[2]  # of a task of the caller, the class
-            curves = [Curve(cell.variant, c.steps, c.values) for cell, c in zip(cells, drawn, strict=True)]
-            panels.setdefault(tuple(map(id, drawn)), Panel(title, curves, anchors, references or {}))
+            panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors, references or {}))
     conventions = {entry.convention for entry in entries.values() if entry.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
     return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", view)
 
 
 def draw_variants(results: Results, out: Path) -> list[Picture]:
-    """Draw the returns of a study of variants, over what it varies where that has an order; of others none.
-
-    Args:
-        results: of the study.
-        out: folder.
-    """
+    """Draw the returns of a study of variants into a folder, over what it varies where that has an order."""
     if results.rows == "panels":
         return []
     if results.kind == "ablate-coefficient" or kind_of(results.kind).breakings:
@@ -97,12 +93,7 @@ def draw_variants(results: Results, out: Path) -> list[Picture]:
 
 
 def draw_over_setting(results: Results, path: Path) -> list[Picture]:
-    """Draw returns over the weight of the consistency loss, or over each strength of breaking.
-
-    Args:
-        results: of a study that varies either.
-        path: of the picture; of breaking `path`-1, `path`-2 and so on, one for each task and setting.
-    """
+    """Draw returns over the weight of the consistency loss, or over strengths of breaking: `path`-1, `path`-2."""
     label, mode = f"{results.mode} return", results.mode
     if results.kind == "ablate-coefficient":
         panels = _finished(results)
@@ -133,3 +124,131 @@ def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
         if cell.returns and None not in cell.returns[results.mode]:
             finished.setdefault(cell.panel, {})[cell.variant] = cell
     return finished
+
+
+_ONE_PANEL, _PANEL = (7.2, 4.2), (4.0, 3.2)  # width and height of a panel, inches
+_LEGEND_INCHES = 0.8
+_MAX_COLUMNS = 3
+_LABEL_CHARACTERS = 44  # of one line beside the vertical axis
+_BELOW_RANDOM = 0.15  # how far below the random policy a panel of curves goes, as a share of what is above it
+_NAME_HEIGHT = 0.05  # height of a level's name as a share of a panel
+_MAX_HOVERED = 200  # evaluations of a curve whose values a page shows; those of longer curves are thinned out
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes of learning curves."""
+
+    title: str  # heading, such as "navigation, 500k"
+    curves: Sequence[RunCurve]  # in the order of their colours; the same label has the same colour in every panel
+    anchors: Mapping[str, float] = field(default_factory=dict)  # dotted lines where they are in view: name -> value
+    # dashed lines that are always in view, as of a paper: name -> value
+    references: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Hover:
+    """What a page shows where the pointer is over a panel; lengths are points of the SVG from its upper left corner."""
+
+    box: tuple[float, float, float, float]  # left, top, right and bottom of the axes
+    # label, colour, and [x, y, step, mean, low, high] of each evaluation
+    curves: tuple[tuple[str, str, list[list[float]]], ...]
+
+
+def learning_curves(
+    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, view: tuple[float, float] | None = None
+) -> tuple[Picture, tuple[Hover, ...]]:
+    """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in the paper's figure 4.
+
+    Args:
+        panels: at least one, each with at least one curve.
+        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
+        ylabel: what is plotted.
+        view: lowest and highest value in view; by default all of the curves and references.
+
+    Returns:
+        The files, and for each panel what a page shows beside the pointer.
+    """
+    labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
+    columns = min(len(panels), _MAX_COLUMNS)
+    rows = math.ceil(len(panels) / columns)
+    width, height = _ONE_PANEL if len(panels) == 1 else _PANEL
+    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES)) as (figure, picture):
+        grid = figure.subplots(rows, columns, squeeze=False)
+        drawn = []
+        for axes, panel in zip(grid.flat, panels, strict=False):
+            bands = [_draw_curve(axes, curve, labels.index(curve.label)) for curve in panel.curves]
+            drawn.append((axes, panel, bands))
+            _draw_levels(axes, panel, view)
+            axes.set_title(panel.title, loc="left", fontweight="bold")
+            axes.set_xlabel("environment steps per seed")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for row in grid:
+            row[0].set_ylabel(fill(ylabel, _LABEL_CHARACTERS))
+        handles = {label: line for axes in grid.flat for line in axes.lines if (label := line.get_label()) in labels}
+        counts = [np.shape(curve.values)[1] for panel in panels for curve in panel.curves]
+        figure.legend(
+            [handles[label] for label in labels],
+            labels,
+            loc="outside lower center",
+            ncols=min(len(labels), 2 * columns),
+            title=caption(counts),
+        )
+    hovers = tuple(_hover(figure, axes, panel, labels, bands) for axes, panel, bands in drawn)
+    return picture, hovers
+
+
+def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
+    """Draw a curve with its band, and return step, mean and both edges of each evaluation [K, 4]."""
+    mean, low, high = curve_band(curve.values)
+    steps = np.asarray(curve.steps, dtype=np.float64)
+    colour, style = appearance(index)
+    marker = "o" if steps.size == 1 else None
+    axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=curve.label)
+    if np.shape(curve.values)[1] > 1:
+        axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
+    return np.stack([steps, mean, low, high], axis=1)
+
+
+def _draw_levels(axes: Axes, panel: Panel, view: tuple[float, float] | None) -> None:
+    """Draw the horizontal lines in view with their names; names that would lie upon each other stand in a row.
+
+    The view ends a little below the random policy: what is worse, as the first greedy policy often is, would press the
+    rest of the curves together.
+    """
+    for value in panel.references.values():
+        axes.axhline(value, linestyle=(0, (8, 4)), color="#333333", linewidth=1.0, zorder=1)
+    low, high = view or axes.get_ylim()
+    random = panel.anchors.get("random", low)
+    if view is None and random < high:
+        low = max(low, random - _BELOW_RANDOM * (high - random))
+    axes.set_ylim(low, high)
+    levels = [(value, name) for name, value in panel.anchors.items()]
+    levels += [(value, f"{name} {value:g}") for name, value in panel.references.items()]
+    names: list[tuple[float, str]] = []
+    for value, name in sorted(level for level in levels if low <= level[0] <= high):
+        beside = names and value - names[-1][0] < _NAME_HEIGHT * (high - low)
+        names.append((value, f"{names.pop()[1]}, {name}" if beside else name))
+    for value, name in names:
+        axes.annotate(name, (1.0, value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7)
+    for value in panel.anchors.values():
+        if low <= value <= high:
+            axes.axhline(value, linestyle=":", color="#777777", linewidth=1.0, zorder=1)
+
+
+def _hover(figure: Figure, axes: Axes, panel: Panel, labels: Sequence[str], bands: Sequence[Floats]) -> Hover:
+    """Return where the evaluations of a panel lie, once the figure is written and so laid out."""
+    scale, height = POINTS_PER_INCH / figure.dpi, figure.get_figheight() * POINTS_PER_INCH
+    left, bottom, right, top = (float(edge) * scale for edge in axes.bbox.extents)
+    curves = []
+    for curve, band in zip(panel.curves, bands, strict=True):
+        every = math.ceil(len(band) / _MAX_HOVERED)
+        kept = band[sorted({*range(0, len(band), every), len(band) - 1})]
+        kept = kept[np.isfinite(kept).all(axis=1)]
+        places = axes.transData.transform(kept[:, :2]).reshape(-1, 2) * scale
+        places[:, 1] = height - places[:, 1]
+        points = np.concatenate([places, kept], axis=1).round(2).tolist()
+        curves.append((curve.label, appearance(labels.index(curve.label))[0], points))
+    return Hover((left, height - top, right, height - bottom), tuple(curves))

@@ -12,8 +12,7 @@ from pydantic import JsonValue
 
 from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
 from esp_cli.policies.statistics import Estimate, SeedSummary, median_steps, summarise
-from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results
-from esp_cli.reporting.summary import floats
+from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results, floats
 from esp_cli.studies.kinds import kind_of
 
 NOT_RUN, _STOPPED = "not run", "every seed stopped"
@@ -50,11 +49,7 @@ def markdown_text(text: str) -> str:
 
 
 def all_tables(results: Results) -> list[Table]:
-    """Return every table that has something to say.
-
-    Args:
-        results: with their statistics, as `summary.summarised` returns them.
-    """
+    """Return every table that has something to say, of results with their statistics."""
     return [table for make in TABLES.values() if (table := make(results)).rows]
 
 
@@ -111,7 +106,7 @@ def comparison_table(results: Results) -> Table:
         f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}{drawn}"
         "No interval is widened for the number of comparisons."
     )
-    return _table(f"Beside the reference{' and the paper' if has_paper else ''}", columns, results.cells, caption)
+    return table(f"Beside the reference{' and the paper' if has_paper else ''}", columns, results.cells, caption)
 
 
 def statistics_table(results: Results) -> Table:
@@ -135,7 +130,7 @@ def statistics_table(results: Results) -> Table:
         columns["weights>"] = lambda cell: format_count(cell.parameters["policy"]) if cell.parameters else NOTHING
         columns["FLOPs an action>"] = lambda cell: NOTHING if (n := cell.flops_per_action) is None else format_count(n)
         caption += " Weights: of one seed's policy. FLOPs: of the matrix products for one agent's action."
-    return _table("Seeds and scale", columns, filter(_summary, results.cells), caption)
+    return table("Seeds and scale", columns, filter(_summary, results.cells), caption)
 
 
 def steps_table(results: Results) -> Table:
@@ -175,7 +170,7 @@ def aggregates_table(results: Results) -> Table:
         "P(improvement over the reference)>": lambda variant: _estimate(numbers[variant].improvement),
     }
     caption = "Of normalised returns over all panels; 95 % intervals by a bootstrap that is stratified by panel."
-    return _table("Over all panels", columns, numbers, caption)
+    return table("Over all panels", columns, numbers, caption)
 
 
 def provenance_table(results: Results) -> Table:
@@ -227,7 +222,7 @@ def on_the_way(results: Results) -> str:
     return f" ({format_span(known)} episodes a seed)" if known else ""
 
 
-def _table(title: str, columns: Columns[Row], rows: Iterable[Row], caption: str) -> Table:
+def table(title: str, columns: Columns[Row], rows: Iterable[Row], caption: str) -> Table:
     """Return a table from the description of its columns."""
     return Table(title, tuple(columns), tuple(tuple(text(row) for text in columns.values()) for row in rows), caption)
 

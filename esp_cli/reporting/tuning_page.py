@@ -15,11 +15,11 @@ import matplotlib.pyplot as plt
 import optuna.visualization.matplotlib as figures
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 
-from esp_cli.files.formatting import format_count, format_duration
+from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_mean
 from esp_cli.files.writing import replace_file
-from esp_cli.reporting.tables import Table
-from esp_cli.studies.search import Outcome, Search
-from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Tuning
+from esp_cli.reporting.tables import Columns, Table, table
+from esp_cli.studies.search import Search
+from esp_cli.studies.tuning import NAMES, REDUCTION, RUNGS, Outcome, Tuning
 
 _MEANING = {
     "return": "mean of the last three greedy evaluations",
@@ -30,22 +30,18 @@ _MEANING = {
 
 def budget_table(tuning: Tuning, outcomes: Sequence[Outcome], title: str = "Budgets and scores") -> Table:
     """Return what each prior was given, and what its best trial scored on the trials' seeds."""
-    headings = ("prior", "trials>", "complete>", "pruned>", "steps>", "time>", "default>", "best>", "trial>")
-    rows = [
-        (
-            NAMES[outcome.prior],
-            str(outcome.trials),
-            str(outcome.completed),
-            str(outcome.pruned),
-            format_count(outcome.env_steps),
-            format_duration(outcome.seconds),
-            _number(outcome.default_score),
-            _number(outcome.best_score),
-            "-" if outcome.best is None else str(outcome.best),
-        )
-        for outcome in outcomes
-    ]
-    return Table(title, headings, tuple(rows), budget_sentence(tuning))
+    columns: Columns[Outcome] = {
+        "prior": lambda one: NAMES[one.prior],
+        "trials>": lambda one: str(one.trials),
+        "complete>": lambda one: str(one.completed),
+        "pruned>": lambda one: str(one.pruned),
+        "steps>": lambda one: format_count(one.env_steps),
+        "time>": lambda one: format_duration(one.seconds),
+        "default>": lambda one: format_mean(one.default_score),
+        "best>": lambda one: format_mean(one.best_score),
+        "trial>": lambda one: NOTHING if one.best is None else str(one.best),
+    }
+    return table(title, columns, outcomes, budget_sentence(tuning))
 
 
 def settings_table(outcomes: Sequence[Outcome]) -> Table:
@@ -72,24 +68,19 @@ def budget_sentence(tuning: Tuning) -> str:
 
 
 def write_page(search: Search, outcomes: Sequence[Outcome], out: Path) -> Path:
-    """Write `tuning.md`, the same numbers as `tuning.json`, and Optuna's figures.
-
-    Args:
-        search: with its record.
-        outcomes: of each prior.
-        out: folder, made if missing.
-
-    Returns:
-        The page.
-    """
+    """Write `tuning.md`, the same numbers as `tuning.json`, and Optuna's figures into a folder; return the page."""
     tuning = search.tuning
     out.mkdir(parents=True, exist_ok=True)
     document = {"tuning": tuning.model_dump(mode="json"), "outcomes": [asdict(outcome) for outcome in outcomes]}
     replace_file(out / "tuning.json", (json.dumps(document, indent=2) + "\n").encode())
     lines = [f"# {search.title}", "", f"`{tuning.command}`", ""]
-    for table in (budget_table(tuning, outcomes), settings_table(outcomes)):
-        lines += [f"## {table.title}", "", table.markdown(), ""]
-    lines += _refused_lines(outcomes)
+    for made in (budget_table(tuning, outcomes), settings_table(outcomes)):
+        lines += [f"## {made.title}", "", made.markdown(), ""]
+    for one in outcomes:  # the most frequent reason first
+        if count := len(one.refused):
+            trials = "1 of the pruned trials was" if count == 1 else f"{count} of the pruned trials were"
+            lines += ["", f"{NAMES[one.prior]}: {trials} refused, as the settings do not go together:", ""]
+            lines += [f"- {times} x {reason}" for reason, times in Counter(one.refused).most_common()]
     lines += ["", "Chosen and scored on the seeds of the trials; the study in `fresh` evaluates them on others."]
     for prior, study in search.studies.items():
         for name, title in _draw(study, out, prior):
@@ -97,16 +88,6 @@ def write_page(search: Search, outcomes: Sequence[Outcome], out: Path) -> Path:
     page = out / "tuning.md"
     replace_file(page, ("\n".join(lines) + "\n").encode())
     return page
-
-
-def _refused_lines(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield how many of the pruned trials were refused, and why, the most frequent reason first."""
-    for outcome in outcomes:
-        if outcome.refused:
-            count = len(outcome.refused)
-            trials = "1 of the pruned trials was" if count == 1 else f"{count} of the pruned trials were"
-            yield from ("", f"{NAMES[outcome.prior]}: {trials} refused, as the settings do not go together:", "")
-            yield from (f"- {times} x {reason}" for reason, times in Counter(outcome.refused).most_common())
 
 
 def _draw(study: Any, out: Path, prior: str) -> Iterator[tuple[str, str]]:
@@ -138,10 +119,6 @@ def _importances(study: Any) -> None:
     axes.barh(list(importances), list(importances.values()))
     axes.invert_yaxis()
     axes.set_xlabel("importance (PED-ANOVA)")
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
 
 
 def _setting(value: object) -> str:

@@ -10,7 +10,7 @@ from esp_cli.checking.measured import planned
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.studies import paper
-from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team, kind_of
+from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team
 from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study
 from esp_cli.training.build import build_learner
@@ -41,11 +41,7 @@ class Request:
 
 
 def plan(name: str, request: Request) -> Study:
-    """Plan a study.
-
-    Args:
-        name: of `KINDS`.
-        request: what the user asked for.
+    """Plan a study of a kind, by its name in `KINDS`.
 
     Raises:
         UserError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
@@ -53,35 +49,18 @@ def plan(name: str, request: Request) -> Study:
     kind = KINDS[name]
     cells = tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request))
     return Study(
-        kind=name,
-        title=kind.title,
-        command=request.command,
-        episodes=request.episodes,
-        rows=kind.rows,
-        cells=cells,
+        kind=name, title=kind.title, command=request.command, episodes=request.episodes, rows=kind.rows, cells=cells
     )
 
 
 def refuse_untrainable(study: Study) -> None:
-    """Refuse a study of which a run cannot be built, before there is a folder; a GPU need not be here.
-
-    Raises:
-        UserError: parts of a run do not go together.
-    """
+    """Refuse a study of which a run cannot be built, before there is a folder; a GPU need not be here."""
     for cell in study.cells:
         build_learner(cell.config.of_one_seed().model_copy(update={"device": "cpu"}))
 
 
 def without_effect(name: str, request: Request) -> list[str]:
-    """Return the settings that a user asked for and that change nothing in any run of a study.
-
-    Args:
-        name: of `KINDS`.
-        request: what the user asked for.
-
-    Raises:
-        UserError: as `plan`.
-    """
+    """Return the settings that a user asked for and that change nothing in any run of a study of this kind."""
     configs = [cell.config for cell in _cells(KINDS[name], request)]
     idle = [(config, config.without_effect()) for config in configs]
     return [
@@ -169,8 +148,7 @@ def task_setting(name: str, task: str) -> str:
 def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
     """Return the numbers of steps of a task.
 
-    500k and 3M name the paper's two rows, which formation has at 200k and 1M; a number written for the task itself is
-    taken as it is.
+    500k and 3M name the paper's two rows (200k and 1M of formation); a number for the task itself is taken as it is.
     """
     rows, names = paper.horizons(task), paper.horizons("navigation")
     if request.steps is None:
@@ -237,18 +215,3 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
 def _paired_name(algorithm: str, prior: str) -> str:
     """Return how the paper calls an algorithm without the prior and with it: "MADDPG", "MADDPG-ESP"."""
     return algorithm.rpartition(":")[2].upper() + ("" if prior == "none" else "-ESP")
-
-
-def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Yield panel, variant and place of every number that the paper's table of this kind has; none for ablations."""
-    kind = kind_of(name)
-    if kind.rows == "variants":
-        return
-    for task in kind.tasks:
-        teams = [team for team in kind.teams if team.settings["task.num_landmarks"] is None]
-        for team in teams or (Team(task, {}, ("table1", task)),):
-            for steps in paper.horizons(task):
-                for algorithm in kind.algorithms:
-                    for prior in kind.variants:
-                        key = (*team.place, str(steps), algorithm, prior)
-                        yield f"{team.label}, {format_exactly(steps)}", _paired_name(algorithm, prior), key

@@ -134,8 +134,8 @@ class LocalJob:
 def follow_parent() -> None:
     """Let this process stop cleanly when the one that started it ends; for the jobs of a LocalEngine.
 
-    Where the operating system does not tell of a parent's end (it does on Linux), the process goes on to its own end; a
-    study that is started again meanwhile finds the run in use and waits for it.
+    Where the operating system does not tell of that (Linux does), the process goes on to its own end; a study that is
+    started again meanwhile waits for it.
     """
     parent = os.environ.get(_PARENT)
     if parent is None or sys.platform != "linux":

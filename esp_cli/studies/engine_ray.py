@@ -39,11 +39,7 @@ POLL_S = 0.5  # seconds between two looks at the process of a job
 CONNECT_S = 10.0  # seconds in which a cluster has to answer
 _OBJECT_STORE_BYTES = 256 * 2**20
 _LIBRARIES = ("torch", "numpy", "mujoco", "pymunk")
-_RAY_ENVIRONMENT = {
-    "RAY_AUTH_MODE": "token",
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-}
+_RAY_ENVIRONMENT = {"RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Of Ray, unless the user sets it."""
 _JOB_ENVIRONMENT = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")  # handed on from the driver to the jobs
 
@@ -103,12 +99,7 @@ class RayEngine:
 
 
 class RayJob:
-    """A job on some node.
-
-    Args:
-        result: reference to its exit code and to why it failed.
-        folder: of the run.
-    """
+    """A job on some node, by the reference to its exit code and to why it failed, and the folder of its run."""
 
     def __init__(self, result: Any, folder: Path) -> None:
         self._result, self._folder = result, folder
@@ -187,16 +178,7 @@ def _waited(job: Job) -> int | None:
 
 
 def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Sequence[Mapping[str, float]]) -> None:
-    """Refuse a run that would wait for ever, since no node offers what it needs.
-
-    Args:
-        needed: resources by Ray's name: "CPU", "GPU", and "memory" in bytes.
-        name: of the run.
-        nodes: what each node offers.
-
-    Raises:
-        ClusterError: there is no such node.
-    """
+    """Refuse a run that would wait for ever: no node offers what it needs of "CPU", "GPU", and "memory" in bytes."""
     if any(all(node.get(kind, 0.0) >= amount for kind, amount in needed.items()) for node in nodes):
         return
     asked = ", ".join(["a core", *(["a GPU"] if needed["GPU"] else []), f"{needed['memory'] / 1e9:.1f} GB of memory"])
@@ -225,16 +207,7 @@ def _version(name: str) -> str:
 
 
 def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, str]) -> None:
-    """Refuse a node whose versions are not those of the driver.
-
-    Args:
-        node: its name.
-        theirs: versions of the node.
-        ours: versions of the driver.
-
-    Raises:
-        ClusterError: they differ; the message names all that do.
-    """
+    """Refuse a node whose versions, by name, are not those of the driver; the message names all that differ."""
     unlike = [name for name in ours if theirs.get(name) != ours[name]]
     if unlike:
         there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)

@@ -69,10 +69,10 @@ class Forecast:
 def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of a study; runs that cost the same are measured once.
+    """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once.
 
     Args:
-        folder: of the study; need not exist.
+        folder: of the study.
         others: studies whose finished runs are taken over.
         jobs: runs side by side.
         listener: told how many runs have been looked at.
@@ -103,13 +103,8 @@ def forecast_search(
 ) -> Forecast:
     """Measure what a search costs where every trial takes as long as that of the default settings and none is pruned.
 
-    Args:
-        tuning: what is asked for.
-        out: its folder.
-        seeds: of the two runs that judge the best settings.
-        episodes: per seed, of their final evaluations.
-        jobs: runs side by side.
-        listener: told how many kinds of prior have been looked at.
+    The best settings and the default ones are judged on `seeds`, in `episodes` episodes per seed; the listener is told
+    how many kinds of prior have been looked at.
     """
     runs, trials = list[RunForecast](), tuning.budget
     for prior in tuning.priors:
@@ -146,12 +141,7 @@ def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
 def measure(config: RunConfig, episodes: int) -> Cost:
     """Measure a run by some of its iterations and an evaluation, without writing anything.
 
-    Args:
-        config: of the run.
-        episodes: per seed, of its final evaluation.
-
-    Raises:
-        UserError: its parts do not go together.
+    Its final evaluation has `episodes` episodes per seed.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the runs of a study do

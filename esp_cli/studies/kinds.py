@@ -17,12 +17,7 @@ PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 
 PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
 Breakings = Mapping[str, Mapping[str, tuple[float, ...]]]
 BREAKINGS: Breakings = {
-    "navigation": {
-        "action_turn_rad": (0.5, 1.57),
-        "reward_offset": (0.1, 0.3),
-        "mud": (0.5, 0.9),
-        "wind": (0.3, 0.6),
-    },
+    "navigation": {"action_turn_rad": (0.5, 1.57), "reward_offset": (0.1, 0.3), "mud": (0.5, 0.9), "wind": (0.3, 0.6)},
     "predator-prey": {"action_turn_rad": (0.5, 1.57), "mud": (0.5, 0.9), "wind": (0.3, 0.6)},
     "formation": {"slope": (0.3, 0.6)},
     "wildlife": {"wind": (0.4, 0.8)},

@@ -16,6 +16,7 @@ from typing import ClassVar
 from esp_cli.files.documents import Strict
 from esp_cli.files.opening import holding, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
+from esp_cli.studies.paper import Reported, reported
 from esp_cli.training.config import RunConfig
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import CONFIG, FRESH, LOCK, LOG, METRICS, POLICY, STUDY_LOCK
@@ -42,14 +43,14 @@ class Cell(Strict):
     # place of the paper's number, see `paper.reported`; None where there is none that compares
     paper: tuple[str, ...] | None = None
 
+    @property
+    def reported(self) -> Reported | None:
+        """The paper's number."""
+        return reported(self.paper)
+
 
 class RunSet(ABC):
-    """Runs in a folder.
-
-    Args:
-        path: the folder.
-        title: one line for people.
-    """
+    """Runs in a folder, with a title of one line for people."""
 
     document: ClassVar[str]  # name of the file that makes a folder one
     runs: ClassVar[str]  # name of the folder of its run folders
@@ -66,11 +67,7 @@ class RunSet(ABC):
 
     @classmethod
     def refuse_foreign(cls, path: Path) -> None:
-        """Refuse a folder that is neither new nor empty nor one of these.
-
-        Raises:
-            StudyError: it holds something foreign, or a link where its runs belong.
-        """
+        """Refuse a folder that is neither new nor empty nor one of these, or that has a link where its runs belong."""
         if path.is_file():
             raise StudyError(f"{path} is a file; choose another --out")
         if (path / cls.runs).is_symlink():
@@ -109,11 +106,7 @@ class RunSet(ABC):
         return self.run_path(cell) / LOG
 
     def prepare(self, cell: Cell) -> RunFolder:
-        """Make the run folder of a cell, or open the one that is there.
-
-        Raises:
-            UserError: what is there is damaged or another run.
-        """
+        """Make the run folder of a cell, or open the one that is there, unless that is damaged or another run."""
         path = self.run_path(cell)
         if not (path / CONFIG).exists():
             return RunFolder.create(path, cell.config.model_dump(mode="json"))

@@ -78,9 +78,7 @@ class Scheduler:
         self.runs = [Run(cell, "finished" if folder.is_finished(cell) else "waiting") for cell in cells]
 
     def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
-        """Run everything that is not finished.
-
-        A run that fails is left as it is and the others go on.
+        """Run everything that is not finished; a run that fails is left as it is and the others go on.
 
         Args:
             listener: told at every look.
@@ -201,12 +199,9 @@ class Scheduler:
 
 
 def makespan(running: Sequence[float], waiting: Sequence[float], jobs: int) -> float:
-    """Return when the last job ends where each waiting one, in order, takes the first place that becomes free.
+    """Return when the last job ends where each waiting one, in order, takes the first of the places that is free.
 
-    Args:
-        running: seconds left of each that runs.
-        waiting: seconds of each that waits.
-        jobs: places.
+    Both lists hold the seconds that each job still takes.
     """
     places = sorted([*running, *[0.0] * max(0, jobs - len(running))])
     for seconds in waiting:

@@ -86,11 +86,7 @@ class Search(RunSet):
 
     @classmethod
     def create(cls, path: Path, tuning: Tuning) -> Search:
-        """Make the folder, or go on with the one that is there, whose budget may grow.
-
-        Raises:
-            StudyError: the folder holds another tuning, or something foreign.
-        """
+        """Make the folder, or go on with the one that is there, whose budget may grow; refuse another one."""
         cls.refuse_foreign(path)
         path.mkdir(parents=True, exist_ok=True)
         file = path / cls.document
@@ -152,11 +148,7 @@ class Search(RunSet):
         return self.studies[prior].get_trials(deepcopy=False)
 
     def trial(self, prior: str, number: int) -> Any:
-        """Return a trial that was begun, or begin it.
-
-        Raises:
-            StudyError: the journal lacks one before it.
-        """
+        """Return a trial that was begun, or begin it."""
         study, known = self.studies[prior], self.trials(prior)
         if number < len(known) and known[number].state != TrialState.WAITING:
             return optuna.trial.Trial(study, known[number]._trial_id)

@@ -69,10 +69,7 @@ def _completed(cell: Cell) -> Cell:
 
 
 class StudyFolder(RunSet):
-    """A folder that holds a study; use :meth:`create` or :meth:`open`.
-
-    Attributes:
-        study: all that was ever planned in it.
+    """A folder that holds a study, all that was ever planned in it.
 
     Example:
         >>> folder = StudyFolder.open(Path("runs/table1"))  # doctest: +SKIP
@@ -91,11 +88,7 @@ class StudyFolder(RunSet):
 
     @classmethod
     def create(cls, path: Path, study: Study) -> StudyFolder:
-        """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
-
-        Raises:
-            StudyError: as `planned`.
-        """
+        """Make a study folder, or go on with the one that is there; cells that it does not have yet are added."""
         folder, differs = cls.planned(path, study)
         path.mkdir(parents=True, exist_ok=True)
         if differs:
@@ -138,11 +131,7 @@ class StudyFolder(RunSet):
 
     @classmethod
     def open(cls, path: Path) -> StudyFolder:
-        """Open an existing study.
-
-        Raises:
-            StudyError: it is missing, damaged, foreign, or of a newer version.
-        """
+        """Open an existing study, unless it is missing, damaged, foreign, or of a newer version."""
         if not path.is_dir():
             raise StudyError(f"{path} is no study: there is no such folder")
         study = STUDY_FORMAT.parse(path / STUDY, Study)
@@ -168,11 +157,7 @@ class StudyFolder(RunSet):
         return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
 
     def begin(self, cell: Cell) -> Cell:
-        """Make the run folder of a cell; return the cell.
-
-        Raises:
-            UserError: what is there is damaged or another run.
-        """
+        """Make the run folder of a cell; return the cell."""
         self.prepare(cell)
         return cell
 
@@ -206,12 +191,7 @@ class StudyFolder(RunSet):
         ]
 
     def adopt_finished(self, cells: Sequence[Cell], others: Sequence[StudyFolder]) -> list[tuple[Cell, Path]]:
-        """Take finished runs of the same configuration over; return the cells that have one now, and where it is from.
-
-        Args:
-            cells: that may take one.
-            others: studies that may have one.
-        """
+        """Take finished runs of the same configuration over; return the cells that have one now, and where from."""
         twins = [(cell, twin) for cell in cells if (twin := self.find_twin(cell, others)) is not None]
         for cell, twin in twins:
             self.adopt(cell, twin)

@@ -47,11 +47,7 @@ class Tuning(Strict):
     command: str = ""  # the command line behind it
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int] | None = None) -> RunConfig:
-        """Resolve the run of a prior with these settings over those of all runs.
-
-        Raises:
-            UserError: a setting is unknown or out of range.
-        """
+        """Resolve the run of a prior with these settings over those of all runs."""
         config = planned(self._asked(prior, settings, self.trial_seeds if seeds is None else seeds))
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
 
@@ -68,10 +64,7 @@ class Tuning(Strict):
         return frozenset.intersection(*(config.without_effect() for config in configs))
 
     def check(self, seeds: Sequence[int]) -> None:
-        """Refuse what cannot be run.
-
-        Args:
-            seeds: of the runs that judge the best settings.
+        """Refuse what cannot be run; `seeds` are those of the runs that judge the best settings.
 
         Raises:
             UserError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
@@ -146,11 +139,7 @@ class Point:
 
 
 def curve_of(metrics: Path) -> list[Point]:
-    """Return the evaluations of a trial by its metrics file; none before it has begun.
-
-    Raises:
-        MetricsError: the file is damaged.
-    """
+    """Return the evaluations of a trial by its metrics file; none before it has begun."""
     rows = [row for row in read_metrics(metrics) if "eval/return_greedy" in row] if metrics.exists() else []
     if not rows:
         return []
@@ -181,13 +170,8 @@ def fresh_study(
     """Plan the study that evaluates the best settings of each prior, beside the default ones, on seeds of its own.
 
     Default settings are compared with those of the plain learner, tuned ones with the tuned plain learner. Where that
-    is missing or the run itself, tuned settings are compared with the default ones.
-
-    Args:
-        tuning: what was asked for.
-        best: by prior, the number of the best trial and its settings; a prior without a score is left out.
-        seeds: of every run.
-        episodes: per seed, of the final evaluations.
+    is missing or the run itself, tuned settings are compared with the default ones. `best` holds by prior the number of
+    the best trial and its settings; a prior without a score is left out.
     """
     panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
 

@@ -116,11 +116,7 @@ SPACES: Mapping[str, Space] = {
 
 
 def default_space(algorithm: str) -> Space:
-    """Return the space of an algorithm; settings of the prior concern runs with the prior alone.
-
-    Raises:
-        UserError: there is none.
-    """
+    """Return the space of an algorithm; settings of the prior concern runs with the prior alone."""
     if algorithm not in SPACES:
         raise UserError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
     return {**SPACES[algorithm], **_PRIOR}
@@ -130,9 +126,6 @@ def read_space(path: Path) -> Space:
     """Read a space from a file, JSON or TOML: {"mappo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": true}}.
 
     A list stands for choices: {"network.hidden": [[64, 64], [128, 128]]}.
-
-    Raises:
-        UserError: it is damaged, or says nothing.
     """
     fields: dict[str, dict[str, object]] = {}
     found = dict(flat(read_table(path)))

@@ -145,10 +145,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda run: edit_config(run, network={"hidden": [4096] * 16}),
         "was written under another configuration",
     ),
-    "a network of negative size": (
-        lambda run: edit_config(run, network={"hidden": [-8]}),
-        "bad value -8",
-    ),
+    "a network of negative size": (lambda run: edit_config(run, network={"hidden": [-8]}), "bad value -8"),
     "another number of seeds": (lambda run: edit_config(run, seeds=[3]), "was written under another configuration"),
     "an empty policy file": (lambda run: _rewrite(run / "policy.safetensors", b""), "is no safetensors file"),
     "a text as a policy file": (lambda run: _rewrite(run / "notes.txt", b"train more, sleep less"), "safetensors"),

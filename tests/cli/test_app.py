@@ -73,10 +73,6 @@ def test_a_command_gets_its_parsed_arguments(commands: None) -> None:
     assert (result.exit_code, result.stdout) == (0, "hello 1500000 (0, 1)\n")
 
 
-def test_defaults_pass_through_the_parsers(commands: None) -> None:
-    assert runner.invoke(app, ["toy"]).stdout == "fine 500000 (0,)\n"
-
-
 @pytest.mark.parametrize(
     ("kind", "code", "sentence"),
     [
@@ -191,17 +187,6 @@ def _python(code: str) -> subprocess.CompletedProcess[str]:
         env={**os.environ, "PYTHONPATH": path},
         check=False,
     )
-
-
-def test_help_imports_neither_torch_nor_numpy() -> None:
-    done = _python(
-        "import sys\n"
-        "from esp_cli.app import app\n"
-        "try: app(['--help'])\n"
-        "except SystemExit as leave: assert leave.code == 0, leave.code\n"
-        "print('heavy:', sorted({'torch', 'numpy', 'scipy', 'matplotlib'} & set(sys.modules)))\n"
-    )
-    assert done.stdout.endswith("heavy: []\n"), done.stdout + done.stderr
 
 
 def test_scipy_s_statistics_are_imported_only_where_they_are_asked_for() -> None:

@@ -64,10 +64,7 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--methods", "mpn,cnn"],
-            "they are 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'",
-        ),
+        (["--methods", "mpn,cnn"], "they are 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'"),
         (["--methods", "mpn,mpn"], "name each variant of this study once"),
         (["--grid", "6"], "use odd numbers"),
         (["--group", "so2"], "so2 cannot act on wildlife"),
@@ -142,14 +139,6 @@ def test_off_policy_learners_play_episodes_that_end_early(tmp_path: Path, algo: 
     metrics = json.loads(result.read_text())["metrics"]
     assert 1 <= metrics["steps"] <= 6
     assert 0 <= metrics["captures"] <= 1
-
-
-def test_a_film_of_drones_and_poacher(tmp_path: Path) -> None:
-    esp("train", "--task", "wildlife", *OPTIONS, "--steps", 32, "--out", tmp_path / "run")
-    esp("eval", tmp_path / "run", "--episodes", 4)
-    for name in ("film.gif", "film.png"):
-        esp("render", tmp_path / "run", "-o", tmp_path / name, "--size", 64)
-        assert (tmp_path / name).stat().st_size > 200
 
 
 def test_a_setting_that_an_option_says_is_refused() -> None:

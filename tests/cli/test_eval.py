@@ -43,11 +43,6 @@ def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, 
     assert "2 seed(s) x 4 episodes" in shown
 
 
-def test_json_on_standard_output_is_alone_there(finished: Path) -> None:
-    result = json.loads(esp("eval", finished, "--episodes", 2, "--json", "-").stdout)
-    assert set(result) == DOCUMENTED | BESIDE
-
-
 def test_one_seed_has_no_error_over_seeds_and_states_that_over_episodes(tmp_path: Path) -> None:
     run = train_tiny(tmp_path / "one", steps=50)
     told = esp("eval", run, "--episodes", 8, "--json", tmp_path / "result.json").stdout
@@ -168,7 +163,3 @@ def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> 
 )
 def test_settings_that_a_policy_cannot_take_are_refused(finished: Path, setting: str, sentence: str) -> None:
     assert sentence in refused("eval", finished, "--episodes", 2, "--set", setting)
-
-
-def test_physics_is_refused_where_a_task_has_none(finished: Path) -> None:
-    assert "unknown setting 'task.physics'" in refused("eval", finished, "--physics", "pymunk")

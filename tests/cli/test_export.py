@@ -10,7 +10,7 @@ import pytest
 
 from esp_cli.export import c_file
 from esp_cli.policies.bundled import MANIFEST, bundled_folder, read_bundled
-from tests.cli.running import DAMAGE, esp, refused
+from tests.cli.running import esp, refused
 
 
 def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None:
@@ -87,17 +87,6 @@ def test_a_bad_option_is_told_in_one_sentence(
 ) -> None:
     assert sentence in refused("export", finished, "-o", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("kind", ["nothing there", "a pickle file", "a truncated policy file"])
-def test_what_is_no_policy_is_told_in_one_sentence(copied: Path, tmp_path: Path, kind: str) -> None:
-    damage, sentence = DAMAGE[kind]
-    assert sentence in refused("export", damage(copied), "-f", "numpy", "-o", tmp_path / "out")
-    assert not (copied / "exploded").exists(), "loading ran code"
-
-
-def test_a_name_that_no_file_can_have_is_told_in_one_sentence() -> None:
-    assert refused("eval", "x" * 5000).endswith("...: File name too long")
 
 
 def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> None:

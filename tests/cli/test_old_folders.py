@@ -13,8 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from esp_cli.reporting.results import read_results
-from esp_cli.reporting.summary import summarised
+from esp_cli.reporting.results import read_results, summarised
 from esp_cli.reporting.tables import TABLES
 from tests.cli.running import esp, refused
 from tests.learning.golden import probe

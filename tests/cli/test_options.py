@@ -107,14 +107,7 @@ def test_a_count_and_a_list_of_seeds_exclude_each_other() -> None:
 def test_assignments_are_json_where_they_can_be() -> None:
     assert parse_assignments(
         ["mappo.learning_rate=5e-4", "prey=random", "a.b=[1, 2]", "on=true", "text=a=b", "none="]
-    ) == {
-        "mappo.learning_rate": 5e-4,
-        "prey": "random",
-        "a.b": [1, 2],
-        "on": True,
-        "text": "a=b",
-        "none": "",
-    }
+    ) == {"mappo.learning_rate": 5e-4, "prey": "random", "a.b": [1, 2], "on": True, "text": "a=b", "none": ""}
 
 
 @pytest.mark.parametrize(

@@ -101,20 +101,7 @@ def test_a_task_without_heuristics_is_evaluated_beside_the_random_policy_alone(f
 
 
 def test_a_study_hands_the_task_to_its_workers(folder: Path) -> None:
-    words = [
-        "ablate",
-        "modules",
-        "--task",
-        TASK,
-        "--algo",
-        "mappo",
-        "--seeds",
-        "1",
-        "--out",
-        "study",
-        "--episodes",
-        "2",
-    ]
+    words = f"ablate modules --task {TASK} --algo mappo --seeds 1 --out study --episodes 2".split()
     assert f"next: esp report study --task {TASK}\n" in esp(folder, *words, *SHORT).stderr
     assert "found nothing" not in esp(folder, "report", "study", "--task", TASK).stdout
     chart = (folder / "study" / "report" / "curves.svg").read_text(encoding="utf-8")

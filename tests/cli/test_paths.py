@@ -31,10 +31,7 @@ def test_a_full_device_is_a_failure_of_the_machine() -> None:
 
 @pytest.mark.parametrize("option", ["--out=", "--json=", "--results="])
 def test_an_option_without_a_value_is_one_sentence(option: str) -> None:
-    assert told("report", "runs/a", option) == (
-        2,
-        f"error: '{option}' is empty; write its value, or leave it out\n",
-    )
+    assert told("report", "runs/a", option) == (2, f"error: '{option}' is empty; write its value, or leave it out\n")
 
 
 def test_a_link_given_to_json_is_followed_and_kept(tmp_path: Path) -> None:

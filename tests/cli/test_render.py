@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from esp_envs.epuck import gl
-from tests.cli.running import DAMAGE, esp, refused, train_tiny
+from tests.cli.running import esp, refused, train_tiny
 
 FRAMES = 26
 """Of one episode: the start and 25 steps."""
@@ -27,11 +27,6 @@ def test_a_gif_has_every_step_of_every_episode_in_real_time(finished: Path, tmp_
         assert film.info["duration"] == 100, "milliseconds: a step is 0.1 s"
         assert film.info["loop"] == 0
     assert [entry.name for entry in file.parent.iterdir()] == ["film.gif"]
-
-
-def test_short_tasks_show_three_episodes(finished: Path, tmp_path: Path) -> None:
-    told = esp("render", finished, "-o", tmp_path / "film.gif", "--size", 32)
-    assert f"{3 * FRAMES} frames -> " in told.stderr
 
 
 def test_speed_seed_and_noise_are_chosen(finished: Path, tmp_path: Path) -> None:
@@ -210,19 +205,7 @@ def test_a_bad_option_is_told_in_one_sentence(
     assert sentence in refused("render", finished, "-o", tmp_path / "film.gif", *options)
 
 
-def test_the_file_has_to_be_named(finished: Path) -> None:
-    assert "Missing option '--out'" in refused("render", finished)
-
-
 def test_a_place_that_cannot_be_written_is_told(finished: Path, tmp_path: Path) -> None:
     (tmp_path / "folder.gif").mkdir()
     assert "is a directory" in refused("render", finished, "-o", tmp_path / "folder.gif", "--size", 32)
     assert list((tmp_path / "folder.gif").iterdir()) == []
-
-
-@pytest.mark.parametrize("kind", DAMAGE)
-def test_what_is_no_policy_is_told_in_one_sentence(copied: Path, tmp_path: Path, kind: str) -> None:
-    damage, sentence = DAMAGE[kind]
-    assert sentence in refused("render", damage(copied), "-o", tmp_path / "film.gif")
-    assert not (tmp_path / "film.gif").exists()
-    assert not (copied / "exploded").exists(), "loading ran code"

@@ -179,12 +179,6 @@ def test_a_bad_option_is_told_in_one_sentence(finished: Path, options: list[str]
     assert sentence in refused("report", finished, *options)
 
 
-@pytest.mark.parametrize("kind", ["nothing there", "config that is no JSON", "seeds that are a text"])
-def test_what_is_no_run_is_told_in_one_sentence(finished: Path, copied: Path, kind: str) -> None:
-    damage, sentence = DAMAGE[kind]
-    assert sentence in refused("report", finished, damage(copied))
-
-
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
@@ -217,11 +211,6 @@ def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path
         file.touch()
         esp("report", copied, option, file)
         assert file.stat().st_size > 0, "a name of the user's own, and a name that is taken in no such folder"
-
-
-def test_the_document_of_a_tuning_is_not_overwritten_either(tmp_path: Path) -> None:
-    TUNING_FORMAT.write(tmp_path / TUNING, {})
-    assert "belongs to the run or study" in refused("settings", "--json", tmp_path / TUNING)
 
 
 def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(finished: Path, copied: Path) -> None:

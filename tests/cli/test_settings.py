@@ -53,10 +53,6 @@ def test_a_value_is_told_once_and_as_set_takes_it() -> None:
     assert "│ weights │ {} │" in table
 
 
-def test_a_bound_that_is_told_is_a_bound() -> None:
-    assert "should be greater than 0" in refused("train", "--print-config", "--set", "mappo.learning_rate=0")
-
-
 def test_the_table_and_the_json_name_every_setting_of_a_section() -> None:
     told = esp("settings", "mappo", "--json", "-").stdout
     names = [one["name"] for section in json.loads(told) for one in section["settings"]]

@@ -66,13 +66,9 @@ def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
     assert ("the times are unreliable" in told.stderr) == unreliable
 
 
-def test_a_dry_run_refuses_the_folders_that_the_run_refuses(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("")
-    assert "is not empty and no study" in refused(*TINY, *TINY_OPTIONS, "--out", tmp_path, "--dry-run")
-
-
-def test_a_dry_run_states_time_and_disk_and_makes_nothing(tmp_path: Path) -> None:
+def test_a_dry_run_states_time_and_disk_makes_nothing_and_refuses_what_the_run_refuses(tmp_path: Path) -> None:
     out, plan = tmp_path / "s", tmp_path / "plan.json"
+    assert "is not empty and no study" in refused(*TINY, *TINY_OPTIONS, "--out", Path(__file__).parent, "--dry-run")
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--dry-run", "--jobs", 2, "--json", plan)
     assert not out.exists()
     found = json.loads(plan.read_text())
@@ -145,17 +141,6 @@ def test_a_study_of_breakings_is_run_in_pieces_and_runs_once_what_trains_the_sam
     assert "this study has no variant 'luck'; they are" in refused(*study, "--methods", "luck")
 
 
-def test_runs_put_together_by_hand_have_a_page_too(finished: Path, tmp_path: Path) -> None:
-    told = esp(
-        "report", f"ours={finished}", f"again={finished}", "--out", tmp_path / "page", "--results", tmp_path / "r"
-    )
-    assert "report.html" in told.stderr
-    text = (tmp_path / "page" / "report.md").read_text()
-    assert "| ours |" in text
-    assert "+0.00" in text, "the difference of a run from itself"
-    assert json.loads((tmp_path / "r").read_text())["kind"] == "runs"
-
-
 def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_path: Path) -> None:
     config = json.loads((copied / "config.json").read_text())
     fewer = config["evaluation"]["episodes"]
@@ -201,7 +186,7 @@ def test_the_command_that_goes_on_says_how_and_a_gpu_may_be_elsewhere() -> None:
     assert StudyChoices().running_words() == ""
     chosen = StudyChoices(engine="ray", address="10.0.0.1:6379", gpu_share=0.5, device="cuda")
     assert chosen.running_words() == " --engine ray --address 10.0.0.1:6379 --gpu-share 0.5"
-    assert chosen.device_of_runs() == "cuda"
+    assert chosen.request("table1").device == "cuda"
     chosen = StudyChoices(jobs=3, reuse=[Path("a b"), Path("c")])
     assert chosen.running_words() == " --jobs 3 --reuse 'a b' --reuse c"
     assert StudyChoices(no_check=True).running_words() == " --no-check"

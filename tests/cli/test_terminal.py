@@ -24,10 +24,10 @@ from esp_cli import console
 from esp_cli.algorithms.presets import PRESETS
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.app import app, build_command
-from esp_cli.commands import COMMANDS, completion
-from esp_cli.console import streams
+from esp_cli.commands import COMMANDS
+from esp_cli.commands import help as known
+from esp_cli.console import lay_out, streams
 from esp_cli.console.progress import progress_line
-from esp_cli.console.tables import lay_out
 from esp_cli.networks.build import NETWORKS
 from esp_cli.policies.bundled import read_bundled
 from esp_cli.training.trackers import TRACKERS
@@ -115,15 +115,7 @@ def test_tables_of_runs_fit_80_columns(monkeypatch: pytest.MonkeyPatch, finished
         ("report", f"plain={finished}", f"esp={finished}", "--at", "100", "--threshold", "-100"),
         ("export", finished, "-f", "numpy", "--seed", "3", "-o", tmp_path / "export"),
         (
-            "reproduce",
-            "table1",
-            "--dry-run",
-            "--task",
-            "navigation",
-            "--algo",
-            "mappo",
-            "--steps",
-            "100",
+            *["reproduce", "table1", "--dry-run", "--task", "navigation", "--algo", "mappo", "--steps", "100"],
             *TINY_OPTIONS,
         ),
     ):
@@ -275,11 +267,11 @@ def test_the_shell_is_offered_what_can_follow(
 
 
 def test_the_names_that_are_offered_are_those_of_the_registries() -> None:
-    assert tuple(filter(TASKS.ships, TASKS)) == completion.TASKS
-    assert tuple(filter(ALGORITHMS.ships, ALGORITHMS)) == completion.ALGORITHMS
-    assert tuple(filter(NETWORKS.ships, NETWORKS)) == completion.NETWORKS
-    assert {*PRESETS["mappo"], "fast"} == set(completion.PRESETS)
-    assert tuple(TRACKERS) == completion.TRACKERS
+    assert tuple(filter(TASKS.ships, TASKS)) == known.TASKS
+    assert tuple(filter(ALGORITHMS.ships, ALGORITHMS)) == known.ALGORITHMS
+    assert tuple(filter(NETWORKS.ships, NETWORKS)) == known.NETWORKS
+    assert {*PRESETS["mappo"], "fast"} == set(known.PRESETS)
+    assert tuple(TRACKERS) == known.TRACKERS
 
 
 def test_neither_help_nor_completion_imports_torch() -> None:

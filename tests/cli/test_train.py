@@ -58,11 +58,6 @@ def test_the_paper_preset_is_rot90_with_a_recurrent_network(tmp_path: Path) -> N
     assert config["algorithm_settings"]["num_envs"] == 2, "--set has the last word over the preset"
 
 
-def test_a_setting_has_the_last_word_over_an_option(tmp_path: Path) -> None:
-    run = train_tiny(tmp_path / "run", "--prior", "esp", "--set", "prior.kind=none", steps=50)
-    assert config_of(run)["prior"]["kind"] == "none"
-
-
 def test_without_out_a_run_gets_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "none")
@@ -310,11 +305,6 @@ def test_a_policy_file_and_damaged_metrics_are_not_resumed(copied: Path) -> None
     metrics = copied / "metrics.jsonl"
     metrics.write_text("sleep less\n" + metrics.read_text())
     assert "line 1 is not a row of metrics" in refused("train", "--resume", copied)
-
-
-def test_a_run_in_use_is_refused(copied: Path) -> None:
-    with RunFolder.open(copied).lock():
-        assert "is in use by process" in refused("train", "--resume", copied)
 
 
 def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from esp_cli.drawing import frames
-from esp_cli.drawing.frames import Mark, frame, marks
+from esp_cli.drawing import films as frames
+from esp_cli.drawing.films import Mark, frame, marks
 from esp_cli.drawing.recording import Moment
 from esp_envs import Body, Scene
 from esp_envs.drawing import TopPainter, draw
-
-RED, BLUE, GREEN = "#ff0000", "#0000ff", "#00ff00"
-WINDOW = (-1.0, 1.0, -1.0, 1.0)
+from tests.drawing.scenes import BLUE, GREEN, RED, WINDOW
 
 
 def scene(*bodies: Body, unit: str = "m") -> Scene:

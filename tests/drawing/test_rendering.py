@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from esp_cli.drawing.draw import open_painter, shots, stride, write_film
+from esp_cli.drawing.draw import open_painter, shots, write_film
 from esp_cli.drawing.films import write_gif, write_mp4
 from esp_cli.drawing.recording import HOLD_SECONDS, framed, record
 from esp_cli.networks.policy import StochasticPolicy
@@ -111,11 +111,6 @@ def test_seeds_and_noise_make_other_recordings_and_the_same_choice_the_same(trai
     assert filmed(trained, 3, 1) != filmed(trained, 3, 1, False)
 
 
-def test_a_seed_that_the_run_has_not_is_refused(trained):
-    with pytest.raises(ValueError, match=r"has no seed 5; it has 3, 7"):
-        filmed(trained, 5, 1)
-
-
 def test_an_episode_that_ends_early_ends_the_recording(trained, monkeypatch):
     kind = type(build_environment(trained.config, 1, "film"))
     step = kind.step
@@ -172,22 +167,6 @@ def test_a_window_grows_until_everything_stays_in_it():
     windows = {scene.window for one in (*wide, *other) for scene in one.scenes}
     assert windows == {(-1.5, 1.5, -1.5, 1.5)}, "one for all episodes"
     assert wide[0].scenes[0].bodies == inside[0][0].scenes[0].bodies
-
-
-@pytest.mark.parametrize(
-    ("period", "speed", "rate", "steps"),
-    [
-        (0.1, 1.0, 25, 1),  # 10 frames a second
-        (0.1, 2.5, 25, 1),  # just 25
-        (0.1, 4.0, 25, 2),  # 40 would be too many, 20 are not
-        (0.1, 4.0, 50, 1),
-        (0.1, 100.0, 25, 40),
-        (0.04, 1.0, 25, 1),
-        (0.1, 1.0, 3, 4),
-    ],
-)
-def test_frames_are_skipped_where_the_rate_asks_for_it(period, speed, rate, steps):
-    assert stride(period, speed, rate) == steps
 
 
 def test_shots_keep_the_first_and_last_scene_and_the_time_of_all():

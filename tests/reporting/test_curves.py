@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from esp_cli.reporting.collect import collect_runs
-from esp_cli.reporting.curves import RunCurve, read_curve
+from esp_cli.reporting.collect import RunCurve, collect_runs, read_curve
 from esp_cli.reporting.study_figures import draw_curves
 from esp_cli.reporting.tables import TABLES
 from esp_cli.training.run_folder import RunFolder
@@ -73,15 +72,6 @@ def test_a_curve_is_read_from_the_rows_that_evaluate(tmp_path):
     assert named.values.tolist() == [[-20.0, -21.0], [-19.0, -18.0]]
 
 
-def test_a_run_without_an_evaluation_or_with_other_seeds_is_refused(tmp_path):
-    for name, rows, sentence in (
-        ("young", [{"step": 50, "train/return": [1.0, 1.0]}], "no row has the metric 'eval/return_greedy'"),
-        ("other", [{"step": 0, "eval/return_greedy": [1.0]}], "its metrics have 1 seeds, its configuration 2"),
-    ):
-        with pytest.raises(ValueError, match=sentence):
-            read_curve(written(tmp_path / name, rows).path, None, "greedy")
-
-
 def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there():
     one = curve([[-9.0], [-7.0], [-5.0]], steps=(0, 800, 1600), seeds=(0,))
     assert one.config.evaluation.every_steps == 100
@@ -132,11 +122,6 @@ def test_returns_differences_thresholds_and_areas_by_hand():
     assert passed[:2] == [(-5.0, 100, [100, 100, 200]), (-2.0, 300, [300, 200, None])]
     # seed 0 up to the last step compared: trapezoids (-9 - 6) / 2 and (-6 - 4) / 2, over two intervals
     assert plain[210]["area_under_curve"][0] == pytest.approx(-6.25)
-
-
-def test_the_default_is_the_last_step_that_all_runs_reached():
-    found = compare([curve(PLAIN), curve(ESP[:3], steps=STEPS[:3])], [], [])
-    assert [list(cells) for cells in found.values()] == [[200], [200]]
 
 
 def test_runs_of_other_seeds_are_not_paired():
@@ -199,11 +184,6 @@ def test_the_picture_shows_the_curves_and_somebody_elses_number(tmp_path):
     text = picture.svg.read_text()
     assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (esp: team sum", "navigation"))
     assert text.count("<!-- plain") == 1, "one curve, whatever the number of steps"
-
-
-def test_two_runs_of_one_label_are_refused():
-    with pytest.raises(ValueError, match=r"two runs are called 'run'; give each a label of its own, as in plain=run"):
-        gathered([curve(PLAIN), curve(ESP)])
 
 
 def test_every_table_compares_at_the_last_step_that_all_runs_reached_and_says_where_each_stands():

