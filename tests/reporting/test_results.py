@@ -101,11 +101,11 @@ def test_seeds_that_never_get_there_count_as_infinitely_late(results):
 
 @pytest.mark.parametrize(("seeds", "shown", "verdict"), [((0, 1), "-", "-"), ((0, 1, 2), "1.00", "yes")])
 def test_a_probability_of_improvement_and_a_verdict_need_three_shared_seeds(tmp_path, seeds, shown, verdict):
-    ends = {"MAPPO": PLAIN[: len(seeds)], "MAPPO-ESP": [x + 1.0 for x in PLAIN[: len(seeds)]]}
+    ends = {"MAPPO": PLAIN[: len(seeds)], "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN[: len(seeds)])]}
     found = collect_study(write_study(tmp_path / "s", small_study(seeds=seeds), ends)).results
     assert column(found, "comparison", "P(improvement)>") == ["", shown]
     assert column(found, "comparison", "ahead of reference") == ["", verdict]
-    assert column(found, "comparison", "minus reference>")[1].startswith("+1.00")
+    assert column(found, "comparison", "minus reference>")[1].startswith("+6.00" if verdict == "yes" else "+5.50")
 
 
 def test_other_thresholds_can_be_asked_for(tmp_path):
