@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import (
-    JsonOption,
-    OwnAlgoOption,
-    OwnNetworkOption,
-    TaskSetOption,
-    parse_task_settings,
-    register_named,
-)
+from esp_cli.commands import options
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -41,13 +34,13 @@ def check(
     transforms: Annotated[
         str | None, typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.")
     ] = None,
-    settings: TaskSetOption = None,
+    settings: options.TaskSetOption = None,
     policy: Annotated[
         Path | None, typer.Option("--policy", help="Also measure how symmetric this policy is.", metavar="RUN|POLICY")
     ] = None,
-    algo: OwnAlgoOption = None,
-    network: OwnNetworkOption = None,
-    json: JsonOption = None,
+    algo: options.OwnAlgoOption = None,
+    network: options.OwnNetworkOption = None,
+    json: options.JsonOption = None,
 ) -> None:
     """Check what every task promises, or a task's declared symmetry.
 
@@ -61,8 +54,8 @@ def check(
     if what == "task" and any((transforms, policy, algo, network)):
         names = "--transforms, --policy, --algo and --network"
         raise UserError(f"{names} belong to 'esp check symmetry'; leave them out")
-    register_named([task], algo, network)
-    chosen = resolve_task_settings(task, parse_task_settings(settings or []))
+    options.register_named([task], algo, network)
+    chosen = resolve_task_settings(task, options.parse_task_settings(settings or []))
 
     def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(task, num_envs, seeds, chosen)

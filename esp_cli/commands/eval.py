@@ -6,19 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from esp_cli import console
-from esp_cli.commands.options import (
-    BundledAlgoOption,
-    BundledPriorOption,
-    EpisodesOption,
-    JsonOption,
-    OwnNetworkOption,
-    OwnTaskOption,
-    PhysicsOption,
-    PolicyArgument,
-    TaskSetOption,
-    parse_task_settings,
-    register_named,
-)
+from esp_cli.commands import options
 from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
@@ -32,15 +20,15 @@ EPILOG = """Examples:\n
 
 
 def evaluate(
-    policy: PolicyArgument,
-    task: OwnTaskOption = None,
-    episodes: EpisodesOption = EPISODES,
-    physics: PhysicsOption = None,
-    settings: TaskSetOption = None,
-    algo: BundledAlgoOption = None,
-    network: OwnNetworkOption = None,
-    prior: BundledPriorOption = None,
-    json: JsonOption = None,
+    policy: options.PolicyArgument,
+    task: options.OwnTaskOption = None,
+    episodes: options.EpisodesOption = EPISODES,
+    physics: options.PhysicsOption = None,
+    settings: options.TaskSetOption = None,
+    algo: options.BundledAlgoOption = None,
+    network: options.OwnNetworkOption = None,
+    prior: options.BundledPriorOption = None,
+    json: options.JsonOption = None,
 ) -> None:
     """Play episodes greedily and stochastically; print mean, s.e.m., 95 % interval, reference policies and metrics.
 
@@ -49,8 +37,8 @@ def evaluate(
     from esp_cli.policies.evaluation import evaluate as evaluate_policy
     from esp_cli.policies.loading import open_policy
 
-    register_named(task, [algo], network)
-    trained = open_policy(policy, algo, prior).transfer(parse_task_settings(settings or [], physics))
+    options.register_named(task, [algo], network)
+    trained = open_policy(policy, algo, prior).transfer(options.parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
     result = evaluate_policy(trained, episodes)

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import (
-    BundledAlgoOption,
-    BundledPriorOption,
-    ForceOption,
-    JsonOption,
-    OutOption,
-    OwnNetworkOption,
-    OwnTaskOption,
-    PolicyArgument,
-    register_named,
-)
+from esp_cli.commands import options
 from esp_cli.defaults import EPISODES
 from esp_envs.errors import UserError
 
@@ -37,21 +27,21 @@ FORMATS = ("onnx", "torch", "c", "numpy", "webots", "ros2", "policy")
 
 
 def export(
-    policy: PolicyArgument,
+    policy: options.PolicyArgument,
     formats: Annotated[
         list[str],
         typer.Option(
             "--format", "-f", help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy: bundle it."
         ),
     ],
-    out: OutOption,
-    task: OwnTaskOption = None,
+    out: options.OutOption,
+    task: options.OwnTaskOption = None,
     seed: Annotated[
         int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
     ] = None,
-    algo: BundledAlgoOption = None,
-    network: OwnNetworkOption = None,
-    prior: BundledPriorOption = None,
+    algo: options.BundledAlgoOption = None,
+    network: options.OwnNetworkOption = None,
+    prior: options.BundledPriorOption = None,
     episodes: Annotated[
         int | None,
         typer.Option(
@@ -65,8 +55,8 @@ def export(
     name: Annotated[
         str | None, typer.Option("--name", help="Name of a bundled policy; by default TASK-ALGO-PRIOR.")
     ] = None,
-    force: ForceOption = False,
-    json: JsonOption = None,
+    force: options.ForceOption = False,
+    json: options.JsonOption = None,
 ) -> None:
     """Write a policy for other programs (ONNX, torch.export, C99, numpy) or robots, checked against the policy itself.
 
@@ -77,7 +67,7 @@ def export(
     from esp_cli.policies.bundling import bundle
     from esp_cli.policies.loading import open_policy
 
-    register_named(task, [algo], network)
+    options.register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)

@@ -11,18 +11,7 @@ from typing import Annotated, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import (
-    BundledAlgoOption,
-    BundledPriorOption,
-    OutOption,
-    OwnNetworkOption,
-    OwnTaskOption,
-    PhysicsOption,
-    PolicyArgument,
-    TaskSetOption,
-    parse_task_settings,
-    register_named,
-)
+from esp_cli.commands import options
 from esp_cli.defaults import SLOWEST
 
 EPILOG = """Examples:\n
@@ -46,13 +35,13 @@ def parse_speed(value: str | float) -> float:
 
 
 def render(
-    policy: PolicyArgument,
-    out: OutOption,
+    policy: options.PolicyArgument,
+    out: options.OutOption,
     beside: Annotated[
         Path | None,
         typer.Argument(help="Another policy of the same task, which plays the same episodes.", metavar="[RUN|POLICY]"),
     ] = None,
-    task: OwnTaskOption = None,
+    task: options.OwnTaskOption = None,
     view: Annotated[
         Literal["auto", "top", "3d"],
         typer.Option("--view", help="From above, or in space; auto takes the latter where the task has it."),
@@ -78,11 +67,11 @@ def render(
         typer.Option("--fps", min=1, max=60, help="Most frames per second: 25 unless given, in a GIF up to 50."),
     ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
-    physics: PhysicsOption = None,
-    settings: TaskSetOption = None,
-    algo: BundledAlgoOption = None,
-    network: OwnNetworkOption = None,
-    prior: BundledPriorOption = None,
+    physics: options.PhysicsOption = None,
+    settings: options.TaskSetOption = None,
+    algo: options.BundledAlgoOption = None,
+    network: options.OwnNetworkOption = None,
+    prior: options.BundledPriorOption = None,
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or a picture of one episode (.png).
 
@@ -92,8 +81,8 @@ def render(
     from esp_cli.policies.loading import open_policy
 
     request = Request(out, seed, episodes, view, size, speed, fps, not stochastic)
-    register_named(task, [algo], network)
-    changed = parse_task_settings(settings or [], physics)
+    options.register_named(task, [algo], network)
+    changed = options.parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):

@@ -11,16 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from esp_cli import console
+from esp_cli.commands import options
 from esp_cli.commands.counts import parse_count
-from esp_cli.commands.options import (
-    JsonOption,
-    OwnAlgoOption,
-    OwnNetworkOption,
-    OwnTaskOption,
-    check_finite,
-    not_over_a_run,
-    register_named,
-)
 from esp_cli.defaults import Mode
 from esp_envs.errors import UserError
 
@@ -46,7 +38,9 @@ OutOption = Annotated[
 ResultsOption = Annotated[
     Path | None,
     typer.Option(
-        "--results", help="Also write every seed's numbers and the configurations as JSON.", callback=not_over_a_run
+        "--results",
+        help="Also write every seed's numbers and the configurations as JSON.",
+        callback=options.not_over_a_run,
     ),
 ]
 AtOption = Annotated[
@@ -68,7 +62,7 @@ LimitsOption = Annotated[
 ]
 CsvOption = Annotated[
     Path | None,
-    typer.Option("--csv", help="Write every logged number of every seed as a table.", callback=not_over_a_run),
+    typer.Option("--csv", help="Write every logged number of every seed as a table.", callback=options.not_over_a_run),
 ]
 PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")]
 
@@ -85,19 +79,19 @@ def report(
     y_limits: LimitsOption = None,
     plot: PlotOption = None,
     csv: CsvOption = None,
-    task: OwnTaskOption = None,
-    algo: OwnAlgoOption = None,
-    network: OwnNetworkOption = None,
-    json: JsonOption = None,
+    task: options.OwnTaskOption = None,
+    algo: options.OwnAlgoOption = None,
+    network: options.OwnNetworkOption = None,
+    json: options.JsonOption = None,
 ) -> None:
     """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
     from esp_cli.reporting.collect import collect_study
     from esp_cli.studies.study import StudyFolder
 
-    register_named(task, algo, network)
+    options.register_named(task, algo, network)
     limits, lines = threshold or [], _references(reference or [])
-    check_finite("--threshold", *limits)
-    check_finite("--y-limits", *(y_limits or ()))
+    options.check_finite("--threshold", *limits)
+    options.check_finite("--y-limits", *(y_limits or ()))
     if y_limits is not None and y_limits[0] >= y_limits[1]:
         low, high = y_limits
         raise UserError(f"--y-limits {low:g} {high:g} is empty; write the lowest return before the highest")

@@ -13,19 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
+from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds, parse_count
-from esp_cli.commands.options import (
-    DeviceOption,
-    EpisodesOption,
-    JsonOption,
-    NoCheckOption,
-    PresetOption,
-    SeedListOption,
-    SeedsOption,
-    SetOption,
-    parse_assignments,
-    register_named,
-)
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_envs.errors import UserError
 
@@ -44,7 +33,7 @@ def _changed(annotation: Any, **changes: object) -> Any:
 if TYPE_CHECKING:
     StudySeedsOption = tuple[int, ...] | None
 else:
-    StudySeedsOption = _changed(SeedsOption, show_default=str(len(STUDY_SEEDS)))
+    StudySeedsOption = _changed(options.SeedsOption, show_default=str(len(STUDY_SEEDS)))
 
 TasksOption = Annotated[
     list[str] | None,
@@ -130,20 +119,20 @@ class StudyChoices:
     algos: AlgosOption = None
     steps: StudyStepsOption = None
     seeds: StudySeedsOption = None
-    seed_list: SeedListOption = None
+    seed_list: options.SeedListOption = None
     out: StudyOutOption = None
-    preset: PresetOption = "default"
-    settings: SetOption = None
-    device: DeviceOption = "cpu"
-    episodes: EpisodesOption = EPISODES
+    preset: options.PresetOption = "default"
+    settings: options.SetOption = None
+    device: options.DeviceOption = "cpu"
+    episodes: options.EpisodesOption = EPISODES
     jobs: JobsOption = None
     engine: EngineOption = "local"
     address: AddressOption = None
     gpu_share: GpuShareOption = 1.0
     dry_run: DryRunOption = False
     reuse: ReuseOption = None
-    no_check: NoCheckOption = False
-    json: JsonOption = None
+    no_check: options.NoCheckOption = False
+    json: options.JsonOption = None
     words: Sequence[str] = field(init=False, default=())  # the command without these options: "reproduce", "table1"
 
     def folder(self, kind: str) -> Path:
@@ -164,8 +153,8 @@ class StudyChoices:
         from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
-        overrides = parse_assignments(self.settings or [])
-        register_named(parse_names(self.tasks), parse_names(self.algos), [overrides.get("network.name")])
+        overrides = options.parse_assignments(self.settings or [])
+        options.register_named(parse_names(self.tasks), parse_names(self.algos), [overrides.get("network.name")])
         asked = self._given("tasks", "algos", "steps", "seeds", "seed_list", "preset", "settings", "device", "episodes")
         on_cluster = (self.engine, self.device) == ("ray", "cuda")  # whose GPU need not be here
         return Request(

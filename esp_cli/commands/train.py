@@ -11,24 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from esp_cli import console
+from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds
-from esp_cli.commands.options import (
-    AlgoOption,
-    DeviceOption,
-    NoCheckOption,
-    PhysicsOption,
-    PresetOption,
-    SeedListOption,
-    SeedsOption,
-    SetOption,
-    StepsOption,
-    TaskOption,
-    TransformsOption,
-    note_without_effect,
-    parse_assignments,
-    register_named,
-    was_given,
-)
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.defaults import STEPS, PriorKind
 from esp_cli.networks.kernels.library import begin
@@ -50,9 +34,9 @@ DEFAULT_SEEDS = (0,)
 
 def train(
     context: typer.Context,
-    task: TaskOption = "navigation",
-    algo: AlgoOption = "mappo",
-    preset: PresetOption = "default",
+    task: options.TaskOption = "navigation",
+    algo: options.AlgoOption = "mappo",
+    preset: options.PresetOption = "default",
     prior: Annotated[
         Literal[PriorKind, "auto"] | None,
         typer.Option(
@@ -60,11 +44,11 @@ def train(
             help="esp: both parts; auto: as far as the task is symmetric; augment, consistency: one part; none: plain.",
         ),
     ] = None,
-    transforms: TransformsOption = None,
+    transforms: options.TransformsOption = None,
     consistency_coef: Annotated[
         float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
     ] = None,
-    physics: PhysicsOption = None,
+    physics: options.PhysicsOption = None,
     network: Annotated[
         str | None,
         typer.Option(
@@ -72,13 +56,13 @@ def train(
             help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn), equivariant, or module:Class.",
         ),
     ] = None,
-    steps: StepsOption = STEPS,
-    seeds: SeedsOption = None,
-    seed_list: SeedListOption = None,
+    steps: options.StepsOption = STEPS,
+    seeds: options.SeedsOption = None,
+    seed_list: options.SeedListOption = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.")] = None,
     resume: Annotated[Path | None, typer.Option("--resume", help="Continue this run with its own settings.")] = None,
-    device: DeviceOption = "cpu",
-    settings: SetOption = None,
+    device: options.DeviceOption = "cpu",
+    settings: options.SetOption = None,
     config: Annotated[
         Path | None,
         typer.Option(
@@ -104,10 +88,10 @@ def train(
             help="Give the metrics to tensorboard, wandb or mlflow too; repeatable. Offline, in the run folder.",
         ),
     ] = None,
-    no_check: NoCheckOption = False,
+    no_check: options.NoCheckOption = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
-    named = parse_assignments(settings or [])
+    named = options.parse_assignments(settings or [])
     if named.get("network.compiled"):
         begin("perceptron")  # while torch is imported
 
@@ -117,7 +101,7 @@ def train(
     from esp_cli.training.trackers import require
 
     trackers = tuple(track or ())
-    register_named([task], [algo], [network, named.get("network.name")])
+    options.register_named([task], [algo], [network, named.get("network.name")])
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
@@ -142,7 +126,7 @@ def train(
     }
     overrides = {name: value for name, value in short.items() if value is not None} | named
     resolved, weights, idle = plan_run(context, config, choices, overrides)
-    note_without_effect(idle)
+    options.note_without_effect(idle)
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
@@ -154,7 +138,8 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", "no_check", *allowed) and was_given(context, parameter.name)
+        if parameter.name not in ("resume", "track", "no_check", *allowed)
+        and options.was_given(context, parameter.name)
     ]
     if given:
         raise UserError(
