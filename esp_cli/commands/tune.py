@@ -10,19 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from esp_cli import console
+from esp_cli.commands import studying
 from esp_cli.commands.options import check_finite, note_without_effect
 from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import (
-    follow,
-    measuring,
-    open_resources,
-    print_forecast,
-    refuse_failed,
-    report_study,
-    run_cells,
-    stopped,
-)
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
@@ -117,11 +108,13 @@ def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     from esp_cli.studies.forecast import forecast_search
 
     out = choices.folder("tune")
-    with open_resources(choices, out, tuning.device) as resources:
+    with studying.open_resources(choices, out, tuning.device) as resources:
         jobs = resources.jobs
-    with measuring(len(tuning.priors)) as listener:
+    with studying.measuring(len(tuning.priors)) as listener:
         found = forecast_search(tuning, out, request.seeds, request.episodes, jobs, listener)
-    print_forecast(found, choices.json, "all trials with the default settings, of which pruning saves about half")
+    studying.print_forecast(
+        found, choices.json, "all trials with the default settings, of which pruning saves about half"
+    )
 
 
 def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
@@ -138,7 +131,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     out, fresh = choices.folder("tune"), None
     judged = out / FRESH
     with (
-        open_resources(choices, out, tuning.device) as resources,
+        studying.open_resources(choices, out, tuning.device) as resources,
         Search.held(out),
         stop_requests("stopping every run after its iteration") as requests,
     ):
@@ -146,19 +139,19 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
             StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
         search = Search.create(out, tuning)
         search.check = resources.check
-        failed = follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
+        failed = studying.follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
         outcomes = [search.outcome(prior) for prior in tuning.priors]
         best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
         _report(search, outcomes, quiet=choices.json == "-")
         if best and not (requests or failed):
             study = fresh_study(tuning, best, request.seeds, request.episodes)
             fresh = StudyFolder.create(judged, study)
-            failed = run_cells(fresh, study, resources, requests)
+            failed = studying.run_cells(fresh, study, resources, requests)
     if requests:
-        raise stopped(tuning.command, choices)
+        raise studying.stopped(tuning.command, choices)
     if fresh is not None:
-        report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
-    refuse_failed(failed, out)
+        studying.report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
+    studying.refuse_failed(failed, out)
     if not best:
         raise UserError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
 
