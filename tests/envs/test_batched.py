@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_envs import BatchedTask, Environment, Field, Kind, generators_for, layout, to_others
+from esp_envs import BatchedTask, Environment, Field, Kind, Scene, generators_for, layout, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec, discrete_moves
@@ -305,33 +305,10 @@ def test_others_are_seen_in_index_order() -> None:
     assert to_others(position[:1]).shape == (1, 0, 1)
 
 
-class Nan(Plain):
-    def _observe(self, world):
-        return world["position"] / 0
-
-
-class Unequal(Plain):
-    def _describe(self):
-        return TaskSpec(**{**vars(super()._describe()), "shared_reward": True})
-
-    def _advance(self, world, action):
-        self._unproven = 0  # as after the first episode, in which the task itself would notice
-        return super()._advance(world, action)
-
-
 class EarlyClock(Plain):
     def step(self, action):
-        return super().step(action) if self._time < 2 else self._ended_early(action)
-
-    def _ended_early(self, action):
-        self._time = self.spec.horizon - 1
+        self._time = self.spec.horizon - 1 if self._time >= 2 else self._time
         return super().step(action)
-
-
-class Endless(Climb):
-    def step(self, action):
-        step = super().step(action)
-        return replace(step, terminated=step.terminated & False, final=None)
 
 
 class Ended(Plain):
@@ -340,46 +317,31 @@ class Ended(Plain):
         return replace(step, terminated=step.truncated, truncated=step.terminated)
 
 
+class Endless(Climb):
+    def step(self, action):
+        step = super().step(action)
+        return replace(step, terminated=step.terminated & False, final=None)
+
+
+class Unequal(Plain):
+    def _describe(self):
+        return replace(super()._describe(), shared_reward=True)
+
+    def _advance(self, world, action):
+        self._unproven = 0  # as after the first episode, in which the task itself would notice
+        return super()._advance(world, action)
+
+
 class GlobalDice(Plain):
     def _advance(self, world, action):
         reward, metrics = super()._advance(world, action)
         return reward + torch.rand(()), metrics
 
 
-class SharedDice(Plain):
-    def _episodes(self):
-        return {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])}
-
-
-class Crowd(Plain):
-    def _advance(self, world, action):
-        return super()._advance(world, action + action.mean((0, 1), keepdim=True))
-
-
 class Leaky(Plain):
     def _play(self, action):
         action[..., 0] += 1
         return super()._play(action)
-
-
-class Forgetful(Plain):
-    def state_dict(self):
-        return super().state_dict() | {"time": torch.tensor(0)}
-
-
-class Careless(Plain):
-    def load_state_dict(self, tensors):
-        self.world = self._split(tensors["world"])
-
-
-class Lazy(Plain):
-    def step(self, action):
-        return super().step(action.reshape(self.action_shape))
-
-
-class OffState(Plain):
-    def _put(self, state):
-        super()._put(state * 2)
 
 
 class NoRestart(Plain):
@@ -390,39 +352,42 @@ class NoRestart(Plain):
         return seen
 
 
-class Empty(Plain):
-    def scene(self, world=(0, 0)):
-        from esp_envs import Scene
-
-        return Scene((), (0, 1, 0, world[0] + 1))
-
-
-class Wild(Plain):
-    heuristics = ("far",)
-
-    def heuristic(self, name=None):
-        return torch.full(self.action_shape, 3.0)
+def plain(**methods: object) -> type[Environment]:
+    """Return the plain task with other methods."""
+    return type("_".join(methods), (Plain,), methods)
 
 
 BREAKERS = {
-    "observations_rewards_and_metrics_fit_the_spec": [Nan, Unequal],
-    "actions_of_heuristics_and_chance_lie_in_the_action_space": [Wild],
+    "observations_rewards_and_metrics_fit_the_spec": [plain(_observe=lambda _, world: world["position"] / 0), Unequal],
+    "actions_of_heuristics_and_chance_lie_in_the_action_space": [
+        plain(heuristics=("far",), heuristic=lambda self, name=None: torch.full(self.action_shape, 3.0))
+    ],
     "episodes_end_when_the_spec_says": [EarlyClock, Endless, Ended],
     "the_same_seed_gives_the_same_run": [GlobalDice],
-    "a_seed_alone_equals_itself_among_others": [SharedDice],
-    "worlds_do_not_touch_each_other": [Crowd],
+    "a_seed_alone_equals_itself_among_others": [
+        plain(_episodes=lambda self: {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])})
+    ],
+    "worlds_do_not_touch_each_other": [
+        plain(_advance=lambda self, world, a: Plain._advance(self, world, a + a.mean((0, 1), keepdim=True)))
+    ],
     "results_are_memory_of_their_own": [Leaky],
-    "a_saved_environment_goes_on_bit_for_bit": [Forgetful],
-    "an_environment_of_another_size_is_refused": [Careless],
-    "a_joint_action_of_the_wrong_shape_is_refused": [Lazy],
-    "set_state_reproduces_what_follows": [OffState],
+    "a_saved_environment_goes_on_bit_for_bit": [
+        plain(state_dict=lambda self: Plain.state_dict(self) | {"time": torch.tensor(0)})
+    ],
+    "an_environment_of_another_size_is_refused": [
+        plain(load_state_dict=lambda self, tensors: setattr(self, "world", self._split(tensors["world"])))
+    ],
+    "a_joint_action_of_the_wrong_shape_is_refused": [
+        plain(step=lambda self, action: Plain.step(self, action.reshape(self.action_shape)))
+    ],
+    "set_state_reproduces_what_follows": [plain(_put=lambda self, state: Plain._put(self, state * 2))],
     "set_state_starts_an_episode": [NoRestart],
-    "a_scene_can_be_drawn": [Empty],
+    "a_scene_can_be_drawn": [plain(scene=lambda self, world=(0, 0): Scene((), (0, 1, 0, world[0] + 1)))],
 }
 BY_NAME = {promise.__name__: promise for promise in PROMISES}
 
 
-@pytest.mark.parametrize(("name", "cls"), [(name, cls) for name, many in BREAKERS.items() for cls in many], ids=str)
+@pytest.mark.parametrize(("name", "cls"), [(name, cls) for name, many in BREAKERS.items() for cls in many])
 def test_a_task_that_breaks_a_promise_is_found(name: str, cls: type[Environment]) -> None:
     with pytest.raises(Broken):
         BY_NAME[name](Subject(lambda num_envs, seeds: worlds(cls, num_envs, seeds)))

@@ -28,6 +28,9 @@ def test_bodies_lie_where_they_should_and_y_points_up() -> None:
     assert pixel(picture, -0.55, 0.6) == pixel(draw(Scene((), WINDOW), 200), -0.55, 0.6)
     picture[:] = 0
     assert pixel(draw(scene, 200), 0.5, 0.5) == [255, 0, 0], "the picture is the caller's own"
+    assert draw(Scene((), (0.0, 4.0, 0.0, 1.0)), 200).shape == (50, 200, 3)
+    round_body = draw(Scene((Body((0.0, 0.0), 0.7, "#000000"),), WINDOW), 100)
+    assert len(np.unique(round_body[:, 20], axis=0)) > 8, "edges are smooth"
 
 
 def test_shapes_differ() -> None:
@@ -59,13 +62,10 @@ def test_trails_are_the_ways_of_the_bodies_that_leave_one() -> None:
     scenes = [Scene((still, Body((0.1 * k, 0.0), 0.1, RED, trail=True)), WINDOW) for k in range(3)]
     assert list(trails(scenes[-1], scenes[:-1])) == [(scenes[-1].bodies[1], [(0.0, 0.0), (0.1, 0.0), (0.2, 0.0)])]
     assert list(trails(scenes[-1], ())) == []
-
-
-def test_a_trail_fades_from_the_background_to_four_fifths_of_the_colour() -> None:
-    assert fade(RED, 0.0) == (0xFA, 0xFA, 0xF7)
     assert BACKGROUND == "#fafaf7"
-    assert fade(RED, 1.0) == (254, 50, 49)  # 250 + 0.8 (255 - 250), 250 - 0.8 x 250, 247 - 0.8 x 247
+    assert fade(RED, 0.0) == (0xFA, 0xFA, 0xF7)
     assert fade(RED, 0.5) == (252, 150, 148)
+    assert fade(RED, 1.0) == (254, 50, 49)  # 250 + 0.8 (255 - 250), 250 - 0.8 x 250, 247 - 0.8 x 247
 
 
 def test_the_painter_draws_the_same_as_the_function() -> None:
@@ -74,15 +74,6 @@ def test_the_painter_draws_the_same_as_the_function() -> None:
     assert np.array_equal(painter.draw(scenes[2], scenes[:2]), draw(scenes[2], 100, scenes[:2]))
     assert np.array_equal(painter.draw(scenes[2]), draw(scenes[2], 100))
     assert (painter.note, TopPainter(100).note) == ("no space here", None)
-
-
-def test_edges_are_smooth() -> None:
-    picture = draw(Scene((Body((0.0, 0.0), 0.7, "#000000"),), WINDOW), 100)
-    assert len(np.unique(picture[:, 20], axis=0)) > 8
-
-
-def test_an_oblong_window_gives_an_oblong_picture() -> None:
-    assert draw(Scene((), (0.0, 4.0, 0.0, 1.0)), 200).shape == (50, 200, 3)
 
 
 @pytest.mark.parametrize(("window", "size"), [((0.0, 0.0, 0.0, 1.0), 100), (WINDOW, 3)])

@@ -51,14 +51,8 @@ def test_a_class_can_be_registered_itself(folder: Path) -> None:
     name = register(navigation)
     assert name == "esp_envs.mpe.navigation:Navigation"
     assert task_class(name) is navigation
-
-
-def test_every_public_name_can_be_imported() -> None:
-    assert all(hasattr(esp_envs, name) for name in esp_envs.__all__)
-
-
-def test_an_ordinary_name_needs_no_registration() -> None:
-    assert register("navigation") == "navigation"
+    assert register("navigation") == "navigation", "an ordinary name needs no registration"
+    assert all(hasattr(esp_envs, public) for public in esp_envs.__all__)
 
 
 @pytest.mark.parametrize(

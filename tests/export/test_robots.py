@@ -132,68 +132,51 @@ def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path,
     assert "from poses" not in (tmp_path / "README.md").read_text()
 
 
-class Node:
-    """Webots' node of a body that stands somewhere."""
+def node(name: str, pose) -> SimpleNamespace:
+    """Return Webots' node of a body that stands where `pose` says."""
 
-    def __init__(self, name: str, pose) -> None:
-        self.name, self.pose = name, pose
-
-    def getDef(self) -> str:  # noqa: N802 - Webots' name
-        return self.name
-
-    def getPosition(self) -> list[float]:  # noqa: N802 - Webots' name
-        return [self.pose()[0], self.pose()[1], 0.0]
-
-    def getOrientation(self) -> list[float]:  # noqa: N802 - Webots' name
-        c, s = math.cos(self.pose()[2]), math.sin(self.pose()[2])
+    def orientation() -> list[float]:
+        c, s = math.cos(pose()[2]), math.sin(pose()[2])
         return [c, -s, 0.0, s, c, 0.0, 0.0, 0.0, 1.0]
 
+    return SimpleNamespace(getDef=lambda: name, getPosition=lambda: [*pose()[:2], 0.0], getOrientation=orientation)
 
-class Motor:
-    """Webots' wheel motor; writes into the team's wheel speeds."""
 
-    def __init__(self, wheels: np.ndarray, side: int) -> None:
-        self.wheels, self.side, self.position = wheels, side, 0.0
+def motor(wheels: np.ndarray, side: int, most: float) -> SimpleNamespace:
+    """Return Webots' wheel motor, which writes into the team's wheel speeds."""
+    positions = [0.0]
 
-    def setPosition(self, position: float) -> None:  # noqa: N802 - Webots' name
-        self.position = position
-
-    def setVelocity(self, velocity: float) -> None:  # noqa: N802 - Webots' name
-        assert self.position == math.inf, "a motor turns to a position, unless that is infinite"
+    def turn(velocity: float) -> None:
+        assert positions[-1] == math.inf, "a motor turns to a position, unless that is infinite"
         assert isinstance(velocity, float)
-        self.wheels[self.side] = velocity
+        wheels[side] = velocity
 
-    def getMaxVelocity(self) -> float:  # noqa: N802 - Webots' name
-        return MAX_WHEEL_SPEED
+    return SimpleNamespace(setPosition=positions.append, setVelocity=turn, getMaxVelocity=lambda: most)
 
 
-class Robot:
-    """Webots' Supervisor of one e-puck; `advance` is called where the simulation goes on."""
+def robot(team: Team, own: int, wheels: np.ndarray, advance=None, most: float = MAX_WHEEL_SPEED) -> SimpleNamespace:
+    """Return Webots' Supervisor of one e-puck; `advance` is called where the simulation goes on."""
+    motors = {f"{name} wheel motor": motor(wheels[own], side, most) for side, name in enumerate(("left", "right"))}
 
-    def __init__(self, team: Team, own: int, wheels: np.ndarray, advance=None) -> None:
-        self.team, self.own, self.advance = team, own, advance
-        self.motors = [Motor(wheels[own], side) for side in (0, 1)]
-
-    def getBasicTimeStep(self) -> float:  # noqa: N802 - Webots' name
-        return 10.0
-
-    def getSelf(self) -> Node | None:  # noqa: N802 - Webots' name
-        return self.getFromDef(f"ROBOT{self.own}")
-
-    def getFromDef(self, name: str) -> Node | None:  # noqa: N802 - Webots' name
+    def named(name: str) -> SimpleNamespace | None:
         kind, index = name.rstrip("0123456789"), int(name.lstrip("ROBTPILA"))
-        if kind == "ROBOT" and index < len(self.team.poses):
-            return Node(name, lambda: self.team.poses[index])
-        if kind == "PILLAR" and index < len(self.team.pillars[0]):
-            return Node(name, lambda: (*self.team.pillars[0, index], 0.0))
+        if kind == "ROBOT" and index < len(team.poses):
+            return node(name, lambda: team.poses[index])
+        if kind == "PILLAR" and index < len(team.pillars[0]):
+            return node(name, lambda: (*team.pillars[0, index], 0.0))
         return None
 
-    def getDevice(self, name: str) -> Motor:  # noqa: N802 - Webots' name
-        return self.motors[["left wheel motor", "right wheel motor"].index(name)]
-
-    def step(self, milliseconds: int) -> int:
+    def step(milliseconds: int) -> int:
         assert milliseconds == 100
-        return self.advance()
+        return advance()
+
+    return SimpleNamespace(
+        getBasicTimeStep=lambda: 10.0,
+        getSelf=lambda: named(f"ROBOT{own}"),
+        getFromDef=named,
+        getDevice=motors.__getitem__,
+        step=step,
+    )
 
 
 @pytest.mark.parametrize("case", ["offset", "wheel pairs", "nearness, three neighbours"])
@@ -213,12 +196,12 @@ def test_the_webots_controller_drives_as_the_policy_does(
         paths.append(team.poses)
         return 0 if len(paths) <= STEPS else -1
 
-    first = Robot(team, 0, wheels, advance)
+    first = robot(team, 0, wheels, advance)
     module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
     pilot = module.Pilot(sys.modules["policy"].DESCRIPTION, sys.modules["policy"].act)
     # goals are opposite to the posts, from which the start is up to a centimetre away
     goals = [tuple(goal) for goal in team.goals]
-    others = [module.Driver(Robot(team, k, wheels), pilot, goals[k]) for k in range(1, len(team.poses))]
+    others = [module.Driver(robot(team, k, wheels), pilot, goals[k]) for k in range(1, len(team.poses))]
     monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *map(str, goals[0])])
     module.main()
     assert len(paths) == STEPS + 1
@@ -233,8 +216,8 @@ def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
 ) -> None:
     export(drawn_policy("wheels"), ["webots"], tmp_path)
     team = SimpleNamespace(poses=np.array([[0.3, 0.2, 1.0], [0.9, -0.5, 2.0]]), pillars=np.zeros((1, 0, 2)))
-    robot = Robot(team, 1, np.zeros((2, 2)), lambda: -1)
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
+    second = robot(team, 1, np.zeros((2, 2)), lambda: -1)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: second))
     asked = []
 
     def wheels(poses, goals, pillars) -> np.ndarray:
@@ -251,11 +234,9 @@ def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
 def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(drawn_policy("wheels"), ["webots"], tmp_path)
     team, wheels = SimpleNamespace(poses=np.zeros((1, 3)), pillars=np.zeros((1, 0, 2))), np.zeros((1, 2))
-    robot = Robot(team, 0, wheels)
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
-    monkeypatch.setattr(Motor, "getMaxVelocity", lambda motor: 4.0)
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=None))
     pilot = SimpleNamespace(wheels=lambda *_: np.array([[6.28, -5.0]]))
-    module.Driver(robot, pilot).act()
+    module.Driver(robot(team, 0, wheels, most=4.0), pilot).act()
     assert wheels.tolist() == [[4.0, -4.0]]
 
 
@@ -263,15 +244,14 @@ def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: p
     trained = drawn_policy("wheels")
     export(trained, ["webots"], tmp_path)
     team = Team(trained)
-    robot = Robot(team, 0, np.zeros((8, 2)))
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: robot))
-    monkeypatch.setattr(robot, "getBasicTimeStep", lambda: 32.0)
+    odd = robot(team, 0, np.zeros((8, 2)))
+    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: odd))
+    odd.getBasicTimeStep = lambda: 32.0
     with pytest.raises(ValueError, match=r"basicTimeStep is 32\.0 ms; take a divisor of 100 ms"):
         module.main()
-    monkeypatch.setattr(robot, "getSelf", lambda: Node("EPUCK", lambda: (0, 0, 0)))
+    odd.getSelf = lambda: node("EPUCK", lambda: (0, 0, 0))
     with pytest.raises(ValueError, match="this robot has the DEF name 'EPUCK'"):
-        module.Driver(robot, None)
-    monkeypatch.undo()
+        module.Driver(odd, None)
 
 
 class RosNode:

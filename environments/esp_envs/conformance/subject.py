@@ -28,17 +28,13 @@ class NotAsked(ValueError):  # noqa: N818
 class Subject:
     """A task to check.
 
-    Attributes:
-        make: makes the worlds, given E and the seeds.
-        rounding: how far a step from a restored state may differ, where the physics is finer than float32.
-        deadline: at which time, as `time.monotonic` gives it, promises about many steps stop looking.
-        align: gives the second environment the chance that the first has drawn in advance, at a step of its episode.
+    `align` gives the second environment the chance that the first has drawn in advance, at a step of its episode.
     """
 
-    make: MakeWorlds
-    rounding: float = 0.0
+    make: MakeWorlds  # makes the worlds, given E and the seeds
+    rounding: float = 0.0  # how far a step from a restored state may differ, where physics is finer than float32
     align: Callable[[Environment, Environment, int], None] | None = None
-    deadline: float = math.inf
+    deadline: float = math.inf  # at which `time.monotonic` promises about many steps stop looking
 
     def worlds(self, num_envs: int = WORLDS, seeds: Sequence[int] = SEEDS) -> Environment:
         """Make E worlds for each seed."""

@@ -15,18 +15,11 @@ PILLAR_RING = 0.4  # distance of the pillars from the middle, as a share of half
 
 @dataclass(frozen=True)
 class Arena:
-    """What stands still, and where robots start.
+    """What stands still, and where robots start."""
 
-    Attributes:
-        side_m: length of a wall.
-        num_robots: N.
-        num_pillars: M.
-        pillar_radius_m: of each pillar.
-    """
-
-    side_m: float
-    num_robots: int
-    num_pillars: int
+    side_m: float  # length of a wall
+    num_robots: int  # N
+    num_pillars: int  # M
     pillar_radius_m: float
 
     def __post_init__(self) -> None:
@@ -55,10 +48,7 @@ class Arena:
     def posts(self) -> Array:
         """Return where the robots start, evenly spread along a square: eight stand on corners and edge midpoints.
 
-        The goal of a robot is the antipodal point of its post.
-
-        Shape:
-            [N, 2], counter-clockwise from the lower left corner, m.
+        They are [N, 2], counter-clockwise from the lower left corner, m. A robot's goal is the antipode of its post.
         """
         along = np.arange(self.num_robots) * 4 / self.num_robots
         corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])

@@ -29,13 +29,7 @@ def length(offset: Array) -> Array:
 
 
 def nearest(apart: Array, ways: Array, count: int) -> Array:
-    """Return the offsets [W, N, count, 2] of the nearest bodies, nearest first.
-
-    Args:
-        apart: [W, N, B] distances of the centres, m.
-        ways: [W, N, B, 2] offsets of the centres, m.
-        count: of bodies.
-    """
+    """Return the offsets [W, N, count, 2] of the nearest bodies, by distances [W, N, B] and offsets [W, N, B, 2], m."""
     index = apart.argmin(-1)[..., None] if count == 1 else np.argsort(apart, -1, kind="stable")[..., :count]
     worlds, robots = np.arange(len(apart))[:, None, None], np.arange(apart.shape[1])[:, None]
     return ways[worlds, robots, index]
@@ -44,9 +38,7 @@ def nearest(apart: Array, ways: Array, count: int) -> Array:
 def nearness(offset: Array, reach_m: float) -> Array:
     """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
 
-    Args:
-        offset: [..., 2] between the centres, m.
-        reach_m: distance of the centres where the bodies touch.
+    The offset [..., 2] is between the centres; at the distance `reach_m` the bodies touch.
     """
     distance = np.maximum(length(offset), 1e-9)[..., None]
     return offset / distance * np.exp(-np.maximum(distance - reach_m, 0) / FADING_M)

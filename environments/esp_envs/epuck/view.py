@@ -44,16 +44,10 @@ _Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the picture is taken from.
+    """Where the picture, `width` times `height` pixels, is taken from."""
 
-    Attributes:
-        target: the point (x, y, 0) in the middle of the picture, m.
-        distance: of the camera from it, m.
-        width, height: of the picture, pixels.
-    """
-
-    target: tuple[float, float, float]
-    distance: float
+    target: tuple[float, float, float]  # the point (x, y, 0) in the middle of the picture, m
+    distance: float  # of the camera from it, m
     width: int
     height: int
 
@@ -111,14 +105,7 @@ class SpacePainter:
         self._renderer: mujoco.Renderer | None = None
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-        """Draw one scene.
-
-        Args:
-            scene: what to draw; its window is the floor between the walls.
-            trail: earlier scenes of the same world, oldest first; bodies that leave a trail get one.
-
-        Shape:
-            [H, W, 3] uint8, red, green and blue; the first row is the top.
+        """Draw one scene, whose window is the floor between the walls; see `esp_envs.scene.Painter`.
 
         Raises:
             UserError: the window is empty, or a body has an unknown model or none.

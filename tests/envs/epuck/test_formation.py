@@ -55,17 +55,19 @@ def test_any_number_of_robots_starts_on_the_edge_and_its_goals_are_antipodal(rob
     torch.testing.assert_close(state[..., where["goals"]], -state[..., where["position"]])
 
 
-def test_robots_or_pillars_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="16 robots do not fit around an arena"):
-        make("formation", 1, [0], {"num_agents": 16, "arena_m": 0.5})
-    with pytest.raises(ValueError, match=r"a robot does not fit into an arena of 0.01 m"):
-        make("formation", 1, [0], {"num_agents": 1, "num_obstacles": 0, "arena_m": 0.01})
-    with pytest.raises(ValueError, match=r"8 pillars of radius .* overlap"):
-        make("formation", 1, [0], {"num_obstacles": 8, "obstacle_radius_m": 0.3})
-    with pytest.raises(ValueError, match=r"pillars of radius 0.9 m reach the posts"):
-        make("formation", 1, [0], {"obstacle_radius_m": 0.9})
-    with pytest.raises(ValueError, match=r"control period of .* is not a multiple"):
-        make("formation", 1, [0], {"control_period_s": 0.055})
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"num_agents": 16, "arena_m": 0.5}, "16 robots do not fit around an arena"),
+        ({"num_agents": 1, "num_obstacles": 0, "arena_m": 0.01}, "a robot does not fit into an arena of 0.01 m"),
+        ({"num_obstacles": 8, "obstacle_radius_m": 0.3}, "8 pillars of radius .* overlap"),
+        ({"obstacle_radius_m": 0.9}, "pillars of radius 0.9 m reach the posts"),
+        ({"control_period_s": 0.055}, "control period of .* is not a multiple"),
+    ],
+)
+def test_what_does_not_fit_is_refused(settings: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        make("formation", 1, [0], settings)
 
 
 def test_progress_is_paid_by_the_metre() -> None:
@@ -160,22 +162,17 @@ def test_arrival_counts_once_and_time_runs_until_then() -> None:
     assert distances[-1] == pytest.approx(gaps.mean().item(), abs=1e-5)
 
 
-def test_arrival_counts_anew_in_every_episode() -> None:
-    env = world([(0.48, 0.0)], [(0.5, 0.0)])
-    start = env._seen().state
-    for _ in range(2):
-        env.set_state(start)
-        assert [env.step(wheels((0, 0))).metrics["arrival_rate"].item() for _ in range(2)] == [1.0, 0.0]
-
-
 def test_a_robot_that_passes_its_goal_has_arrived_once_and_for_all() -> None:
     env = world([(0.0, 0.0)], [(0.0, 0.0)])
+    start = env._seen().state
     # 8 steps of 1.256 cm lead beyond the 5 cm, and 8 back again
     steps = [env.step(wheels((speed, speed))) for speed in (1, -1) for _ in range(8)]
     away = [step.next.state[0, 0, env.spec.state.slices()["position"]].norm().item() for step in steps]
     assert away[-1] < 0.05 < max(away)
     assert [step.metrics["arrival_rate"].item() for step in steps] == [1.0] + [0.0] * 15
     assert [step.metrics["time_to_arrival_s"].item() for step in steps] == [0.0] * 16
+    env.set_state(start)
+    assert env.step(wheels((0, 0))).metrics["arrival_rate"].item() == 1.0, "and anew in the next episode"
 
 
 def test_bodies_that_touch_from_the_start_do_not_collide() -> None:
@@ -311,17 +308,11 @@ def test_masses_and_grip_spread_evenly_around_a_robots_own_and_a_state_brings_th
         assert bool(((values - 1).abs() <= spread).all())
         # 320 uniform numbers: their deviation of spread / sqrt(3) is known to 2.5 %
         assert values.std().item() == pytest.approx(spread / math.sqrt(3), rel=0.1)
-    env.set_state(state)
-    assert all(bool((env.state_dict()[f"physics.{name}"] == 1).all()) for name in ("mass", "friction"))
-
-
-def test_masses_and_grip_are_drawn_apart() -> None:
-    env = make("formation", 40, [0], {"mass_spread": 0.3, "friction_spread": 0.6})
-    env.reset()
-    drawn = env.state_dict()
     pairs = torch.stack([drawn[f"physics.{name}"].flatten() for name in ("mass", "friction")])
     # 320 independent pairs: their correlation is 0 with a standard error of 0.056
     assert abs(torch.corrcoef(pairs)[0, 1].item()) < 0.25
+    env.set_state(state)
+    assert all(bool((env.state_dict()[f"physics.{name}"] == 1).all()) for name in ("mass", "friction"))
 
 
 def test_steering_by_hand() -> None:
@@ -333,12 +324,8 @@ def test_steering_by_hand() -> None:
     expected = [[1.0, 1.0], [part - 0.5, part + 0.5], [part + 0.5, part - 0.5], [-1.0, 1.0]]
     np.testing.assert_allclose(driven, expected, atol=1e-9)
     assert not rules.towards(np.zeros((1, 4, 2)), heading, PERIOD_S).any(), "rests at its goal"
-
-
-def test_a_robot_drives_slowly_to_a_goal_that_is_nearer_than_a_step() -> None:
-    reach = MAX_SPEED_M_S * PERIOD_S
-    wish = np.array([[[0.5 * reach, 0.0], [0.2 * reach, 0.0], [0.09 * reach, 0.0]]])
-    driven = rules.towards(wish, np.zeros((1, 3)), PERIOD_S)[0]
+    near = np.array([[0.5], [0.2], [0.09]]) * [[[MAX_SPEED_M_S * PERIOD_S, 0.0]]]  # shares of a period's way
+    driven = rules.towards(near, np.zeros((1, 3)), PERIOD_S)[0]
     np.testing.assert_allclose(driven, [[0.5, 0.5], [0.2, 0.2], [0.0, 0.0]], atol=1e-9)
 
 
