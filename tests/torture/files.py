@@ -23,7 +23,9 @@ from esp_cli.checking.logs import read_transitions
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.reporting.tuning_page import budget_table
 from esp_cli.studies.catalogue import plan
+from esp_cli.studies.search import Search
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
@@ -33,6 +35,8 @@ from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
 from esp_cli.training.trainer import Trainer
 from esp_envs.registry import make
 from tests.studies.small_studies import request
+from tests.studies.test_tuner import search
+from tests.studies.test_tuning import tuning
 from tests.torture.junk import spoil_bytes, spoil_header, spoil_json, spoil_value
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
 from tests.training.runs import TINY, tiny_folder
@@ -43,6 +47,7 @@ COMMAND_SHARE = 1 / 2000
 FORGED_SHARE = 1 / 100
 """Of policies and checkpoints whose checksum is right: for them networks are built, which takes milliseconds."""
 RUN, STUDY = "run", "study"
+TUNING = tuning(priors=("none",), budget=2, steps=300)
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,7 @@ def _make_sound_files(scratch: Path) -> None:
     recorded = collect(make("navigation", 64, [0]), 64, 2)
     arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
     np.savez(scratch / "transitions.npz", **arrays)
+    search(scratch / "tuning", TUNING)
     (scratch / "bundled").mkdir()
     manifest = json.loads((bundled_folder() / MANIFEST).read_text())
     manifest["policies"] = manifest["policies"][:2]  # the others are alike
@@ -281,6 +287,11 @@ def _transitions(path: Path) -> None:
     read_transitions(path, make("navigation", 1, [0]).spec)
 
 
+def _journal(path: Path) -> None:
+    found = Search.create(path.parent, TUNING)
+    budget_table(found.tuning, [found.outcome("none")])
+
+
 def _format(name: str) -> str:
     return "esp-checkpoint" if name == "checkpoint" else "esp-policy"
 
@@ -296,6 +307,7 @@ _ALL = (
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
     ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
     ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
+    ("tuning/journal.jsonl", _journal, "report {scratch}/tuning", spoil_json),
 )
 _NAMES = (
     "policy",
@@ -307,6 +319,7 @@ _NAMES = (
     "manifest",
     "prey",
     "transitions",
+    "journal",
 )
 KINDS = {
     name: Kind(path, load, tuple(command.split()), spoil)
