@@ -17,7 +17,6 @@ that of another run is neither resumed nor removed. What the user can correct is
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import secrets
@@ -84,29 +83,23 @@ class RunFolder:
 
     @classmethod
     def create(
-        cls, path: str | os.PathLike[str], config: Mapping[str, Any], initial: Mapping[str, Tensor] | None = None
+        cls, path: str | os.PathLike[str], config: dict[str, Any], initial: Mapping[str, Tensor] | None = None
     ) -> RunFolder:
         """Make a run folder; its configuration is written last, so that a folder with one is complete.
 
         Args:
             path: a folder that is missing, empty, or left half-made by a killed process.
-            config: resolved configuration, JSON-able.
+            config: the resolved configuration as JSON has it.
             initial: weights of the policy that the run starts from.
         """
         path = Path(path)
-        if taken := {"format", "version", RUN_ID} & set(config):
-            raise RunFolderError(f"a configuration may not use the reserved key '{min(taken)}'")
-        try:
-            resolved = json.loads(json.dumps(dict(config), allow_nan=False))
-        except (TypeError, ValueError, RecursionError) as error:
-            raise RunFolderError(f"the configuration of {path} is not JSON ({error})") from None
         with attempting("make the run folder", path, RunFolderError):
             if path.exists() and not path.is_dir():
                 raise RunFolderError(f"{path} is a file; choose another --out")
             require_held(path)
             path.mkdir(parents=True, exist_ok=True)
             _refuse_taken(path)
-            folder = cls(path, resolved, secrets.token_hex(16))
+            folder = cls(path, config, secrets.token_hex(16))
             with folder.lock():
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path)
@@ -116,7 +109,7 @@ class RunFolder:
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
                     write_policy(folder.initial_path, initial, {})
-                RUN_FORMAT.write(path / CONFIG, {RUN_ID: folder.identity, **resolved})
+                RUN_FORMAT.write(path / CONFIG, {RUN_ID: folder.identity, **config})
         return folder
 
     @classmethod

@@ -136,12 +136,9 @@ def _shapes(schema: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def _type(schema: Mapping[str, Any]) -> str:
     words = {"boolean": "flag", "string": "text", "array": "list"}
-    found: dict[str, None] = {}
-    for shape in _shapes(schema):
-        word = str(shape.get("type", "text"))
-        inner = f" of {_type(shape['items'])}s" if "items" in shape else ""
-        found[words.get(word, word) + inner] = None  # each once, in their order
-    return " or ".join(found)
+    kinds = [(str(shape.get("type", "text")), shape.get("items")) for shape in _shapes(schema)]
+    found = [words.get(word, word) + (f" of {_type(items)}s" if items else "") for word, items in kinds]
+    return " or ".join(dict.fromkeys(found))
 
 
 def _bounds(schema: Mapping[str, Any]) -> str:

@@ -57,18 +57,6 @@ def test_create_then_open_gives_the_configuration_back(folder):
     assert opened.identity == folder.identity
 
 
-def test_the_configuration_is_kept_as_json_shows_it(tmp_path):
-    folder = RunFolder.create(tmp_path / "a", {"seeds": (0, 1)})
-    assert folder.config == RunFolder.open(tmp_path / "a").config == {"seeds": [0, 1]}
-
-
-@pytest.mark.parametrize("config", [{"version": 3}, {"x": float("nan")}, {"x": object()}])
-def test_a_configuration_that_cannot_be_kept_makes_no_folder(tmp_path, config):
-    with pytest.raises(RunFolderError, match=r"reserved|not JSON"):
-        RunFolder.create(tmp_path / "a", config)
-    assert not (tmp_path / "a").exists()
-
-
 def test_create_refuses_an_existing_run_and_leaves_it_alone(folder):
     write_checkpoints(folder, 100)
     with pytest.raises(RunFolderError) as caught:
