@@ -28,8 +28,8 @@ from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.evaluation import evaluate as evaluate_policy
-from esp_cli.policies.loaded import LoadedPolicy
-from esp_cli.policies.loading import Start, TrainedPolicy, register_own
+from esp_cli.policies.loaded import LoadedPolicy, register_own
+from esp_cli.policies.loading import Start, TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.config_file import parse_config

@@ -18,10 +18,13 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.algorithms.learner import Learner
+from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
-from esp_cli.policies.loading import TrainedPolicy, open_policy, register_own
+from esp_cli.policies.loading import TrainedPolicy, open_policy
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
+from esp_envs.registry import register
 from esp_envs.spec import Continuous, Discrete, TaskSpec
 
 Floats = NDArray[np.float32]
@@ -178,3 +181,17 @@ def load_policy(
     register_own(task, algo, network)
     name = algo if isinstance(algo, str) else None
     return LoadedPolicy(open_policy(Path(where), name, prior).transfer(settings or {}), seed)
+
+
+def register_own(
+    task: str | type[Environment] | None,
+    algo: str | type[Learner] | None,
+    network: str | type[NetworkConfig] | None,
+) -> None:
+    """Register the task, algorithm and network that a caller names; see `Registry.register`."""
+    if task is not None:
+        register(task)
+    if algo is not None:
+        ALGORITHMS.register(algo)
+    if network is not None:
+        NETWORKS.register(network)

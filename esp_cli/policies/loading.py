@@ -20,7 +20,6 @@ from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import shortened
 from esp_cli.files.formatting import did_you_mean
-from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.policies import bundled
@@ -30,14 +29,13 @@ from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_setti
 from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.streams import generators
-from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest
-from esp_envs.registry import register, task_names
+from esp_envs.registry import task_names
 from esp_envs.spec import TaskSpec
 
+# modules beside the policy that a run may start from
 _FURTHER = ("critic.", "target_critic.", "mixer.", "target_mixer.", "normaliser.", "reward_scale.")
-"""Modules beside the policy that a run may start from."""
 
 
 @dataclass(frozen=True)
@@ -194,9 +192,6 @@ class Start:
         """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner.
 
         Those of a policy have to fit; those of another module are left out where they do not.
-
-        Raises:
-            UserError: numbers of seeds, names or shapes differ.
         """
         seeds, own, given = learner.policy.num_seeds, learner.policy.state_dict(), dict(self.weights)
         fitting: dict[str, Tensor] = {}
@@ -227,10 +222,10 @@ class Start:
 
     def matches(self, config: RunConfig) -> bool:
         """Return whether these are the weights that the run of a configuration started from."""
-        seeds = len(config.seeds)
-        if config.init_from is None or self._num_seeds not in (1, seeds):
+        seeds, start = len(config.seeds), config.init_from
+        if start is None or self._num_seeds not in (1, seeds):
             return False
-        return digest(_repeated(self.weights, seeds), {}) == config.init_from.sha256
+        return digest(_repeated(self.weights, seeds), {}) == start.sha256
 
     @property
     def _num_seeds(self) -> int:
@@ -241,22 +236,7 @@ def _repeated(weights: Mapping[str, Tensor], seeds: int) -> dict[str, Tensor]:
     return {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in weights.items()}
 
 
-def register_own(
-    task: str | type[Environment] | None,
-    algo: str | type[Learner] | None,
-    network: str | type[NetworkConfig] | None,
-) -> None:
-    """Register the task, algorithm and network that a caller names; see `Registry.register`."""
-    if task is not None:
-        register(task)
-    if algo is not None:
-        ALGORITHMS.register(algo)
-    if network is not None:
-        NETWORKS.register(network)
-
-
 def _untrained(config: RunConfig, spec: TaskSpec, network: NetworkConfig) -> Policy:
-    """Return the policy of a configuration before training, in evaluation mode."""
     return ALGORITHMS[config.algorithm].build_policy(spec, network, generators(config.seeds, "shape")).eval()
 
 
