@@ -40,11 +40,7 @@ def busy_with() -> float:
 
 
 def resolve_device(wanted: str) -> str:
-    """Return "cpu" or "cuda" for what --device asks for.
-
-    Raises:
-        UserError: a GPU is asked for and there is none, or something else is asked for.
-    """
+    """Return "cpu" or "cuda" for what --device asks for; a UserError says that there is no such device."""
     if wanted not in ("cpu", "cuda", "auto"):
         raise UserError(f"there is no device '{wanted}'; choose cpu, cuda or auto")
     import torch  # noqa: PLC0415 - takes a second

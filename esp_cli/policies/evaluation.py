@@ -58,9 +58,6 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy.
 
     A seed that stopped in training has an early policy. Its numbers are NaN, as in the metrics of its run.
-
-    Raises:
-        UserError: there is less than one episode.
     """
     if episodes < 1:
         raise UserError(f"episodes is {episodes}; play at least one")

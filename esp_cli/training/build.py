@@ -66,7 +66,7 @@ def spec_of(config: RunConfig) -> TaskSpec:
 
 
 def build_learner(config: RunConfig) -> Learner:
-    """Build the learner of a run, with its worlds, from the configuration alone.
+    """Build the learner of a run, with its worlds.
 
     Raises:
         UserError: parts of the configuration do not go together, or it needs more memory than the machine has.
@@ -75,14 +75,8 @@ def build_learner(config: RunConfig) -> Learner:
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, spec_of(config))
     env = build_environment(config, settings.num_envs, "training worlds")
-    learner = cls(
-        env,
-        settings,
-        config.network,
-        config.prior,
-        generators(config.seeds, "learner"),
-        generators(config.seeds, "prior"),
-    )
+    own, of_prior = generators(config.seeds, "learner"), generators(config.seeds, "prior")
+    learner = cls(env, settings, config.network, config.prior, own, of_prior)
     _set_gate(learner, config)
     return learner
 

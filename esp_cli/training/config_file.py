@@ -34,10 +34,7 @@ def read_config_file(path: Path) -> ConfigFile:
     """Read the configuration of a run (its folder or its config.json), or a small file as JSON or TOML.
 
     A small file names settings flat, {"mappo.learning_rate": 5e-4}, or nested, {"mappo": {"learning_rate": 5e-4}},
-    beside choices such as {"task": "navigation", "steps": "500k"}.
-
-    Raises:
-        UserError: it is missing or damaged, or names a choice that does not exist.
+    beside choices such as {"task": "navigation", "steps": "500k"}. Anything else is a UserError.
     """
     if path.is_dir():
         return _of_run(path, parse_config(RunFolder.open(path).config, path))

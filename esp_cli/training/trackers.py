@@ -169,12 +169,12 @@ TRACKERS: dict[str, Callable[[TrackedRun], Tracker]] = {
 
 
 class Guarded:
-    """A sink that hands rows to a tracker until the tracker fails; the failure becomes one sentence for the user."""
+    """Hands rows to a tracker until the tracker fails; the failure becomes one sentence for the user."""
 
     def __init__(self, name: str, make: Callable[[], Tracker], tell: Callable[[str], None]) -> None:
         self._name, self._tell = name, tell
         self._tracker: Tracker | None = None
-        self._attempt("open", lambda: setattr(self, "_tracker", make()))
+        self._tracker = self._attempt("open", make)
 
     def write(self, step: int, values: Row) -> None:
         """Hand over one row at a step (environment steps per seed), unless the tracker has failed before."""
@@ -186,9 +186,9 @@ class Guarded:
         if (tracker := self._tracker) is not None:
             self._attempt("close", tracker.close)
 
-    def _attempt(self, verb: str, action: Callable[[], None]) -> None:
+    def _attempt(self, verb: str, action: Callable[[], Any]) -> Any:
         try:
-            action()
+            return action()
         except Exception as error:  # a tracker is foreign code: whatever it raises, the run goes on
             failed, self._tracker = self._tracker, None
             if failed is not None and verb == "write":
@@ -196,6 +196,7 @@ class Guarded:
                     failed.close()
             reason = next(iter(str(error).splitlines()), "") or type(error).__name__
             self._tell(f"tracking with {self._name} ended: it cannot {verb} ({reason[:200]}); the run goes on")
+            return None
 
 
 def require(names: Sequence[str]) -> None:

@@ -208,26 +208,25 @@ def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monke
     assert [entry.name for entry in read_bundled(tmp_path)] == ["other", "own"]
 
 
-def test_a_file_that_is_not_the_manifests_is_refused(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def changed(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the folder of `made`, to be changed, as that of this installation."""
     folder = Path(shutil.copytree(made, tmp_path / "bundled"))
     monkeypatch.setattr(bundled, "bundled_folder", lambda: folder)
-    shutil.copy(folder / "navigation-vectors.safetensors", folder / "navigation-mappo-esp.safetensors")
+    return folder
+
+
+def test_a_file_that_is_not_the_manifests_is_refused(changed: Path) -> None:
+    shutil.copy(changed / "navigation-vectors.safetensors", changed / "navigation-mappo-esp.safetensors")
     with pytest.raises(ValueError, match="is not the file that its manifest names: their SHA-256 differ"):
         open_policy(Path("navigation"))
-    (folder / "navigation-mappo-esp.safetensors").unlink()
+    (changed / "navigation-mappo-esp.safetensors").unlink()
     with pytest.raises(ValueError, match="does not exist"):
         open_policy(Path("navigation"))
 
 
-def test_a_manifest_that_says_something_else_of_a_file_is_refused(
-    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = Path(shutil.copytree(made, tmp_path / "bundled"))
-    monkeypatch.setattr(bundled, "bundled_folder", lambda: folder)
-    entry = find("navigation")
-    bundled.write_bundled(folder, (entry.model_copy(update={"seed": 5}),))
+def test_a_manifest_that_says_something_else_of_a_file_is_refused(changed: Path) -> None:
+    bundled.write_bundled(changed, (find("navigation").model_copy(update={"seed": 5}),))
     with pytest.raises(ValueError, match="does not hold the policy that its manifest describes"):
         open_policy(Path("navigation"))
 

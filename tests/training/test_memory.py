@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from esp_cli.algorithms.registry import ALGORITHMS
-from esp_cli.training import build as memory
+from esp_cli.training import build
 from esp_cli.training.build import build_learner, spec_of
 from esp_cli.training.config import resolve_config
 
@@ -30,38 +30,38 @@ def test_the_bound_counts_what_the_replay_holds():
     config = resolve_config("navigation", "qmix", seeds=(0, 1))
     learner = build_learner(config)
     settings = ALGORITHMS["qmix"].config_class(**config.algorithm_settings)
-    counted = memory.least_bytes(config, settings, learner.spec)["qmix.replay_episodes"]
+    counted = build.least_bytes(config, settings, learner.spec)["qmix.replay_episodes"]
     assert 0.8 * learner.replay.num_bytes < counted <= learner.replay.num_bytes
 
 
 def test_a_machine_with_less_memory_refuses_what_a_larger_one_takes(monkeypatch):
     config = resolve_config("navigation")
     build_learner(config)
-    monkeypatch.setattr(memory, "machine_bytes", lambda device: 10_000)
+    monkeypatch.setattr(build, "machine_bytes", lambda device: 10_000)
     with pytest.raises(ValueError, match=r"but cpu has 0\.0 GB"):
         build_learner(config)
 
 
 def test_a_container_has_the_memory_that_it_may_take(monkeypatch, tmp_path):
-    installed = memory.machine_bytes("cpu")
+    installed = build.machine_bytes("cpu")
     for content, expected in (("1000000\n", 1_000_000), ("max\n", installed), (f"{2 * installed}\n", installed)):
         (tmp_path / "memory.max").write_text(content)
-        monkeypatch.setattr(memory, "_LIMITS", (tmp_path / "memory.max", tmp_path / "nothing"))
-        assert memory.machine_bytes("cpu") == expected
+        monkeypatch.setattr(build, "_LIMITS", (tmp_path / "memory.max", tmp_path / "nothing"))
+        assert build.machine_bytes("cpu") == expected
 
 
 def test_every_seed_counts():
     one, ten = (resolve_config("formation", seeds=range(count)) for count in (1, 10))
     settings = ALGORITHMS["mappo"].config_class(**one.algorithm_settings)
-    needed = memory.least_bytes(one, settings, spec_of(one))
-    assert memory.least_bytes(ten, settings, spec_of(ten)) == {name: 10 * size for name, size in needed.items()}
+    needed = build.least_bytes(one, settings, spec_of(one))
+    assert build.least_bytes(ten, settings, spec_of(ten)) == {name: 10 * size for name, size in needed.items()}
 
 
 def test_a_process_on_a_cluster_is_given_room_for_its_replay_and_its_libraries():
     small, large = (resolve_config("navigation", "qmix", seeds=range(count)) for count in (1, 10))
     settings = ALGORITHMS["qmix"].config_class(**small.algorithm_settings)
-    held = sum(memory.least_bytes(small, settings, spec_of(small)).values())
-    given = [memory.process_bytes(config, spec_of(config)) for config in (small, large)]
+    held = sum(build.least_bytes(small, settings, spec_of(small)).values())
+    given = [build.process_bytes(config, spec_of(config)) for config in (small, large)]
     assert given[0] > 500e6 + held
     assert given[1] - given[0] == 2 * 9 * held
 
@@ -69,7 +69,7 @@ def test_a_process_on_a_cluster_is_given_room_for_its_replay_and_its_libraries()
 def test_the_frame_of_a_compass_takes_room_in_every_row():
     plain, framed = (resolve_config("navigation", "qmix", overrides={"prior.compass": length}) for length in (0.0, 1.0))
     settings = ALGORITHMS["qmix"].config_class(**plain.algorithm_settings)
-    rows = [memory.least_bytes(config, settings, spec_of(config))["qmix.replay_episodes"] for config in (plain, framed)]
+    rows = [build.least_bytes(config, settings, spec_of(config))["qmix.replay_episodes"] for config in (plain, framed)]
     frame_width = 4  # two vectors, seen by each of three agents and once in the state
     steps = settings.replay_episodes * spec_of(plain).horizon
     assert rows[1] - rows[0] == steps * (3 + 1) * frame_width * 4
