@@ -158,7 +158,7 @@ def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
             raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
         (header_bytes,) = struct.unpack("<Q", prefix)
         if header_bytes > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
-            raise CheckpointError("is truncated or no safetensors file: its declared header does not fit into it")
+            raise CheckpointError("is truncated or no safetensors file: the header that it declares does not fit")
         text = file.read(header_bytes)
         header = parse_object(text, "header")
         if not whole:
