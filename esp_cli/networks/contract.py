@@ -16,11 +16,9 @@ from esp_cli.networks.io_spec import IoSpec
 from esp_envs.errors import UserError
 
 ActivationName = Literal["relu", "tanh"]
-
-
+# the vector-Jacobian product of a network: from the slope of a loss by its outputs to those by its parameters in order,
+# as they are, or all together side by side [S, P]
 VJP = Callable[[Tensor], list[Tensor]]
-"""The vector-Jacobian product of a network: from the slope of a loss by its outputs to those by its parameters in
-order, as they are, or all together side by side [S, P]."""
 
 
 class NetworkConfig(Strict, ABC):
@@ -56,11 +54,7 @@ class NetworkConfig(Strict, ABC):
         """
 
     def io_or_refuse(self, io: IoSpec | None) -> IoSpec:
-        """Return `io` where it is given.
-
-        Raises:
-            UserError: it is None, though the network needs it.
-        """
+        """Return `io`, and refuse a place that gives none."""
         if io is None:
             raise UserError(f"the network {self.name} needs the meaning of its inputs, which this place does not give")
         return io

@@ -18,8 +18,8 @@ from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
 
+# steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed
 WORTH_COMPILING = 100_000
-"""Steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed."""
 
 
 class CompiledConfig(NetworkConfig):
@@ -69,15 +69,12 @@ class PlainConfig(CompiledConfig):
 
     @property
     def can_compile(self) -> bool:
-        """Whether kernels compute what the other settings ask for."""
         return self.precision == "float32" and not self.layer_norm
 
     def without_effect(self) -> frozenset[str]:
-        """Return what concerns networks without layer normalisation where there is one."""
         return frozenset({"precision", "compiled"}) if self.layer_norm else frozenset()
 
     def least_parameters(self, inputs: int) -> int:
-        """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
         return sum(a * b for a, b in pairwise((inputs, *self.hidden)))
 
 
@@ -89,7 +86,6 @@ class MlpConfig(PlainConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build a perceptron; see `NetworkConfig.build`."""
         return MLP(generators, inputs, outputs, self, output_gain)
 
 
@@ -103,7 +99,6 @@ class GruConfig(PlainConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build a recurrent network; see `NetworkConfig.build`."""
         return GRU(generators, inputs, outputs, self, output_gain)
 
 
@@ -117,11 +112,9 @@ class MLP(SeedMLP, Memoryless):
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Apply the network to all steps at once, wherever they lie in memory; see `Memoryless.unroll`."""
         return self(x)
 
     def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        """Return outputs and VJP; see `Network.unroll_with_vjp`."""
         return super().unroll_with_vjp(x, truncation) if self.norms is not None else self.forward_with_vjp(x)
 
 
@@ -142,17 +135,12 @@ class GRU(Network):
         self.head = SeedLinear(generators, width, outputs, output_gain)
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Advance one step."""
         memory = self.gru(self.body(x), memory)
         return self.head(self.norm(memory)), memory
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Run over whole episodes; all but the recurrence itself is done for all steps at once."""
+        # all but the recurrence itself is done for all steps at once
         memories = self.gru.unroll(self.body(x.transpose(1, 2)), truncation)
-        return self._said(self.norm(memories.flatten(1, 2))).unflatten(1, memories.shape[1:3]).transpose(1, 2)
-
-    def _said(self, rows: Tensor) -> Tensor:
-        """Return the outputs for memories [S, B, H]."""
-        if not self.gru.compiled:
-            return self.head(rows)
-        return perceptron(Shape("relu", False, torch.float32, compiled=True), [rows], [*self.head.parameters()])
+        rows, shape = self.norm(memories.flatten(1, 2)), Shape("relu", False, torch.float32, compiled=True)
+        outputs = perceptron(shape, [rows], [*self.head.parameters()]) if self.gru.compiled else self.head(rows)
+        return outputs.unflatten(1, memories.shape[1:3]).transpose(1, 2)

@@ -16,8 +16,7 @@ from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.separate import Separate, action_parts
 from esp_envs.spec import Spaces
 
-POLICY_GAIN = 0.01
-"""Orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)."""
+POLICY_GAIN = 0.01  # orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)
 
 
 class Policy(nn.Module):
@@ -148,7 +147,6 @@ class HistoryPolicy(Policy):
     def act(
         self, obs: Tensor, memory: Tensor, noise: Tensor | None = None, action_mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
         action, memory = super().act(obs, memory, noise, action_mask)
         return action, self.remember(memory, action)
 
