@@ -48,11 +48,7 @@ VALUE_GAIN = 0.1
 
 
 class Qmix(ExploringLearner):
-    """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`.
-
-    Raises:
-        UserError: continuous actions.
-    """
+    """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`."""
 
     config_class = QmixConfig
     has_policy_term = False
@@ -77,11 +73,7 @@ class Qmix(ExploringLearner):
     def build_policy(
         cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
     ) -> HistoryPolicy:
-        """Return new epsilon-greedy policies.
-
-        Raises:
-            UserError: continuous actions.
-        """
+        """Return new epsilon-greedy policies."""
         if not isinstance(spec.action, Discrete):
             raise UserError(
                 f"qmix chooses among discrete actions, but those of this {spec.name} are continuous; "

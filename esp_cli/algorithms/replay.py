@@ -91,11 +91,7 @@ class EpisodeReplay:
         return sum(tensor.nbytes for tensor in self._store.tensors.values())
 
     def add(self, episodes: EpisodeBatch) -> None:
-        """Store episodes; the oldest give way.
-
-        Raises:
-            UserError: more episodes at once than there is room for.
-        """
+        """Store episodes; the oldest give way."""
         count = episodes.obs.shape[1]
         if count > self.capacity:
             raise UserError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
@@ -123,11 +119,7 @@ class EpisodeReplay:
         return filled | {"cursor": torch.tensor(self.cursor)}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            UserError: episodes of another task or another number of seeds, or more than fit.
-        """
+        """Restore what `state_dict` returned."""
         if tensors.keys() != {*self._store.tensors, "cursor"} or tensors["obs"].dim() < 2:
             raise UserError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]

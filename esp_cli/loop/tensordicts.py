@@ -47,9 +47,6 @@ def with_copies(
         data: TensorDict [B, ...], agents in nested groups or not, also below "next".
         choose: returns the elements of the copies, on the device of a tensor.
         roles: of keys by their last part, where they differ from `ROLES`.
-
-    Raises:
-        UserError: the numbers under a key do not fit, or have no role.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
     leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}

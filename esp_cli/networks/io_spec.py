@@ -37,11 +37,7 @@ class IoSpec:
         return self.spaces.state if self.reads == "state" else self.spaces.observation
 
     def group(self, name: str) -> FiniteGroup:
-        """Return a group that leaves agents in their places by its name.
-
-        Raises:
-            UserError: there is no such group, it is infinite or moves agents, or the task cannot carry it.
-        """
+        """Return a group that leaves agents in their places by its name."""
         group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
             raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents")

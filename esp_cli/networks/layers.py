@@ -66,9 +66,6 @@ class SeedMLP(nn.Module):
         activate_output: end with an activation, for a body on which something else stands.
         precision: of the matrix products; parameters, inputs, outputs and parameter gradients stay float32.
         compiled: whether passes on the CPU go through the compiled kernel; has no effect with layer normalisation.
-
-    Raises:
-        UserError: there is no compiler for it.
     """
 
     def __init__(

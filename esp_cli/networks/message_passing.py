@@ -171,9 +171,6 @@ class MessagePassing(Memoryless):
 
     A layer maps [own features, mean of (relative position, features) over near drones] through a linear layer and relu.
     The mean divides by the number of near drones plus one, for the drone itself.
-
-    Raises:
-        UserError: the task does not show pictures and relative positions, or a critic reads all of them in a row.
     """
 
     def __init__(

@@ -13,11 +13,7 @@ from esp_envs.spec import ActionSpace, Discrete
 
 
 def action_parts(space: ActionSpace) -> Tensor:
-    """Return the 0/1 matrix [values of all parts, actions] of the part values that make up each action.
-
-    Raises:
-        UserError: the actions are not all combinations of part values.
-    """
+    """Return the 0/1 matrix [values of all parts, actions] of the part values that make up each action."""
     if isinstance(space, Discrete):
         columns = list(zip(*space.points, strict=True))
         values = [sorted(set(column)) for column in columns]

@@ -17,9 +17,6 @@ class Symmetrised(Network):
     """y = 1 / G sum_g rho_out(g)^-1 f(rho_in(g) x): equivariant whatever f is, at G times its cost.
 
     What a recurrent f remembers of each image is kept apart.
-
-    Raises:
-        UserError: see `IoSpec.group`.
     """
 
     def __init__(self, network: Network, io: IoSpec, group: str) -> None:

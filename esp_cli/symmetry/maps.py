@@ -119,11 +119,7 @@ Map = Dense | Gather
 
 
 def map_of(operator: Operator, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Map:
-    """Return what computes an operator: a gather where one is possible, and faster on a CPU, else a matrix product.
-
-    Raises:
-        UserError: it is no signed permutation, and its matrix would be too large.
-    """
+    """Return what computes an operator: a gather where one is possible, and faster on a CPU, else a matrix product."""
     if operator.terms == 1 and (operator.width >= _GATHERED_WIDTH or torch.device(device).type != "cpu"):
         return gather_of(operator, device)
     if operator.width > _LARGEST_MATRIX:

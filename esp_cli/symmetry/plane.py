@@ -144,9 +144,6 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
     """Return [rows * columns]: the index of the old pixel that shows in each pixel of a transformed picture.
 
     A pixel's place is its middle's (x, y), seen from the picture's: the first row is the top, the first column left.
-
-    Raises:
-        UserError: some pixel would come to lie between others, or outside.
     """
     rows, columns = pixels
     row, column = np.divmod(np.arange(rows * columns), columns)
@@ -163,9 +160,6 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
     """Return [rays]: the index of the old ray that shows in each ray of a transformed ring.
 
     Ray k points at k / rays of a turn, counter-clockwise from the x-axis.
-
-    Raises:
-        UserError: some ray would come to lie between others.
     """
     angle = 2 * np.pi * np.arange(rays) / rays
     origin = np.stack([np.cos(angle), np.sin(angle)], -1) @ planar  # the inverse is the transpose

@@ -1,6 +1,7 @@
 """What elements do to the numbers of a task: observations and states to L_g, actions to K_g.
 
-Layouts say how the numbers of one row transform; here agents change places too.
+Layouts say how the numbers of one row transform; here agents change places too. Whatever cannot is refused by a
+`UserError` that says why.
 """
 
 from __future__ import annotations
@@ -113,9 +114,6 @@ def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     """Return L_g of the global state of Ds numbers.
 
     A joint state (`Spaces.is_joint`) moves like the joint observation; any other moves its AGENTS items.
-
-    Raises:
-        UserError: agents move, and a field's items cannot follow them.
     """
     places = agent_places(elements, spaces.num_agents)
     if places is not None and spaces.is_joint:
@@ -140,9 +138,6 @@ def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
 
     It is derived by turning each action's physical meaning and looking for the action that means the result. Of
     several actions with one meaning the first goes to the first, the second to the second.
-
-    Raises:
-        UserError: some action's image is no action.
     """
     points = np.array(action.points, dtype=np.float64)
     images = np.einsum("gvw,jw->gjv", item_operator(Field("action", action.kind), elements).matrix, points)
@@ -170,11 +165,7 @@ def field_operator(field: Field, elements: Sequence[Element]) -> Operator:
 
 
 def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
-    """Return how the numbers of one item of a field transform, with all things in their places.
-
-    Raises:
-        UserError: a geometry cannot transform the field, or two do not commute on it.
-    """
+    """Return how the numbers of one item of a field transform, with all things in their places."""
     geometries = list(dict.fromkeys(element.geometry for element in elements))
     index = [geometries.index(element.geometry) for element in elements]
     if field.parts:
@@ -207,11 +198,7 @@ def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
 
 
 def item_places(field: Field, elements: Sequence[Element]) -> Indices | None:
-    """Return [G, count] the place that each item of a field moves to under each element, or None where all stay.
-
-    Raises:
-        UserError: the field has another number of items, is a picture, or its items follow the agents.
-    """
+    """Return [G, count] the place that each item of a field moves to under each element, or None where all stay."""
     name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
     orders = [dict(element.items).get(name) for element in elements]
     moved = [order for order in orders if order is not None]
@@ -223,11 +210,7 @@ def item_places(field: Field, elements: Sequence[Element]) -> Indices | None:
 
 
 def agent_places(elements: Sequence[Element], num_agents: int) -> Indices | None:
-    """Return [G, N] the place that each agent moves to under each element, or None where all stay.
-
-    Raises:
-        UserError: an element permutes another number of agents.
-    """
+    """Return [G, N] the place that each agent moves to under each element, or None where all stay."""
     orders = [element.permutation for element in elements]
     if any(order and len(order) != num_agents for order in orders):
         raise UserError(f"the permutation is not one of its {num_agents} agents")
@@ -248,11 +231,7 @@ def require_items(elements: Sequence[Element], spaces: Spaces) -> None:
 
 
 def state_sources(layout: Layout, places: Indices) -> Indices:
-    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents to `places`.
-
-    Raises:
-        UserError: a field's items cannot follow the agents.
-    """
+    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents to `places`."""
     came_from = np.argsort(places, axis=1)
     for field in layout.fields:
         if field.items is Items.OTHERS:

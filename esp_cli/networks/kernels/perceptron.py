@@ -89,9 +89,6 @@ class CompiledPass:
 
     Arguments as of `networks.perceptron.perceptron` and `Shape`. The inputs may lie anyhow in memory, and are read
     again by the backward.
-
-    Raises:
-        UserError: inputs of other shapes or numbers than the parameters take.
     """
 
     def __init__(
