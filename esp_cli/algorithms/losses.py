@@ -17,7 +17,7 @@ def gae(
     gamma: float,
     gae_lambda: float,
 ) -> Tensor:
-    """Return generalised advantage estimates (Schulman et al., 2016).
+    """Return generalised advantage estimates [S, E, T, C] (Schulman et al., 2016).
 
     delta_t = r_t + gamma (1 - terminated_t) V(s_{t+1}) - V(s_t)
     A_t = delta_t + gamma lambda (1 - ended_t) A_{t+1}
@@ -30,9 +30,6 @@ def gae(
         ended: likewise, terminated or truncated; the next row belongs to another episode.
         gamma: discount factor.
         gae_lambda: 0 is one-step temporal difference, 1 Monte Carlo.
-
-    Returns:
-        [S, E, T, C].
     """
     delta = torch.where(terminated, reward, reward + gamma * next_value) - value
     decay = gamma * gae_lambda * (~ended).to(delta.dtype)
@@ -46,7 +43,7 @@ def gae(
 def td_targets(
     reward: Tensor, next_value: Tensor, ended: Tensor, gamma: float, td_lambda: float, cut: Tensor | None = None
 ) -> Tensor:
-    """Return targets for action values: one-step, or TD(lambda) along the stored episode.
+    """Return targets [S, B, T, C] for action values: one-step, or TD(lambda) along the stored episode.
 
     y_t = r_t + gamma (1 - ended_t) ((1 - lambda) Q(s_{t+1}) + lambda y_{t+1}), and y_{t+1} = Q(s_{t+1}) at the
     last step of an episode.
@@ -58,9 +55,6 @@ def td_targets(
         gamma: discount factor.
         td_lambda: 0 is the one-step target, 1 the discounted return of what was done.
         cut: [S, B, T, 1] bool, the last steps of episodes that were truncated before the end of the rows.
-
-    Returns:
-        [S, B, T, C].
     """
     ahead = torch.where(ended, 0.0, gamma * next_value)
     if td_lambda == 0:
@@ -75,12 +69,9 @@ def td_targets(
 
 
 def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = None) -> Tensor:
-    """Return x shifted and scaled to mean 0 and standard deviation 1 within each seed.
+    """Return x [S, ...] shifted and scaled to mean 0 and standard deviation 1 within each seed.
 
-    Args:
-        x: [S, ...].
-        epsilon: added to the deviation.
-        valid: which numbers count, of the shape of x; all where it is None. The others become 0.
+    `valid`, of the shape of x, says which numbers count; the others become 0.
     """
     if valid is not None:
         centred = _centred(x, valid)
@@ -102,13 +93,7 @@ def beside(per_seed: Tensor, x: Tensor) -> Tensor:
 
 
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return 1 - Var[target - value] / Var[target] per seed: [S, ...] -> [S].
-
-    Args:
-        value: [S, ...].
-        target: likewise.
-        valid: which numbers count, of the shape of the others; all where it is None.
-    """
+    """Return 1 - Var[target - value] / Var[target] per seed, [S, ...] -> [S], over the numbers that are valid."""
     residual, whole = _variance(target - value, valid), _variance(target, valid)
     return 1 - residual / whole.clamp_min(1e-8)
 

@@ -118,10 +118,7 @@ class Maddpg(ExploringLearner):
     def _learn_critic(self, copies: Copies[EpisodeBatch], seen: Tensor, here: Tensor) -> dict[str, Tensor]:
         """Take one gradient step down L_TD + c S_Q (supplement eq. 19).
 
-        Args:
-            copies: the batch.
-            seen: what the critic sees of every row, [S, B (1 + copies), T + 1(, N), critic width].
-            here: the same without the final states.
+        The critic sees `seen` of every row [S, B (1 + copies), T + 1(, N), critic width], `here` without final states.
         """
         values = self.joint.value(self.critic, here, self._encoded(copies.rows))
         target = self._targets(copies.originals, copies.original(seen))
@@ -153,11 +150,8 @@ class Maddpg(ExploringLearner):
     def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
-        Args:
-            seen: [S, B, T(, N), critic width].
-            outputs: [S, B, T, N, ...] of the policy.
-            noise: of the shape of `outputs`, uniform in [0, 1).
-            rows: what was done.
+        Of rows the critic sees `seen` [S, B, T(, N), critic width], and the policy says `outputs` [S, B, T, N, ...], of
+        whose shape is the noise, uniform in [0, 1).
         """
         head, together = self.head, self.config.actor_actions == "all"
         if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):

@@ -246,11 +246,7 @@ class Mappo(Learner):
     def loss(self, copies: Copies[Batch], entropy_coef: float, weight: float, sums: dict[str, Tensor] | None) -> Loss:
         """Return the negative of J_ESP = J_MAPPO - c (S_pi + S_V) (Eq. 10) per seed: [S].
 
-        Args:
-            copies: a chunk of a minibatch.
-            entropy_coef: weight of the entropy.
-            weight: share of the chunk in its minibatch.
-            sums: to which the numbers that are logged are added; None adds none.
+        The copies are a chunk of a minibatch, `weight` its share of it. What is logged is added to `sums`, if given.
         """
         config, head, state = self.config, self.policy.head, copies.originals.state
         outputs = self.policy.unroll_with_vjp(copies.obs, config.truncation, copies.action_mask)

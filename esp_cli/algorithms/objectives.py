@@ -44,10 +44,7 @@ def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, 
 
 
 def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> tuple[Tensor, Tensor]:
-    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A), and its slope by log rho, element by element.
-
-    The slope is rho A, or 0 where the objective is clipped.
-    """
+    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A), and its slope by log rho: rho A, or 0."""
     ratio = log_ratio.exp()
     gain, bound = ratio * advantage, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage
     return torch.minimum(gain, bound), gain.masked_fill(gain > bound, 0.0)

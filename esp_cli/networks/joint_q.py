@@ -49,16 +49,10 @@ class SharedCriticInput:
         return critic(seen, self.joint_action(action))
 
     def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
-        """Return each agent's Q for its other actions, with the actions of all others fixed.
+        """Return each agent's Q [S, W, N, K] for its other actions, with the actions of all others fixed.
 
-        Args:
-            critic: with frozen parameters.
-            seen: what it sees of the scenes.
-            joint: [S, W, N, A] encoded actions.
-            others: [S, W, N, K, A] other actions of each agent.
-
-        Returns:
-            [S, W, N, K].
+        The critic's parameters are frozen; `seen` is what it sees of the scenes, `joint` [S, W, N, A] and `others`
+        [S, W, N, K, A] are encoded actions.
         """
         shape = joint.shape[1:-2]
         rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
@@ -99,14 +93,7 @@ class PerAgentCriticInput(SharedCriticInput):
 
 
 def in_circular_order(items: Tensor) -> Tensor:
-    """Return N rows of all items: row i lists the items in circular order and ends with item i.
-
-    Args:
-        items: [..., N, A].
-
-    Returns:
-        [..., N, N A]; row i holds items i + 1, ..., N, 1, ..., i.
-    """
+    """Return N rows [..., N, N A] of all items [..., N, A]: row i holds items i + 1, ..., N, 1, ..., i."""
     count = items.shape[-2]
     agents = torch.arange(count, device=items.device)
     order = (agents.unsqueeze(1) + agents + 1) % count
@@ -116,18 +103,11 @@ def in_circular_order(items: Tensor) -> Tensor:
 def counterfactual_values(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
     """Return the outputs for rows that end in N items, with one item at a time replaced by each of K others.
 
-    The N K rows share nearly all of the first layer's sums, which are computed once.
+    The N K rows share nearly all of the first layer's sums, which are computed once. Gradients flow to `others` alone;
+    the network's own parameters have to be frozen.
 
-    Gradients flow to `others` alone; the network's own parameters have to be frozen.
-
-    Args:
-        network: of inputs of width D + N A.
-        rows: [S, R, D] the numbers before the items.
-        items: [S, R, N, A].
-        others: [S, R, N, K, A] replacements of each item.
-
-    Returns:
-        [S, R, N, K, outputs].
+    Shape:
+        rows [S, R, D] before the items, items [S, R, N, A], others [S, R, N, K, A] to [S, R, N, K, outputs].
     """
     if network.norms is not None:  # normalisation changes the whole input with every exchange
         return _one_by_one(network, rows, items, others)

@@ -44,15 +44,12 @@ class Shape(NamedTuple):
 
 
 def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    """Return y = W_n act(... act(x W_1 + b_1) ...) + b_n.
+    """Return y = W_n act(... act(x W_1 + b_1) ...) + b_n: [S, ..., out], with the axes of the inputs.
 
     Args:
         shape: see there.
         inputs: [S, ..., d] parts of x, side by side; gradients flow to those that ask for them.
         parameters: W_1, b_1, ..., W_n, b_n.
-
-    Returns:
-        [S, ..., out], with the axes of the inputs.
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]

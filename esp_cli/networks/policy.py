@@ -62,10 +62,7 @@ class Policy(nn.Module):
     def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the normalised outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory.
 
-        Args:
-            obs: see above.
-            memory: see `initial_memory`.
-            action_mask: [S, E, N, A] bool, the allowed actions; None allows all.
+        The action mask [S, E, N, A] holds the allowed actions; None allows all.
         """
         outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
         return self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask), memory
@@ -151,15 +148,11 @@ class HistoryPolicy(Policy):
         return action, self.remember(memory, action)
 
     def unroll(self, obs: Tensor, action: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the normalised outputs over whole episodes, from empty memory.
+        """Return the normalised outputs over whole episodes, from empty memory, one row for each row of `obs`.
 
-        Args:
-            obs: [S, B, T + 1, N, D]; the last row may be left out.
-            action: [S, B, T, N(, width)] what was done in each step.
-            action_mask: [S, B, T + 1, N, A] bool, the allowed actions; None allows all.
-
-        Returns:
-            [S, B, T + 1, N, outputs], one row for each row of `obs`.
+        Shape:
+            obs [S, B, T + 1, N, D], the last row may be left out; what was done, action [S, B, T, N(, width)]; the
+            allowed actions, action_mask [S, B, T + 1, N, A] -> [S, B, T + 1, N, outputs].
         """
         rows = obs
         if self.recurrent:

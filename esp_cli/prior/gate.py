@@ -107,10 +107,7 @@ class Gate:
     def kept(self, transform: Transform, obs: Tensor, action: Tensor) -> Tensor:
         """Return the probability [S, B, T] with which the copy of each row is kept.
 
-        Args:
-            transform: one element per seed, or one for all.
-            obs: [S, B, T, N, D].
-            action: [S, B, T, N] int64, or [S, B, T, N, width] float32, as the learner has it.
+        Rows are obs [S, B, T, N, D] and action [S, B, T, N] int64, or [S, B, T, N, width], as the learner has it.
         """
         width, action = obs.shape[-1], self.spaces.action.admissible(self.to_environment(action))
         here = self._predicted(obs, action)
@@ -135,11 +132,7 @@ class Gate:
 def fit_gate(env: Environment, doubt: float, certain: Collection[str], alike: bool) -> Gate:
     """Fit the predictors of a task to episodes of its worlds, half of them by the heuristic if there is one.
 
-    Args:
-        env: worlds of one seed.
-        doubt: see `Gate`.
-        certain: likewise.
-        alike: whether one regression serves all agents; not where elements exchange them.
+    `alike` says whether one regression serves all agents; not where elements exchange them. The worlds are of one seed.
     """
     spaces = env.spec
     obs, action, outputs = _played(env)

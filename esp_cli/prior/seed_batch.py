@@ -99,15 +99,10 @@ class SeedBatch:
 
 
 def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean of each seed over what counts.
+    """Return the mean [S] of x [S, B, T, ...] (without a mask [S, ...]) over what counts; 0 where nothing does.
 
-    Args:
-        x: [S, B, T, ...]; without a mask [S, ...].
-        mask: [S, B, T] which rows count, or [S, B, T, N] of which agents; all where it is None. A number per world,
-            x [S, B, T, 1], counts while an agent of the world does.
-
-    Returns:
-        [S]; 0 where nothing counts.
+    The mask [S, B, T] says which rows count, or [S, B, T, N] which agents. A number per world, x [S, B, T, 1], counts
+    while an agent of the world does.
     """
     if mask is None:
         return x.flatten(1).mean(1)
@@ -121,12 +116,8 @@ def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
 def shares(mask: Tensor | None, shape: Sequence[int]) -> Tensor | float:
     """Return the share of each number of x [S, P, R] in the mean of each seed over parts and over what counts.
 
-    Args:
-        mask: [S, B, T] which rows count, or [S, B, T, N] of which agents; all where it is None.
-        shape: of x; R counts B, T and one number per world or N of the agents.
-
-    Returns:
-        A number, or [S, 1, R].
+    It is a number, or [S, 1, R]; the mask is as of `mean_per_seed`. R counts B, T and one number per world or N of the
+    agents.
     """
     if mask is None:
         return 1.0 / (shape[1] * shape[2])

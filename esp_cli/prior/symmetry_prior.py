@@ -122,10 +122,8 @@ class SymmetryPrior:
     ) -> Copies[Rows]:
         """Return a batch with the copies for its gradient step; without any where nothing would use them.
 
-        Args:
-            batch: the originals.
-            generators: one per seed; used only if there is something to draw.
-            adapt: what the learner changes in a copy that transforming alone leaves wrong.
+        The generators, one per seed, are used only if there is something to draw. `adapt` is what the learner changes
+        in a copy that transforming alone leaves wrong.
         """
         used = self.augments or self.config.coefficient > 0
         return Copies(self.config, batch, self._chosen(batch, generators) if used else [], self.augments, adapt)
@@ -141,10 +139,6 @@ class SymmetryPrior:
     @torch.no_grad()
     def errors(self, batch: Rows, evaluate: Callable[[Rows], Answers]) -> dict[str, Tensor]:
         """Measure how far networks are from symmetry, with a prior or without, on fixed elements.
-
-        Args:
-            batch: the originals.
-            evaluate: returns what the networks say of rows.
 
         Returns:
             "policy_symmetry_error" and "value_symmetry_error", [S] each, as far as `evaluate` answers; empty where the

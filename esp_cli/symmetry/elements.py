@@ -60,11 +60,9 @@ class Geometry(ABC):
 
     @abstractmethod
     def block(self, field: Field) -> Floats | Indices:
-        """Return how the d numbers of one item of a field transform.
+        """Return how the d numbers of one item of a field transform: an orthogonal matrix [d, d].
 
-        Returns:
-            An orthogonal matrix [d, d]; or, where numbers only change places, [d] integers: new number k is the old
-            number block[k].
+        Or, where numbers only change places, [d] integers: new number k is the old number block[k].
 
         Raises:
             UserError: the field cannot be transformed.
