@@ -23,14 +23,10 @@ from esp_envs.spec import TaskSpec
 
 @dataclass(frozen=True)
 class Iteration:
-    """What one iteration of collecting and learning returns.
+    """What one iteration of collecting and learning returns."""
 
-    Attributes:
-        metrics: what is logged, by name, [S] each.
-        finite: [S] bool, whether each seed's losses and gradients are finite numbers; one that is not stops the seed.
-    """
-
-    metrics: dict[str, Tensor]
+    metrics: dict[str, Tensor]  # what is logged, by name, [S] each
+    # [S] bool, whether each seed's losses and gradients are finite numbers; one that is not stops the seed
     finite: Tensor
 
 

@@ -63,15 +63,13 @@ class OffPolicyLearner(Learner):
 
     Arguments as of `Learner`.
 
-    Attributes:
-        watched: names of what `update` returns that has to be finite for a seed to go on.
 
     Raises:
         UserError: the replay cannot hold what one round collects.
     """
 
     replays = True
-    watched: ClassVar[tuple[str, ...]]
+    watched: ClassVar[tuple[str, ...]]  # names of what `update` returns that has to be finite for a seed to go on
     config: OffPolicyConfig
     policy: HistoryPolicy
     collector: EpisodeCollector

@@ -22,18 +22,12 @@ VJP = Callable[[Tensor], list[Tensor]]
 
 
 class NetworkConfig(Strict, ABC):
-    """The settings of one kind of network; a subclass has the fields of its kind and builds it.
+    """The settings of one kind of network; a subclass has the fields of its kind and builds it."""
 
-    Attributes:
-        name: by which the user chose the network.
-        recurrent: whether the network carries memory from step to step.
-        free_of_counts: whether the weights are the same for any number of agents and of things.
-    """
+    recurrent: ClassVar[bool] = False  # whether the network carries memory from step to step
+    free_of_counts: ClassVar[bool] = False  # whether the weights are the same for any number of agents and of things
 
-    recurrent: ClassVar[bool] = False
-    free_of_counts: ClassVar[bool] = False
-
-    name: str = Field("", max_length=100)
+    name: str = Field("", max_length=100)  # by which the user chose the network
     hidden: tuple[Annotated[int, Field(ge=1, le=4096)], ...] = Field(
         (64, 64), min_length=1, max_length=16, description="hidden widths; MAPPO paper: two of 64"
     )
@@ -131,17 +125,11 @@ class Network(nn.Module, ABC):
 
 
 class WithVJP(NamedTuple):
-    """What a network returned, and the way back from slopes by it.
+    """What a network returned, and the way back from slopes by it."""
 
-    Attributes:
-        tensor: without a graph.
-        vjp: see `VJP`.
-        parameters: that the VJP gives the slopes by.
-    """
-
-    tensor: Tensor
-    vjp: VJP
-    parameters: Sequence[Tensor]
+    tensor: Tensor  # without a graph
+    vjp: VJP  # see `VJP`
+    parameters: Sequence[Tensor]  # that the VJP gives the slopes by
 
 
 class Memoryless(Network):

@@ -41,15 +41,10 @@ def drawn(draw: Callable[..., Tensor], shape: Sequence[int], generators: Sequenc
 
 
 class Head(nn.Module, ABC):
-    """Reads actions out of a network's outputs; what every learner's policy has at its end.
+    """Reads actions out of a network's outputs; what every learner's policy has at its end."""
 
-    Attributes:
-        num_outputs: numbers that it reads of an agent; an encoded action has as many.
-        masks: whether outputs come with masked actions.
-    """
-
-    num_outputs: int
-    masks: bool = False
+    num_outputs: int  # numbers that it reads of an agent; an encoded action has as many
+    masks: bool = False  # whether outputs come with masked actions
 
     @abstractmethod
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:

@@ -15,18 +15,14 @@ Reads = Literal["state", "observations", "own"]
 
 @dataclass(frozen=True)
 class IoSpec:
-    """The input and output of a network in a task.
+    """The input and output of a network in a task."""
 
-    Attributes:
-        spaces: of the task.
-        reads: the global state, all agents' observations in a row, or one agent's own observation; rows of own
-            observations hold the agents of a world side by side.
-        num_values: number of invariant outputs; None for an actor, whose outputs are one number per discrete action,
-            or the numbers of a continuous action.
-    """
-
-    spaces: Spaces
+    spaces: Spaces  # of the task
+    # the global state, all agents' observations in a row, or one agent's own observation; rows of own observations
+    # hold the agents of a world side by side
     reads: Reads
+    # number of invariant outputs; None for an actor, whose outputs are one number per discrete action, or the numbers
+    # of a continuous action
     num_values: int | None = None
 
     @property

@@ -26,21 +26,14 @@ THIN = 16
 
 
 class Shape(NamedTuple):
-    """What a perceptron does beside its products.
+    """What a perceptron does beside its products."""
 
-    Attributes:
-        activation: "relu" or "tanh".
-        activate_output: whether it ends with an activation.
-        precision: of the products; what goes in and out stays float32.
-        rows_innermost: whether the outputs [S, B, out] lie in memory as [S, out, B]; those of thin outputs always do.
-        compiled: whether passes on the CPU go through the compiled kernel, in float32.
-    """
-
-    activation: str
-    activate_output: bool
-    precision: torch.dtype
+    activation: str  # "relu" or "tanh"
+    activate_output: bool  # whether it ends with an activation
+    precision: torch.dtype  # of the products; what goes in and out stays float32
+    # whether the outputs [S, B, out] lie in memory as [S, out, B]; those of thin outputs always do
     rows_innermost: bool = False
-    compiled: bool = False
+    compiled: bool = False  # whether passes on the CPU go through the compiled kernel, in float32
 
 
 def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:

@@ -40,13 +40,9 @@ _WIDEST_OTHERS = 160
 
 @dataclass(frozen=True)
 class GatedTransform(Transform):
-    """A transform of those rows alone whose gate is open; the others stay as they are.
+    """A transform of those rows alone whose gate is open; the others stay as they are."""
 
-    Attributes:
-        open: [S, B, T] bool; a last state behind the T steps goes with the last step.
-    """
-
-    open: Tensor
+    open: Tensor  # [S, B, T] bool; a last state behind the T steps goes with the last step
 
     @property
     def is_uniform(self) -> bool:
@@ -83,24 +79,16 @@ def moved_share(transform: Transform, num_seeds: int) -> Tensor:
 
 @dataclass(frozen=True)
 class Gate:
-    """One-step predictors of a task, and how far to trust a copy by what they say.
+    """One-step predictors of a task, and how far to trust a copy by what they say."""
 
-    Attributes:
-        spaces: of the task.
-        weights: [N or 1, features, D + 1] regression of change and reward on `inputs_of`, for each agent or for all.
-        scale: [D + 1] standard deviation of each number's field.
-        noise: [D + 1] gap in that unit that counts as none.
-        doubt: a copy that is off by b standard deviations is kept with probability exp(-doubt b).
-        certain: names of elements that are not gated.
-        to_environment: what the task is given for an action of the learner.
-    """
-
-    spaces: Spaces
+    spaces: Spaces  # of the task
+    # [N or 1, features, D + 1] regression of change and reward on `inputs_of`, for each agent or for all
     weights: Tensor
-    scale: Tensor
-    noise: Tensor
-    doubt: float
-    certain: Collection[str] = ()
+    scale: Tensor  # [D + 1] standard deviation of each number's field
+    noise: Tensor  # [D + 1] gap in that unit that counts as none
+    doubt: float  # a copy that is off by b standard deviations is kept with probability exp(-doubt b)
+    certain: Collection[str] = ()  # names of elements that are not gated
+    # what the task is given for an action of the learner
     to_environment: Callable[[Tensor], Tensor] = lambda action: action
 
     @torch.no_grad()

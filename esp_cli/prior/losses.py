@@ -18,17 +18,11 @@ from esp_cli.prior.seed_batch import average, shares
 
 
 class Stated(NamedTuple):
-    """An equation, evaluated.
+    """An equation, evaluated."""
 
-    Attributes:
-        elements: [S, P, R], whose mean it is; or a number per seed [S], or one [].
-        share: of each element in the mean of its seed; see `shares`. None for a number.
-        slope: that of the terms before, or None, with its own times its weight added.
-    """
-
-    elements: Tensor
-    share: Tensor | float | None
-    slope: Any
+    elements: Tensor  # [S, P, R], whose mean it is; or a number per seed [S], or one []
+    share: Tensor | float | None  # of each element in the mean of its seed; see `shares`. None for a number.
+    slope: Any  # that of the terms before, or None, with its own times its weight added
 
 
 Equation = Callable[[Any, float, Any], Stated]  # (outputs, weight, slope of the terms before or None) -> what is stated

@@ -16,23 +16,17 @@ Rows = TypeVar("Rows", bound="SeedBatch")
 
 @dataclass
 class SeedBatch:
-    """Tensors [S, B, ...] of what was seen and done; a subclass adds fields and names those that count per agent.
+    """Tensors [S, B, ...] of what was seen and done; a subclass adds fields and names those that count per agent."""
 
-    Attributes:
-        obs: [S, B, ..., N, D].
-        state: [S, B, ..., Ds].
-        action: [S, B, ..., N(, width)].
-        action_mask: [S, B, ..., N, A] bool, the allowed actions; None allows all.
-        alive: [S, B, ..., N] bool, the agents that have not ended; None where none ever ends.
-        per_agent: names of fields [S, B, ..., N] that move with their agents; those with one number per world stay.
-    """
-
+    # names of fields [S, B, ..., N] that move with their agents; those with one number per world stay
     per_agent: ClassVar[tuple[str, ...]] = ()
 
-    obs: Tensor
-    state: Tensor
-    action: Tensor
+    obs: Tensor  # [S, B, ..., N, D]
+    state: Tensor  # [S, B, ..., Ds]
+    action: Tensor  # [S, B, ..., N(, width)]
+    # [S, B, ..., N, A] bool, the allowed actions; None allows all
     action_mask: Tensor | None = field(default=None, kw_only=True)
+    # [S, B, ..., N] bool, the agents that have not ended; None where none ever ends
     alive: Tensor | None = field(default=None, kw_only=True)
 
     @property

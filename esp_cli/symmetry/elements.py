@@ -77,17 +77,14 @@ class Element:
     both = mirror() @ swap  # the parts act on different things, so they commute
     both.name  # "flip-x*agents-1-0"
 
-    Attributes:
-        geometry: at most one of each kind of `Geometry`; empty where the scene stays.
-        permutation: sigma, with sigma[i] the place that agent i moves to; None where agents stay.
-        items: fields whose like items change places, each with the place that item k moves to; sorted by name.
 
     Raises:
         UserError: two geometries are of one kind, or an order names a place twice.
     """
 
-    geometry: tuple[Geometry, ...] = ()
-    permutation: Order | None = None
+    geometry: tuple[Geometry, ...] = ()  # at most one of each kind of `Geometry`; empty where the scene stays
+    permutation: Order | None = None  # sigma, with sigma[i] the place that agent i moves to; None where agents stay
+    # fields whose like items change places, each with the place that item k moves to; sorted by name
     items: Orders = ()
 
     def __post_init__(self) -> None:

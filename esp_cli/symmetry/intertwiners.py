@@ -17,15 +17,10 @@ _INDEPENDENT = 1e-6  # length of what is new in a map, of those that are average
 
 @dataclass(frozen=True)
 class Block:
-    """Equal runs of numbers, one after the other, which transform by the same matrices.
+    """Equal runs of numbers, one after the other, which transform by the same matrices."""
 
-    Attributes:
-        matrices: [G, d, d] how each element acts on one copy, orthogonal.
-        copies: how many.
-    """
-
-    matrices: Floats
-    copies: int
+    matrices: Floats  # [G, d, d] how each element acts on one copy, orthogonal
+    copies: int  # how many
 
     @property
     def size(self) -> int:

@@ -25,13 +25,9 @@ _LARGEST_MATRIX = 4096  # numbers in a row beyond which no matrix is built
 
 @dataclass(frozen=True)
 class Dense:
-    """Multiply by a matrix.
+    """Multiply by a matrix."""
 
-    Attributes:
-        matrix: [S, width, width], orthogonal.
-    """
-
-    matrix: Tensor
+    matrix: Tensor  # [S, width, width], orthogonal
 
     @property
     def width(self) -> int:
@@ -78,17 +74,11 @@ def _product(rows: Tensor, matrix: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Gather:
-    """Reorder the numbers and change some signs; its members are those of `Dense`.
+    """Reorder the numbers and change some signs; its members are those of `Dense`."""
 
-    Attributes:
-        source: [S, width] int64, where each pushed number comes from.
-        back: [S, width] int64, the inverse: where each pulled number comes from.
-        sign: [S, width] what each pushed number is multiplied by; None changes no sign.
-    """
-
-    source: Tensor
-    back: Tensor
-    sign: Tensor | None = None
+    source: Tensor  # [S, width] int64, where each pushed number comes from
+    back: Tensor  # [S, width] int64, the inverse: where each pulled number comes from
+    sign: Tensor | None = None  # [S, width] what each pushed number is multiplied by; None changes no sign
 
     @property
     def width(self) -> int:

@@ -33,14 +33,10 @@ class PlaneElement(Geometry):
     """Mirror in the x-axis if `mirrored`, then turn. Products and inverses are exact; matrices are derived.
 
     PlaneElement(Fraction(1, 4)).block(Field("way", Kind.VECTOR))  # [[0, -1], [1, 0]]
-
-    Attributes:
-        turn: counter-clockwise fraction of a full turn in [0, 1).
-        mirrored: whether y changes sign before the turn.
     """
 
-    turn: Fraction = Fraction(0)
-    mirrored: bool = False
+    turn: Fraction = Fraction(0)  # counter-clockwise fraction of a full turn in [0, 1)
+    mirrored: bool = False  # whether y changes sign before the turn
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "turn", Fraction(self.turn) % 1)

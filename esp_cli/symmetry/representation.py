@@ -24,14 +24,10 @@ class Operator:
     """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]].
 
     It is sparse, so that a permutation of the pixels of a picture is no matrix of their square.
-
-    Attributes:
-        source: [G, D, m] int64; a new number is made of m old ones.
-        weight: [G, D, m].
     """
 
-    source: Indices
-    weight: Floats
+    source: Indices  # [G, D, m] int64; a new number is made of m old ones
+    weight: Floats  # [G, D, m]
 
     @classmethod
     def of_block(cls, block: Floats | Indices) -> Operator:

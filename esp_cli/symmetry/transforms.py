@@ -42,21 +42,14 @@ class Transform:
 
     Where agents stay in their places, rows may come without an agent axis. Results are new tensors, and gradients flow
     through.
-
-    Attributes:
-        elements: the element of each seed.
-        agents: how agents change places, on one number for each; None where all stay.
-        obs_map: L_g of an observation, or where agents move of all agents' observations end to end.
-        state_map: L_g of the global state.
-        output_map: K_g of one number per discrete action, or of a continuous action, likewise.
-        action_index: K_g of a discrete action, [S, A] int64: what action j becomes; None of continuous ones.
     """
 
-    elements: tuple[Element, ...]
-    agents: Gather | None
-    obs_map: Map
-    state_map: Map
-    output_map: Map
+    elements: tuple[Element, ...]  # the element of each seed
+    agents: Gather | None  # how agents change places, on one number for each; None where all stay
+    obs_map: Map  # L_g of an observation, or where agents move of all agents' observations end to end
+    state_map: Map  # L_g of the global state
+    output_map: Map  # K_g of one number per discrete action, or of a continuous action, likewise
+    # K_g of a discrete action, [S, A] int64: what action j becomes; None of continuous ones
     action_index: Tensor | None
 
     @property
