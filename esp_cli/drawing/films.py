@@ -30,6 +30,10 @@ _BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6
 """Height of a bar of text, height of the numbers below and width of those beside a picture, in letters."""
 _OVERSAMPLING = 3
 _GAP = 8  # pixels between two pictures
+GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
+_GIF_TICK_S = 0.01
+_COLORS = 255  # colours of a GIF; one more marks what has not changed since the frame before
+_EXACT_COLORS = 64
 
 
 @dataclass(frozen=True)
@@ -73,17 +77,6 @@ def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float)
     return np.concatenate([_bar(body.shape[1], size, left, time), body, legend])
 
 
-def _total(moment: Moment) -> str:
-    return f"return {moment.total:.1f}"
-
-
-def _scale(scene: Scene, flat: bool) -> str:
-    if flat:
-        return f"axes in {scene.unit}" if scene.unit else ""
-    x_min, x_max, y_min, y_max = scene.window
-    return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
-
-
 def beside(pictures: Sequence[Frame], gap: int) -> Frame:
     """Put pictures of any height side by side, with a gap in pixels between them."""
     height = max(map(len, pictures))
@@ -93,6 +86,61 @@ def beside(pictures: Sequence[Frame], gap: int) -> Frame:
         for picture, (left, below) in zip(pictures, margins, strict=True)
     ]
     return np.concatenate(padded, axis=1)
+
+
+def write_gif(path: Path, frames: Iterable[Frame], seconds: Sequence[float], sample: Sequence[Frame]) -> None:
+    """Write frames as an endlessly repeated GIF.
+
+    Args:
+        path: where to.
+        frames: [H, W, 3] each, all of one size; taken one after the other, so they need not all be in memory.
+        seconds: how long each frame is in view.
+        sample: some of the frames, which the one palette of the film is made for.
+    """
+    palette = _palette(sample)
+    reduced = _reduced(frames, palette)
+    content = BytesIO()
+    next(reduced).save(
+        content,
+        "GIF",
+        save_all=True,
+        append_images=reduced,
+        duration=_milliseconds(seconds),
+        loop=0,
+        optimize=True,
+        transparency=_COLORS,
+        palette=palette.tobytes().ljust(3 * 256, b"\0"),
+    )
+    write_file(path, content.getvalue())
+
+
+def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
+    """Write frames as an MP4."""
+    with TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"
+        options: dict[str, Any] = {"fps": frames_per_second, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        writer: Any = get_writer(film, format="FFMPEG", mode="I", **options)
+        with writer:
+            for frame in frames:
+                odd = [(0, size % 2) for size in frame.shape[:2]]  # the format asks for even sizes
+                writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
+        write_file(path, film.read_bytes())
+
+
+def write_png(path: Path, picture: Frame) -> None:
+    """Write one picture."""
+    write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))
+
+
+def _total(moment: Moment) -> str:
+    return f"return {moment.total:.1f}"
+
+
+def _scale(scene: Scene, flat: bool) -> str:
+    if flat:
+        return f"axes in {scene.unit}" if scene.unit else ""
+    x_min, x_max, y_min, y_max = scene.window
+    return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
 
 
 @lru_cache(maxsize=8)
@@ -167,38 +215,6 @@ def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> 
     return [k * step for k in range(first, last + 1)]
 
 
-GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
-_GIF_TICK_S = 0.01
-_COLORS = 255  # colours of a GIF; one more marks what has not changed since the frame before
-_EXACT_COLORS = 64
-
-
-def write_gif(path: Path, frames: Iterable[Frame], seconds: Sequence[float], sample: Sequence[Frame]) -> None:
-    """Write frames as an endlessly repeated GIF.
-
-    Args:
-        path: where to.
-        frames: [H, W, 3] each, all of one size; taken one after the other, so they need not all be in memory.
-        seconds: how long each frame is in view.
-        sample: some of the frames, which the one palette of the film is made for.
-    """
-    palette = _palette(sample)
-    reduced = _reduced(frames, palette)
-    content = BytesIO()
-    next(reduced).save(
-        content,
-        "GIF",
-        save_all=True,
-        append_images=reduced,
-        duration=_milliseconds(seconds),
-        loop=0,
-        optimize=True,
-        transparency=_COLORS,
-        palette=palette.tobytes().ljust(3 * 256, b"\0"),
-    )
-    write_file(path, content.getvalue())
-
-
 def _milliseconds(seconds: Sequence[float]) -> list[int]:
     """Round to the hundredths that a GIF knows, so that the errors do not add up."""
     shortest = round(1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S))
@@ -247,21 +263,3 @@ def _codes(frame: Frame) -> NDArray[np.uint32]:
 def _colors(codes: NDArray[np.uint32]) -> Frame:
     """Return [K, 3] the colours behind numbers [K]."""
     return np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)
-
-
-def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> None:
-    """Write frames as an MP4."""
-    with TemporaryDirectory() as folder:
-        film = Path(folder) / "film.mp4"
-        options: dict[str, Any] = {"fps": frames_per_second, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-        writer: Any = get_writer(film, format="FFMPEG", mode="I", **options)
-        with writer:
-            for frame in frames:
-                odd = [(0, size % 2) for size in frame.shape[:2]]  # the format asks for even sizes
-                writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
-        write_file(path, film.read_bytes())
-
-
-def write_png(path: Path, picture: Frame) -> None:
-    """Write one picture."""
-    write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))

@@ -42,6 +42,9 @@ _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
 _FILM_SECONDS = 15.0  # a film is sped up to last no longer
 _MAX_FILM_BYTES = 2**26
+_KEYS = ("run", "seed", "step")
+SeedRun = dict[str, dict[str, int | list[float]]]  # step, or "absolute_metrics" -> metric -> numbers
+MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment -> task -> algorithm -> seed
 
 
 def write_report(material: Material, out: Path) -> list[Path]:
@@ -116,38 +119,6 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
         watch(count)
 
 
-def _refuse_foreign(out: Path) -> None:
-    """Refuse a folder whose files of these names are not of a report."""
-    own = (MARKDOWN, RESULTS, PAGE, MARL_EVAL, f"{CURVES}.png", f"{CURVES}.svg")
-    foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
-    if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
-        raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
-
-
-def _film(path: Path) -> bytes:
-    """Return a film that was drawn before; empty where there is none. A link is not followed."""
-    content = None
-    if not path.is_symlink():
-        with contextlib.suppress(OSError):
-            content = read_regular(path, _MAX_FILM_BYTES)
-    return content if content and content.startswith(b"GIF8") else b""
-
-
-def _data_uri(content: bytes, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _fenced(command: str) -> str:
-    """Return a block of shell commands, in a fence that is longer than any row of backticks in it."""
-    fence = "`" * max(3, *(len(row) + 1 for row in re.findall("`+", command)), 0)
-    return f"{fence}sh\n{command}\n{fence}"
-
-
-_KEYS = ("run", "seed", "step")
-SeedRun = dict[str, dict[str, int | list[float]]]  # step, or "absolute_metrics" -> metric -> numbers
-MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment -> task -> algorithm -> seed
-
-
 def write_csv(path: Path, material: Material) -> int:
     """Write the metrics of runs that have begun; return the number of rows.
 
@@ -182,6 +153,33 @@ def marl_eval(material: Material) -> MarlEval:
         runs = {f"seed_{seed}": _seed_run(curve, k, whole[k]) for k, seed in enumerate(cell.config.seeds)}
         out.setdefault(_environment(cell), {}).setdefault(_key(cell.panel), {})[_key(cell.variant)] = runs
     return out
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Refuse a folder whose files of these names are not of a report."""
+    own = (MARKDOWN, RESULTS, PAGE, MARL_EVAL, f"{CURVES}.png", f"{CURVES}.svg")
+    foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
+    if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
+        raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
+
+
+def _film(path: Path) -> bytes:
+    """Return a film that was drawn before; empty where there is none. A link is not followed."""
+    content = None
+    if not path.is_symlink():
+        with contextlib.suppress(OSError):
+            content = read_regular(path, _MAX_FILM_BYTES)
+    return content if content and content.startswith(b"GIF8") else b""
+
+
+def _data_uri(content: bytes, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def _fenced(command: str) -> str:
+    """Return a block of shell commands, in a fence that is longer than any row of backticks in it."""
+    fence = "`" * max(3, *(len(row) + 1 for row in re.findall("`+", command)), 0)
+    return f"{fence}sh\n{command}\n{fence}"
 
 
 def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:

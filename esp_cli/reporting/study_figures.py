@@ -20,6 +20,14 @@ from esp_cli.reporting.figures import POINTS_PER_INCH, Picture, appearance, capt
 from esp_cli.reporting.results import CellResult, Results, floats
 from esp_cli.studies.kinds import UNBROKEN, kind_of
 
+_ONE_PANEL, _PANEL = (7.2, 4.2), (4.0, 3.2)  # width and height of a panel, inches
+_LEGEND_INCHES = 0.8
+_MAX_COLUMNS = 3
+_LABEL_CHARACTERS = 44  # of one line beside the vertical axis
+_BELOW_RANDOM = 0.15  # how far below the random policy a panel of curves goes, as a share of what is above it
+_NAME_HEIGHT = 0.05  # height of a level's name as a share of a panel
+_MAX_HOVERED = 200  # evaluations of a curve whose values a page shows; those of longer curves are thinned out
+
 
 @dataclass(frozen=True)
 class Series:
@@ -117,24 +125,6 @@ def draw_over_setting(results: Results, path: Path) -> list[Picture]:
     return pictures
 
 
-def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
-    """Return the cells whose seeds all have a return, by panel and variant."""
-    finished: dict[str, dict[str, CellResult]] = {}
-    for cell in results.cells:
-        if cell.returns and None not in cell.returns[results.mode]:
-            finished.setdefault(cell.panel, {})[cell.variant] = cell
-    return finished
-
-
-_ONE_PANEL, _PANEL = (7.2, 4.2), (4.0, 3.2)  # width and height of a panel, inches
-_LEGEND_INCHES = 0.8
-_MAX_COLUMNS = 3
-_LABEL_CHARACTERS = 44  # of one line beside the vertical axis
-_BELOW_RANDOM = 0.15  # how far below the random policy a panel of curves goes, as a share of what is above it
-_NAME_HEIGHT = 0.05  # height of a level's name as a share of a panel
-_MAX_HOVERED = 200  # evaluations of a curve whose values a page shows; those of longer curves are thinned out
-
-
 @dataclass(frozen=True)
 class Panel:
     """One pair of axes of learning curves."""
@@ -198,6 +188,15 @@ def learning_curves(
         )
     hovers = tuple(_hover(figure, axes, panel, labels, bands) for axes, panel, bands in drawn)
     return picture, hovers
+
+
+def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
+    """Return the cells whose seeds all have a return, by panel and variant."""
+    finished: dict[str, dict[str, CellResult]] = {}
+    for cell in results.cells:
+        if cell.returns and None not in cell.returns[results.mode]:
+            finished.setdefault(cell.panel, {})[cell.variant] = cell
+    return finished
 
 
 def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
