@@ -29,18 +29,18 @@ def policies(
     entries = [entry for entry in read_bundled() if task in (None, entry.task)]
     if not entries:
         raise UserError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
-    console.result(json, entries, lambda: _print(entries, commands=task is not None))
+
+    def show() -> None:
+        with console.paged():
+            _print(entries)
+        for entry in entries if task else ():
+            console.say(f"{entry.name}: {entry.command}")
+        console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
+
+    console.result(json, entries, show)
 
 
-def _print(entries: Sequence[Entry], commands: bool) -> None:
-    with console.paged():
-        _print_tables(entries)
-    for entry in entries if commands else ():
-        console.say(f"{entry.name}: {entry.command}")
-    console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
-
-
-def _print_tables(entries: Sequence[Entry]) -> None:
+def _print(entries: Sequence[Entry]) -> None:
     """Print a table for each convention of returns, within which alone they compare."""
     groups: dict[tuple[str, int, str, int], list[Entry]] = {}
     for entry in entries:

@@ -64,14 +64,8 @@ def _print(sections: Sequence[Section]) -> None:
 
 def _print_section(section: Section) -> None:
     prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
-    chosen = {
-        "task": f"--task {section.name}",
-        "algorithm": f"--algo {section.name}",
-        "network": f"--network {section.name}",
-    }
-    title = f"{section.name}: --set {prefix}.NAME=VALUE" + (
-        f", with {chosen[section.kind]}" if section.kind in chosen else ""
-    )
+    option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
+    title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
     rows = [
         (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
         for one in section.settings

@@ -25,11 +25,10 @@ from esp_cli.files.formatting import escaped, format_count
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file, write_file
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.reporting.collect import Material, RunCurve
+from esp_cli.reporting.collect import Material
 from esp_cli.reporting.results import RESULTS_FORMAT
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
-from esp_cli.studies.run_set import Cell
 from esp_cli.training.folder_names import POLICY
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -150,8 +149,17 @@ def marl_eval(material: Material) -> MarlEval:
         whole = [value for value in finals if value is not None]
         if curve is None or not whole or len(whole) < len(finals) or not np.isfinite(curve.values).all():
             continue
-        runs = {f"seed_{seed}": _seed_run(curve, k, whole[k]) for k, seed in enumerate(cell.config.seeds)}
-        out.setdefault(_environment(cell), {}).setdefault(_key(cell.panel), {})[_key(cell.variant)] = runs
+        runs: dict[str, SeedRun] = {}
+        for k, seed in enumerate(cell.config.seeds):
+            evaluations = enumerate(zip(curve.steps, curve.values[:, k], strict=True), start=1)
+            own: SeedRun = {
+                f"step_{n}": {"step_count": int(step), "return": [float(value)]} for n, (step, value) in evaluations
+            }
+            runs[f"seed_{seed}"] = {**own, "absolute_metrics": {"return": [float(whole[k])]}}
+        package, *inner = task_class(cell.config.task).__module__.split(".")
+        family = inner[0] if package == "esp_envs" and inner else package
+        environment = out.setdefault(f"{family}_{format_count(cell.config.steps)}", {})
+        environment.setdefault(_key(cell.panel), {})[_key(cell.variant)] = runs
     return out
 
 
@@ -189,30 +197,12 @@ def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:
     seeds = opened.config["seeds"]
     for row in read_metrics(opened.metrics_path):
         for index, seed in enumerate(seeds):
-            cells = {key: _of_seed(value, index) for key, value in row.items() if key != "step"}
-            yield {"run": name, "seed": seed, "step": row["step"], **cells}
-
-
-def _of_seed(value: Any, index: int) -> Any:
-    if not isinstance(value, list):
-        return value
-    return value[index] if index < len(value) else None
-
-
-def _environment(cell: Cell) -> str:
-    """Return the family of the task and the number of steps: "mpe_500k"."""
-    package, *inner = task_class(cell.config.task).__module__.split(".")
-    family = inner[0] if package == "esp_envs" and inner else package
-    return f"{family}_{format_count(cell.config.steps)}"
+            own = {
+                key: ([*value, *[None] * len(seeds)][index] if isinstance(value, list) else value)
+                for key, value in row.items()
+            }
+            yield {**own, "run": name, "seed": seed}
 
 
 def _key(text: str) -> str:
     return "_".join(text.replace(",", " ").replace("=", " ").split())
-
-
-def _seed_run(curve: RunCurve, seed: int, final: float) -> SeedRun:
-    steps: SeedRun = {
-        f"step_{k}": {"step_count": int(step), "return": [float(value)]}
-        for k, (step, value) in enumerate(zip(curve.steps, curve.values[:, seed], strict=True), start=1)
-    }
-    return {**steps, "absolute_metrics": {"return": [float(final)]}}

@@ -62,9 +62,14 @@ def returns_table(results: Results) -> Table:
     rows, columns = (panels, variants) if by_panel else (variants, panels)
     has_paper = any(cell.paper for cell in results.cells)
     lines: list[tuple[str, ...]] = []
+
+    def own_text(cell: CellResult) -> str:
+        fewer = cell.status == "finished" and len(cell.seeds) < most
+        return return_text(cell) + (f" (n = {len(cell.seeds)})" if fewer else "")
+
     for row in rows:
         placed = [cells.get((row, column) if by_panel else (column, row)) for column in columns]
-        ours = [NOTHING if cell is None else return_text(cell) + _fewer_seeds(cell, most) for cell in placed]
+        ours = [NOTHING if cell is None else own_text(cell) for cell in placed]
         theirs = [format_mean(*cell.paper) if cell is not None and cell.paper else NOTHING for cell in placed]
         lines.append((row, *(["ours"] if has_paper else []), *ours))
         if set(theirs) != {NOTHING}:
@@ -247,12 +252,6 @@ def _beside(text: Callable[[Gap], str]) -> Callable[[CellResult], str]:
         return NOTHING if summary is None or summary.gap is None else text(summary.gap)
 
     return column
-
-
-def _fewer_seeds(cell: CellResult, most: int) -> str:
-    """Say how many seeds a finished cell has where others have more."""
-    count = len(cell.seeds)
-    return f" (n = {count})" if count < most and cell.status == "finished" else ""
 
 
 def _reference(results: Results) -> str:

@@ -122,6 +122,4 @@ def _importances(study: Any) -> None:
 
 
 def _setting(value: object) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3g}" if isinstance(value, float) else json.dumps(value)
+    return NOTHING if value is None else f"{value:.3g}" if isinstance(value, float) else json.dumps(value)
