@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from esp_cli.files.formatting import NOTHING
+from esp_cli.files.formatting import NOTHING, format_exactly
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import Floats, difference, summarise
@@ -29,9 +29,8 @@ from esp_cli.reporting.results import CellResult, Results, Side, floats, read_re
 from esp_cli.reporting.study_figures import Series, series_of
 from esp_cli.reporting.tables import TABLES as REPORT_TABLES
 from esp_cli.reporting.tables import Table, mean_text, on_the_way
-from esp_cli.studies.catalogue import paper_cells
-from esp_cli.studies.kinds import UNBROKEN
-from esp_cli.studies.paper import reported
+from esp_cli.studies import paper
+from esp_cli.studies.kinds import UNBROKEN, Team, kind_of
 from esp_envs.errors import UserError
 
 DOCS = Path(__file__).parent
@@ -113,7 +112,7 @@ def paper_table(results: Results) -> Table:
     bare = {"status": "not run", "returns": {}, "summary": None, "convention": None}
     cells = []
     for panel, variant, key in paper_cells(results.kind):
-        number = reported(key)
+        number = paper.reported(key)
         theirs = {"panel": panel, "variant": variant, "paper": number and (number.mean, number.sem)}
         cells.append(ours.pop((panel, variant), None) or results.cells[0].model_copy(update=bare | theirs))
     return REPORT_TABLES["returns"](results.model_copy(update={"cells": (*cells, *ours.values())}))
@@ -268,6 +267,22 @@ def main() -> None:
     for page in named or [page for page in sorted(DOCS.rglob("*.md")) if files_of(page)]:
         write_file(page, filled(page).encode())
         print(f"tables -> {page}")
+
+
+def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Yield panel, variant and place of every number that the paper's table of this kind has; none for ablations."""
+    kind = kind_of(name)
+    if kind.rows == "variants":
+        return
+    for task in kind.tasks:
+        teams = [team for team in kind.teams if team.settings["task.num_landmarks"] is None]
+        for team in teams or (Team(task, {}, ("table1", task)),):
+            for steps in paper.horizons(task):
+                for algorithm in kind.algorithms:
+                    for prior in kind.variants:
+                        key = (*team.place, str(steps), algorithm, prior)
+                        variant = algorithm.upper() + ("" if prior == "none" else "-ESP")
+                        yield f"{team.label}, {format_exactly(steps)}", variant, key
 
 
 if __name__ == "__main__":
