@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 
-from esp_cli.checking.task import check_symmetry, judged
+from esp_cli.checking.task import TRANSITIONS, check_symmetry, judged
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Group, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestricted
@@ -92,7 +92,7 @@ def _discovered(make_worlds: _Maker) -> str:
 
 @lru_cache(maxsize=64)
 def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], ...]:
-    """Return by how many standard deviations each element's worst field is off; infinite where it is not covered.
+    """Return by how many standard deviations each element's worst field is off; infinite where nobody knows.
 
     Raises:
         UserError: the task cannot carry the elements, or they cannot be listed.
@@ -105,11 +105,16 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
             f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "
             "finite group, such as d4"
         )
-    _, verdicts = judged(make_worlds, elements)
-    return tuple((verdict.element, _gap(verdict)) for verdict in verdicts)
+    method, verdicts = judged(make_worlds, elements)
+    return tuple((verdict.element, _gap(verdict, method)) for verdict in verdicts)
 
 
-def _gap(verdict: ElementVerdict) -> float:
-    if verdict.outcome == "not covered":
+def _gap(verdict: ElementVerdict, method: str) -> float:
+    """Return by how much the worst field is off; infinite where nobody knows.
+
+    That is where a field is not covered, or is broken as far as transitions show, which can be less than it is.
+    """
+    outcomes = {field.outcome for field in verdict.fields} | {verdict.outcome}
+    if "not covered" in outcomes or (method == TRANSITIONS and "broken" in outcomes):
         return math.inf
     return max((field.gap for field in verdict.fields if field.outcome == "broken"), default=0.0)

@@ -1,4 +1,4 @@
-"""Predict what follows a step: by a ridge regression on products and bumps, and by a network what that leaves over."""
+"""Predict what follows a step: a regression on products and bumps, cells and a network, each on what is left over."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ _HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3
 _RIDGE = 1e-2
 _BUMPS, _BREADTH = 32, 0.6
 """Bumps for each vector, and how broad one is, in standard deviations of the vector."""
+_CELLS = 24
+"""Parts of each number of a vector, of equally many steps: what has sharp edges is averaged in the cells of both."""
 _ROUNDING = 1e-3
 _CHUNK = 512
 """Episodes whose features are held at once."""
@@ -47,6 +49,8 @@ class Predictor:
         self._middles = rows[picked][:, self._planes]
         self._weights = self._regressed(data, torch.cat([outputs, functions], -1))
         rest = (outputs - self._linear(data)[..., : self._count]).flatten(0, 2)
+        self._cells = _Cells(rows[:, self._planes], rest)
+        rest = rest - self._cells(rows[:, self._planes])
         self._scale = torch.maximum(rest.std(0), 1e-3 * outputs.flatten(0, 2).std(0)).clamp_min(STILL)
         self._net = _Network(rows, rest / self._scale)
 
@@ -54,7 +58,8 @@ class Predictor:
     def __call__(self, data: Transitions) -> tuple[Tensor, Tensor]:
         """Return what is expected to follow, [M, T, N, O], and the functions, [M, T, N, B]."""
         outputs, functions = self._linear(data).tensor_split([self._count], -1)
-        rest = self._net(self._standard(self._seen(data)).flatten(0, 2)) * self._scale
+        rows = self._standard(self._seen(data)).flatten(0, 2)
+        rest = self._net(rows) * self._scale + self._cells(rows[:, self._planes])
         return outputs + rest.view_as(outputs), functions
 
     def covers(self, data: Transitions) -> Tensor:
@@ -100,6 +105,42 @@ class Predictor:
         acted, agents = self._done(data), self._spaces.num_agents
         others = [acted[:, :, order] for order in orders_of_others(agents)]
         return torch.cat([data.obs, acted, *others, torch.eye(agents).expand(*data.obs.shape[:3], -1)], -1)
+
+
+class _Cells:
+    """Means in the cells of each vector, one vector after the other, shrunk as far as noise would make them.
+
+    Args:
+        vectors: [rows, planes, 2].
+        y: [rows, outputs].
+    """
+
+    def __init__(self, vectors: Tensor, y: Tensor) -> None:
+        levels = torch.linspace(0, 1, _CELLS + 1)[1:-1]
+        self._edges = torch.quantile(vectors[: 1 << 14], levels, 0).movedim(0, -1).contiguous()
+        self._means = []
+        for cells in self._of(vectors).unbind(1):
+            count = torch.bincount(cells, minlength=_CELLS**2).unsqueeze(1).float()
+            mean = torch.zeros(_CELLS**2, y.shape[1]).index_add(0, cells, y) / count.clamp_min(1)
+            noise = y.var(0)
+            share = (count * mean.square()).sum(0) / len(y) - noise * (count > 0).sum() / len(y)
+            held = share.clamp_min(0) / (share.clamp_min(0) + noise / count.clamp_min(1)).clamp_min(1e-20)
+            self._means.append(held * mean)
+            y = y - self._means[-1][cells]
+
+    def __call__(self, vectors: Tensor) -> Tensor:
+        """Return what is expected, [rows, outputs]."""
+        cells = self._of(vectors)
+        return torch.stack([mean[cells[:, k]] for k, mean in enumerate(self._means)]).sum(0)
+
+    def _of(self, vectors: Tensor) -> Tensor:
+        """Return the cell of each vector, [rows, planes]."""
+        places = [
+            torch.searchsorted(edges, part.contiguous())
+            for edges, part in zip(self._edges.flatten(0, 1), vectors.flatten(1).unbind(1), strict=True)
+        ]
+        x, y = torch.stack(places, 1).unflatten(1, (-1, 2)).unbind(-1)
+        return x * _CELLS + y
 
 
 class _Network:

@@ -37,6 +37,8 @@ TOLERATED = 0.2
 """Standard deviations of a field that a step from the image may differ from the step's image."""
 _SEEN = 0.1
 """Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
+_DOUBTFUL = 4.0
+"""Standard errors from which such a gap is no breaking yet, but leaves an element uncovered."""
 _MOST_ROWS = 1 << 15
 """Steps of agents that are looked at, at most; of more episodes every k-th step."""
 _FEWEST_INSIDE = 0.5
@@ -110,16 +112,16 @@ def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> Field
     """
     gap, error = _mean(alone)
     p_value = 1.0
-    if planted.shape[1]:
+    if planted.shape[1] and not _is_beyond(gap, error, _DOUBTFUL):
         expected, errors = _mean(planted - alone.unsqueeze(1))[0], _mean(planted)[1]
         p_value = float(torch.special.ndtr((gap - expected) / errors).max())
     if name.startswith("obs."):
         other, its_error = _mean(squares)
-        if other / its_error > gap / error and _is_broken(other, its_error):
+        if other / its_error > gap / error and _is_beyond(other, its_error):
             gap, error = other, its_error
     size = float(gap.clamp_min(0).sqrt())
     error_of_size = min(float(error) / max(2 * size, 1e-12), float(error) ** 0.5)
-    return concluded(name, size, error_of_size, _is_broken(gap, error), p_value)
+    return concluded(name, size, error_of_size, _is_beyond(gap, error), p_value)
 
 
 class _Half:
@@ -264,8 +266,8 @@ def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:
     return samples.mean(0), (samples.std(0) / len(samples) ** 0.5).clamp_min(1e-12)
 
 
-def _is_broken(gap: Tensor | float, error: Tensor | float) -> bool:
-    return bool(gap > SIGNIFICANT * error) and bool(gap > _SEEN * TOLERATED**2)
+def _is_beyond(gap: Tensor | float, error: Tensor | float, errors: float = SIGNIFICANT) -> bool:
+    return bool(gap > errors * error) and bool(gap > _SEEN * TOLERATED**2)
 
 
 def _in_float32(data: Transitions) -> Transitions:

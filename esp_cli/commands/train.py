@@ -183,8 +183,9 @@ def _announce(config: RunConfig, path: Path, step: int) -> None:
         symmetry = f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
         if unseen := [name for name, weight in prior.weights.items() if weight == 0]:
             symmetry += (
-                f", {len(unseen)} of {len(prior.weights)} elements not covered and left out: {', '.join(unseen[:8])}"
+                f", {len(unseen)} of {len(prior.weights)} elements left out, not covered or broken by an unknown "
             )
+            symmetry += f"size: {', '.join(unseen[:8])}"
         if broken := [weight for weight in prior.weights.values() if 0 < weight < 1]:
             worth = f"{min(broken):.2g} to {max(broken):.2g}" if min(broken) < max(broken) else f"{broken[0]:.2g}"
             symmetry += f", {len(broken)} of {len(prior.weights)} elements broken and weighed {worth}"

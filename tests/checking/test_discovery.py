@@ -249,16 +249,19 @@ def _measured_anew():
 
 
 @pytest.mark.usefixtures("_measured_anew")
-def test_what_is_broken_weighs_little_and_what_is_not_covered_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Off by 0.4: exp(-8 x 0.4)."""
+@pytest.mark.parametrize(("method", "weight"), [("paired states", 0.0408), ("transitions", 0.0)])
+def test_what_is_broken_weighs_little_and_what_nobody_knows_nothing(
+    method: str, weight: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Off by 0.4: exp(-8 x 0.4). Transitions show less of a breaking than there is, and a field may hide more."""
     off = (FieldVerdict("reward", "broken", 0.4, 0.01), FieldVerdict("obs.velocity", "broken", 0.1, 0.01))
     unseen = (FieldVerdict("reward", "not covered", 0.0, 0.01), FieldVerdict("obs.velocity", "holds", 0.0, 0.01, 0.0))
     held = FieldVerdict("reward", "holds", 0.1, 0.001, 0.0)
-    fields = {"rot90": off, "rot180": (held,), "rot270": unseen, "flip-x": ()}
+    fields = {"rot90": off, "rot180": (held,), "rot270": unseen, "flip-x": (), "flip-y": (off[1], unseen[0])}
     verdicts = [ElementVerdict(name, False, found) for name, found in fields.items()]
-    monkeypatch.setattr(measured, "judged", lambda *_: ("transitions", verdicts))
+    monkeypatch.setattr(measured, "judged", lambda *_: (method, verdicts))
     config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.transforms": ",".join(fields)})
-    weights = {"rot90": pytest.approx(0.0408, abs=5e-5), "rot180": 1.0, "rot270": 0.0, "flip-x": 0.0}
+    weights = {"rot90": pytest.approx(weight, abs=5e-5), "rot180": 1.0, "rot270": 0.0, "flip-x": 0.0, "flip-y": 0.0}
     assert prepared(config).prior.weights == weights
 
 

@@ -118,7 +118,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
     gaps = (0.0, math.inf, 0.0, 0.1, 0.5, 0.5, 0.5)
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple(zip(names, gaps, strict=True)))
     told = esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "auto", "--out", tmp_path / "auto").stderr
-    left_out = "1 of 7 elements not covered and left out: rot180"
+    left_out = "1 of 7 elements left out, not covered or broken by an unknown size: rot180"
     weighed = f"prior esp (d4, c = 0.1), {left_out}, 4 of 7 elements broken and weighed 0.018 to 0.45"
     assert f"{weighed}, fading out over 50% of the run, 1 seed(s)" in told
     monkeypatch.setattr(measured, "_breaking", lambda *_: tuple((name, 0.0) for name in names))
