@@ -45,6 +45,7 @@ _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a comm
     "check": {"transforms": "Options"},
     "discover": {"task": _SEARCHED, "transforms": _SEARCHED, "logs": _SEARCHED},
     "tune": {"prior": _PRIOR},
+    "mirror": {"root": _SEARCHED},
 }
 _WORDS = {int: "COUNT", float: "NUMBER", Path: "PATH"}
 
