@@ -21,6 +21,7 @@ from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
@@ -69,7 +70,11 @@ class Maddpg(ExploringLearner):
             self.joint = PerAgentCriticInput(spec, config.critic_input)
         shape = perceptron(network, config.critic_activation)
         width = self.critic_width + spec.num_agents * self.head.num_outputs
-        self.critic = MLP(generators, width, 1, shape, 1.0).to(self.device)
+        own = None
+        if spec.shared_reward:
+            io = IoSpec(spec, config.critic_input)
+            own = network.joint_critic(generators, io, self.head.num_outputs, int(config.critic_sees_time))
+        self.critic = (own or MLP(generators, width, 1, shape, 1.0)).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.actor_optimiser = self.adam(self.policy, learning_rate=config.actor_learning_rate)
@@ -164,7 +169,7 @@ class Maddpg(ExploringLearner):
         return self.joint.exchanged(self.critic, seen, self._encoded(rows), own.unsqueeze(-2)).squeeze(-1)
 
     def _condition(self, batch: EpisodeBatch) -> dict[str, Tensor]:
-        if self.config.critic_activation != "relu":
+        if self.config.critic_activation != "relu" or not isinstance(self.critic, MLP):
             return {}
         rows = self.joint.inputs(self.critic_rows(batch)[:, :, :-1], self._encoded(batch))
         return {"train/critic_idle_units": self.critic.idle_units(rows.flatten(1, -2))}

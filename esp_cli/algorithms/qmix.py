@@ -24,6 +24,7 @@ from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
+from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers
@@ -61,7 +62,9 @@ class Qmix(ExploringLearner):
         config, generators = self.config, self.generators["learner"]
         widths = (self.spec.num_agents, self.critic_width, config.mixer_width, config.hyper_width)
         _, compiled = perceptron(network, "relu").products
-        self.mixer = MonotonicMixer(generators, *widths, compiled).to(self.device)
+        io = IoSpec(self.spec, config.critic_input)
+        own = network.mixer(generators, io, config.mixer_width, int(config.critic_sees_time))
+        self.mixer = (own or MonotonicMixer(generators, *widths, compiled)).to(self.device)
         self.target_policy = copy.deepcopy(self.policy).requires_grad_(False)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
         self.optimiser = self.adam(self.policy, self.mixer, learning_rate=config.learning_rate)

@@ -47,6 +47,31 @@ class NetworkConfig(Strict, ABC):
             UserError: the network does not fit `io`, or needs it and there is none.
         """
 
+    def joint_critic(
+        self, generators: Sequence[torch.Generator], io: IoSpec, actions: int, further: int
+    ) -> nn.Module | None:
+        """Build a critic of joint actions of agents that share their reward, as MADDPG has it; None for a perceptron.
+
+        Args:
+            generators: one CPU generator per seed, which draw the initial weights.
+            io: what it sees of a scene.
+            actions: A, numbers of an agent's encoded action.
+            further: numbers behind the scene, such as the time.
+
+        Returns:
+            A module that maps seen [S, ..., D + further] and actions [S, ..., N A] to Q [S, ..., 1].
+        """
+        return None
+
+    def mixer(self, generators: Sequence[torch.Generator], io: IoSpec, width: int, further: int) -> nn.Module | None:
+        """Build QMIX's mixer; None for weights by a hypernetwork from one row. Arguments as of `joint_critic`.
+
+        Returns:
+            A module that maps values [S, ..., N] and what is seen [S, ..., D + further] to Q_tot [S, ...], which never
+            falls when a value rises.
+        """
+        return None
+
     def io_or_refuse(self, io: IoSpec | None) -> IoSpec:
         """Return `io`, and refuse a place that gives none."""
         if io is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from esp_cli.networks.layers import SeedLinear, SeedMLP
 from esp_cli.networks.perceptron import affine
@@ -44,11 +44,11 @@ class SharedCriticInput:
         """Return encoded joint actions [S, W, N, A] as the critic reads them: [S, ..., N A]."""
         return action.flatten(-2)
 
-    def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
+    def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
         return critic(seen, self.joint_action(action))
 
-    def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+    def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q [S, W, N, K] for its other actions, with the actions of all others fixed.
 
         The critic's parameters are frozen; `seen` is what it sees of the scenes, `joint` [S, W, N, A] and `others`
@@ -81,11 +81,11 @@ class PerAgentCriticInput(SharedCriticInput):
         """Return encoded joint actions [S, W, N, A] for each agent: [S, W, N, N A]."""
         return in_circular_order(action)
 
-    def value(self, critic: SeedMLP, seen: Tensor, action: Tensor) -> Tensor:
+    def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""
         return super().value(critic, seen, action).squeeze(-1)
 
-    def exchanged(self, critic: SeedMLP, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
+    def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `SharedCriticInput`."""
         # the agent's own action is the last of its row, and the only one that is exchanged
         seen = torch.cat([seen, in_circular_order(joint)[..., : -joint.shape[-1]]], -1)
@@ -100,7 +100,7 @@ def in_circular_order(items: Tensor) -> Tensor:
     return items[..., order, :].flatten(-2)
 
 
-def counterfactual_values(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
+def counterfactual_values(network: nn.Module, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
     """Return the outputs for rows that end in N items, with one item at a time replaced by each of K others.
 
     The N K rows share nearly all of the first layer's sums, which are computed once. Gradients flow to `others` alone;
@@ -109,7 +109,8 @@ def counterfactual_values(network: SeedMLP, rows: Tensor, items: Tensor, others:
     Shape:
         rows [S, R, D] before the items, items [S, R, N, A], others [S, R, N, K, A] to [S, R, N, K, outputs].
     """
-    if network.norms is not None:  # normalisation changes the whole input with every exchange
+    # normalisation changes the whole input with every exchange
+    if not isinstance(network, SeedMLP) or network.norms is not None:
         return _one_by_one(network, rows, items, others)
     first: SeedLinear = network.layers[0]  # type: ignore[assignment]
     precision, (num_rows, num_items, num_others, width) = network.precision, others.shape[1:]
@@ -126,7 +127,7 @@ def counterfactual_values(network: SeedMLP, rows: Tensor, items: Tensor, others:
     return values.unflatten(1, (num_items, num_rows, num_others)).transpose(1, 2)
 
 
-def _one_by_one(network: SeedMLP, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
+def _one_by_one(network: nn.Module, rows: Tensor, items: Tensor, others: Tensor) -> Tensor:
     """Build every row and apply the network to it."""
     num_rows, num_items, num_others = others.shape[1:4]
     own = torch.eye(num_items, dtype=torch.bool, device=rows.device).view(num_items, 1, num_items, 1)

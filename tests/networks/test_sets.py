@@ -9,7 +9,10 @@ from esp_cli.networks.build import build_network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.plain import MlpConfig
-from esp_cli.networks.sets import Rows, SetConfig, distances_among
+from esp_cli.networks.set_features import Rows, distances_among
+from esp_cli.networks.sets import SetConfig
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
 from esp_cli.training.streams import generators
 from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout, make
 from tests.networks.gradients import assert_same_gradients
@@ -182,7 +185,7 @@ def test_an_observation_without_like_things_is_refused():
 def test_wide_own_numbers_are_embedded_once():
     spec = make("wildlife", 2, [0]).spec
     assert Rows(spec.observation, False, 0, False).num_own > 32
-    assert network(spec).encoder.num_own == 32
+    assert network(spec).features.encoder.num_own == 32
 
 
 @needs_compiler
@@ -191,3 +194,81 @@ def test_a_seed_gets_the_same_bits_alone_and_with_any_number_of_threads():
     assert_same_bits_alone_and_for_any_threads(
         lambda seeds: [*compiled_distances([p[seeds] for p in places]), compiled_pool(things[seeds])], 3
     )
+
+
+def joint(spec, build, reads):
+    module = build(generators([0, 1], "x"), IoSpec(spec, reads))
+    rng = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for p in module.parameters():
+            p.add_(torch.randn(p.shape, generator=rng) * 0.1)
+    return module
+
+
+def exchanged(spec, seen, reads, order):
+    """Return observations end to end, or states, in which agents have changed places."""
+    moved = seen.clone()
+    agents = lambda x: x.unflatten(-1, (3, -1))[..., order, :].flatten(-2)  # noqa: E731
+    if reads == "observations":
+        return agents(seen)  # the others of each have another order then too, which changes nothing
+    for name in ("velocity", "position"):
+        where = spec.state.slices()[name]
+        moved[..., where] = agents(seen[..., where])
+    return moved
+
+
+@pytest.mark.parametrize("reads", ["state", "observations"])
+def test_a_mixer_rises_with_every_value_and_knows_no_order_of_agents(reads):
+    spec, scene_ = scene()
+    seen = scene_.state if reads == "state" else scene_.obs.flatten(2)
+    rows = torch.cat([seen, torch.rand(*seen.shape[:2], 1)], -1)
+    mixer = joint(spec, lambda g, io: SetConfig().mixer(g, io, 8, 1), reads)
+    values = torch.randn(2, 6, 3, requires_grad=True)
+    total = mixer(values, rows)
+    (slope,) = torch.autograd.grad(total.sum(), values)
+    assert total.shape == (2, 6)
+    assert (slope >= 0).all()
+    assert (slope > 0).any()
+    order = [2, 0, 1]
+    moved = torch.cat([exchanged(spec, seen, reads, order), rows[..., -1:]], -1)
+    torch.testing.assert_close(mixer(values[..., order], moved), total, **CLOSE)
+    assert (mixer(values[..., order], rows) - total).abs().amax() > 1e-4, "negative control: values alone"
+
+
+@pytest.mark.parametrize("reads", ["state", "observations"])
+def test_a_critic_of_pairs_knows_no_order_of_agents_but_whose_action_is_whose(reads):
+    spec, scene_ = scene()
+    seen, action = scene_.state if reads == "state" else scene_.obs.flatten(2), torch.randn(2, 6, 15)
+    critic = joint(spec, lambda g, io: SetConfig().joint_critic(g, io, 5, 0), reads)
+    value, order = critic(seen, action), [2, 0, 1]
+    acts = action.unflatten(-1, (3, 5))[..., order, :].flatten(-2)
+    torch.testing.assert_close(critic(exchanged(spec, seen, reads, order), acts), value, **CLOSE)
+    torch.testing.assert_close(critic(torch.cat([seen, action], -1)), value, **CLOSE)
+    assert (critic(seen, acts) - value).abs().amax() > 1e-4, "negative control: actions alone"
+    more = joint(scene(num_agents=5)[0], lambda g, io: SetConfig().joint_critic(g, io, 5, 0), reads)
+    assert {n: p.shape for n, p in more.named_parameters()} == {n: p.shape for n, p in critic.named_parameters()}
+
+
+@pytest.mark.parametrize("settings", [{}, {"maddpg.actor_actions": "own"}, {"maddpg.actor_gradient": "expected"}])
+def test_maddpg_learns_with_a_critic_of_pairs(settings):
+    learner = build_learner(
+        resolve_config("navigation", "maddpg", overrides={"network.name": "set", **OFF, **settings})
+    )
+    before = {n: p.clone() for n, p in learner.critic.named_parameters()}
+    acting = {n: p.clone() for n, p in learner.policy.named_parameters()}
+    for _ in range(3):
+        assert bool(learner.iterate(0.5).finite.all())
+    assert all(not torch.equal(p, before[n]) for n, p in learner.critic.named_parameters() if p.dim() == 3)
+    assert any(not torch.equal(p, acting[n]) for n, p in learner.policy.named_parameters())
+
+
+def test_qmix_learns_with_a_mixer_over_a_set():
+    config = {"network.name": "set", **{name.replace("maddpg", "qmix"): value for name, value in OFF.items()}}
+    learner = build_learner(resolve_config("navigation", "qmix", overrides=config))
+    before = {n: p.clone() for n, p in learner.mixer.named_parameters()}
+    for _ in range(3):
+        assert bool(learner.iterate(0.5).finite.all())
+    assert any(not torch.equal(p, before[n]) for n, p in learner.mixer.named_parameters())
+
+
+OFF = {"maddpg.num_envs": 4, "maddpg.batch_episodes": 4, "maddpg.warmup_episodes": 2}

@@ -1,0 +1,236 @@
+"""Features of rows that show sets of like things; see `sets`.
+
+Shape letters: S seeds, B rows, N agents, K things of a family, W numbers and H features of one, P features of a row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.kernels.library import begin, computes
+from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
+from esp_cli.networks.layers import GAINS, SeedMLP
+from esp_envs.errors import UserError
+from esp_envs.spec import Family, Kind, Layout
+
+if TYPE_CHECKING:
+    from esp_cli.networks.sets import SetConfig
+
+
+class Rows:
+    """Splits rows into the own numbers and the numbers of the things of each family, in parts that stand side by side.
+
+    Where a task does not change when it is shifted, places are taken from the middle of all places of a row.
+
+    Args:
+        layout: of a row.
+        shifts: whether the task does not change when it is shifted.
+        near: of each family the things that are nearest to the reader; 0 for all.
+        compiled: whether distances are computed by the kernel.
+
+    Attributes:
+        num_own: own numbers.
+        families: sets of like things.
+        widths: W of each family.
+    """
+
+    def __init__(self, layout: Layout, shifts: bool, near: int, compiled: bool) -> None:
+        parts = [*layout.own, *(part for family in layout.families for part in family.parts)]
+        places = [part.where for part in parts if shifts and part.field.is_point]
+        alone = places if sum(where.stop - where.start for where in places) == 2 else []
+        self._places = [] if alone else places  # a single one, taken from itself, says nothing
+        self._own = [part.where for part in layout.own if part.where not in alone]
+        self.num_own = sum(where.stop - where.start for where in self._own)
+        self.families, self._near, self.compiled = layout.families, near, compiled
+        self._offsets = [_place(family) for family in layout.families]
+        located = sum(at is not None for at in self._offsets)
+        each = zip(self.families, self._offsets, strict=True)
+        self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
+
+    def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
+        """Return the own numbers [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
+        x = self._from_the_middle(x) if self._places else x
+        own = torch.cat([x[..., where] for where in self._own], -1) if self._own else x[..., :0]
+        things, places = [], []
+        for family, at in zip(self.families, self._offsets, strict=True):
+            numbers = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
+            if at is not None:
+                joined = numbers[0] if len(numbers) == 1 else torch.cat(numbers, -1)
+                numbers = [_nearest(joined, at, self._near)]
+                places.append(numbers[0][..., at : at + 2])
+            things.append(numbers)
+        compiled = bool(places) and computes(self.compiled, x)
+        distances = iter((compiled_distances if compiled else distances_among)(places))
+        for numbers, at in zip(things, self._offsets, strict=True):
+            if at is not None:
+                numbers.append(next(distances))
+        return own, things
+
+    def _from_the_middle(self, x: Tensor) -> Tensor:
+        places = torch.cat([x[..., where] for where in self._places], -1)
+        middle, x = places.unflatten(-1, (-1, 2)).mean(-2), x.clone()
+        for where in self._places:
+            x[..., where] -= middle.repeat(1, 1, (where.stop - where.start) // 2)
+        return x
+
+
+def _place(family: Family) -> int | None:
+    """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
+    columns, start = [], 0
+    for field, _ in family.parts:
+        for part in field.parts or (field,):
+            if part.kind == Kind.VECTOR:
+                columns.append((not part.is_point, start))
+            start += part.item_width if part is field else part.width
+    return min(columns)[1] if columns else None
+
+
+def _nearest(things: Tensor, at: int, count: int) -> Tensor:
+    """Return the nearest of the things [S, B, K, W], whose places begin at a column; all of them for 0."""
+    if not 0 < count < things.shape[2]:
+        return things
+    square = things[..., at : at + 2].square().sum(-1)
+    which = square.topk(count, -1, largest=False, sorted=False).indices
+    return things.gather(2, which.unsqueeze(-1).expand(-1, -1, -1, things.shape[-1]))
+
+
+def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
+    """Describe things by distances, which neither turns nor mirrors change.
+
+    Args:
+        places: of the things of F families, [S, B, K, 2] each.
+
+    Returns:
+        For each family [S, B, K, 1 + F]: the distance of a thing, and that between it and the nearest other thing of
+        each family; where there is no other, twice the largest distance of any thing.
+    """
+    described, farthest = [], 4 * torch.cat([*places], 2).square().sum(-1, keepdim=True).amax(2, keepdim=True)
+    for i, first in enumerate(places):
+        columns = [first.square().sum(-1).sqrt()]
+        for j, second in enumerate(places):
+            square = (first.unsqueeze(3) - second.unsqueeze(2)).square().sum(-1)
+            if i == j:
+                itself = torch.eye(first.shape[2], dtype=torch.bool, device=first.device)
+                square = torch.where(itself, farthest if len(itself) == 1 else torch.inf, square)
+            columns.append(square.amin(3).sqrt())
+        described.append(torch.stack(columns, -1))
+    return described
+
+
+class SetEncoder(nn.Module):
+    """Features of rows that show sets.
+
+    Args:
+        generators: one CPU generator per seed, which draw the initial weights.
+        rows: splits rows.
+        config: shape.
+
+    Attributes:
+        width: P, features of a row.
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetConfig) -> None:
+        super().__init__()
+        self.rows, features = rows, config.width
+        self.own = layers(generators, (rows.num_own, features), config) if rows.num_own > features else None
+        self.num_own = features if self.own else rows.num_own
+        self.embed = nn.ModuleDict(
+            {
+                family.name: layers(generators, (width + self.num_own, features, features), config)
+                for family, width in zip(rows.families, rows.widths, strict=True)
+            }
+        )
+        self.width = self.num_own + 2 * features * len(rows.families)
+
+    def forward(self, x: Tensor) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Map rows x [S, B, D] to parts of their features [S, B, P], and to features of each family [S, B, K, H]."""
+        own, things = self.rows.split(x)
+        own = own if self.own is None else self.own(own)
+        embedded = {}
+        for (name, embed), parts in zip(self.embed.items(), things, strict=True):
+            beside = own.unsqueeze(2).expand(-1, -1, parts[0].shape[2], -1)
+            embedded[name] = embed(*parts, beside)
+        return [own, *map(self.pool, embedded.values())], embedded
+
+    def pool(self, things: Tensor) -> Tensor:
+        """Return mean and maximum over things [S, B, K, H]: [S, B, 2H]."""
+        if computes(self.rows.compiled, things):
+            return compiled_pool(things)
+        return torch.cat([things.mean(2), things.amax(2)], -1)
+
+
+def layers(generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetConfig) -> SeedMLP:
+    """Return a perceptron that ends with an activation."""
+    name = config.activation
+    return SeedMLP(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
+
+
+class TeamFeatures(nn.Module):
+    """Features of what a network reads, and of each agent in it.
+
+    What reads all observations in a row embeds each as an agent's, and takes the agents as a set.
+
+    Args:
+        generators: one CPU generator per seed, which draw the initial weights.
+        io: of the network.
+        config: shape.
+        beside: numbers that come along with each agent, such as its action.
+
+    Attributes:
+        width: features of a row.
+    """
+
+    def __init__(self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, beside: int = 0) -> None:
+        super().__init__()
+        spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"
+        if compiled:
+            begin("sets")
+        layout = io.layout if io.reads == "state" else spaces.observation
+        rows = Rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
+        self.encoder = SetEncoder(generators, rows, config)
+        self.num_agents = spaces.num_agents if joint else 0
+        found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []
+        self.each = "agents" if "agents" in found else next(iter(found), "")
+        inputs = self.encoder.width if joint else config.width * (beside > 0)
+        self.agents = layers(generators, (inputs + beside, config.width), config) if inputs else None
+        self.width = self.encoder.width * (not joint) + 2 * config.width * (self.agents is not None)
+
+    def forward(self, x: Tensor, *beside: Tensor) -> tuple[list[Tensor], Tensor | None]:
+        """Map rows x [S, B, in], and numbers [S, B, N, .] beside agents, to features.
+
+        Returns:
+            Parts of the features of a row [S, B, .], and the features of each agent [S, B, N, H] where there are any.
+        """
+        if not self.num_agents:
+            parts, sets = self.encoder(x)
+            agents = sets.get(self.each)
+            if self.agents is None:
+                return parts, agents
+            agents = self.agents(agents, *beside)
+            return [*parts, self.encoder.pool(agents)], agents
+        seen, _ = self.encoder(x.unflatten(-1, (self.num_agents, -1)).flatten(1, 2))
+        assert self.agents is not None
+        agents = self.agents(*(part.unflatten(1, (-1, self.num_agents)) for part in seen), *beside)
+        return [self.encoder.pool(agents)], agents
+
+    def each_or_refuse(self, io: IoSpec) -> None:
+        """Refuse rows in which no agent has features of its own.
+
+        Raises:
+            UserError: it is a state that does not say which numbers are whose.
+        """
+        if not (self.num_agents or self.each):
+            raise UserError(
+                f"set looks at each agent by itself, but the state of {io.spaces.label} does not say which numbers are "
+                "whose; set the critic's input to observations"
+            )
+
+
+def along(parts: Sequence[Tensor], agents: Tensor) -> list[Tensor]:
+    """Return features of rows [S, B, .] beside each agent [S, B, N, H]: [S, B, N, .]."""
+    return [part.unsqueeze(2).expand(-1, -1, agents.shape[2], -1) for part in parts]
