@@ -5,21 +5,37 @@ Shape letters: S seeds, B rows, N agents, K things of a family, W numbers and H 
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Annotated, ClassVar
 
 import torch
+from pydantic import Field as Setting
 from torch import Tensor, nn
 
+from esp_cli.networks.contract import ActivationName
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
+from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
 from esp_envs.spec import Family, Kind, Layout
 
-if TYPE_CHECKING:
-    from esp_cli.networks.sets import SetConfig
+
+class SetShape(CompiledConfig, ABC):
+    """The settings of networks over sets."""
+
+    free_of_counts: ClassVar[bool] = True
+
+    activation: ActivationName = Setting("relu", description="of the actor")
+    hidden: tuple[Annotated[int, Setting(ge=1, le=4096)], ...] = Setting(
+        (64,), min_length=1, max_length=16, description="hidden widths behind the sets"
+    )
+    width: int = Setting(32, ge=1, le=4096, description="features of each thing of a set")
+    near: int = Setting(
+        0, ge=0, le=4096, description="how many of each set an agent looks at, the nearest ones; 0: all of them"
+    )
 
 
 class Rows:
@@ -134,7 +150,7 @@ class SetEncoder(nn.Module):
         width: P, features of a row.
     """
 
-    def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetConfig) -> None:
+    def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetShape) -> None:
         super().__init__()
         self.rows, features = rows, config.width
         self.own = layers(generators, (rows.num_own, features), config) if rows.num_own > features else None
@@ -164,7 +180,7 @@ class SetEncoder(nn.Module):
         return torch.cat([things.mean(2), things.amax(2)], -1)
 
 
-def layers(generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetConfig) -> SeedMLP:
+def layers(generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetShape) -> SeedMLP:
     """Return a perceptron that ends with an activation."""
     name = config.activation
     return SeedMLP(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
@@ -185,7 +201,7 @@ class TeamFeatures(nn.Module):
         width: features of a row.
     """
 
-    def __init__(self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, beside: int = 0) -> None:
+    def __init__(self, generators: Sequence[torch.Generator], io: IoSpec, config: SetShape, beside: int = 0) -> None:
         super().__init__()
         spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"
         if compiled:

@@ -12,35 +12,23 @@ Shape letters: S seeds, B rows, N agents, H features of a thing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, ClassVar, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Memoryless, Network
+from esp_cli.networks.contract import Memoryless, Network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.mixer import HYPER_GAIN
-from esp_cli.networks.plain import CompiledConfig
-from esp_cli.networks.set_features import TeamFeatures, along
+from esp_cli.networks.set_features import SetShape, TeamFeatures, along
 from esp_envs.errors import UserError
 
 
-class SetConfig(CompiledConfig):
+class SetConfig(SetShape):
     """The settings of the network over sets."""
 
-    free_of_counts: ClassVar[bool] = True
-
     name: Literal["set"] = "set"
-    activation: ActivationName = Setting("relu", description="of the actor")
-    hidden: tuple[Annotated[int, Setting(ge=1, le=4096)], ...] = Setting(
-        (64,), min_length=1, max_length=16, description="hidden widths behind the sets"
-    )
-    width: int = Setting(32, ge=1, le=4096, description="features of each thing of a set")
-    near: int = Setting(
-        0, ge=0, le=4096, description="how many of each set an agent looks at, the nearest ones; 0: all of them"
-    )
 
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
