@@ -47,7 +47,6 @@ class StudyKind:
     # what the rows of its table are. With "panels" each algorithm stands beside itself with the prior, as in the
     # paper's tables; with "variants" each panel is one algorithm, whose variants are compared with the first
     rows: Literal["panels", "variants"]
-    varies: frozenset[str]  # settings that the study sets itself and a user cannot
     variants: Mapping[str, Settings]  # name -> the settings that make it
     common: Settings = field(default_factory=dict)  # settings of all runs, under those of the user
     tasks: tuple[str, ...] = ("navigation",)  # unless the user names others
@@ -70,6 +69,14 @@ class StudyKind:
     reference: str = "the plain learner (the first run) of the same panel"
     otherwise: str = "the first run of the same panel"  # the same where it is not
 
+    @property
+    def varies(self) -> set[str]:
+        """The settings that the study sets itself and a user cannot: not those that one variant switches off."""
+        chosen = {name for settings in self.variants.values() for name in settings}
+        once = {name for name in self.common if any(name not in settings for settings in self.variants.values())}
+        broken = {f"task.{setting}" for settings in self.breakings.values() for setting in settings}
+        return (chosen - once) | broken | {name for team in self.teams for name in team.settings}
+
 
 def _team(agents: int, landmarks: int | None) -> Team:
     label = f"N = {agents}" + (f", {landmarks} landmarks" if landmarks else "")
@@ -79,17 +86,11 @@ def _team(agents: int, landmarks: int | None) -> Team:
 
 KINDS: Mapping[str, StudyKind] = {
     "table1": StudyKind(
-        "Table 1 of the paper",
-        rows="panels",
-        varies=frozenset({"prior.kind"}),
-        variants=PLAIN_AND_ESP,
-        tasks=paper.tasks(),
-        algorithms=ALGORITHMS,
+        "Table 1 of the paper", rows="panels", variants=PLAIN_AND_ESP, tasks=paper.tasks(), algorithms=ALGORITHMS
     ),
     "agents": StudyKind(
         "Cooperative navigation with 2, 3 and 4 agents, as in the paper's supplement",
         rows="panels",
-        varies=frozenset({"prior.kind", "task.num_agents", "task.num_landmarks"}),
         variants=PLAIN_AND_ESP,
         algorithms=ALGORITHMS,
         only="navigation",
@@ -101,7 +102,6 @@ KINDS: Mapping[str, StudyKind] = {
     "ablate-transforms": StudyKind(
         "Number and type of transforms, augmentation alone (figures 5a and 5b)",
         rows="variants",
-        varies=frozenset({"prior.transforms", "prior.copies"}),
         common={"prior.kind": "augment"},
         variants={
             "none": {"prior.kind": "none"},
@@ -116,7 +116,6 @@ KINDS: Mapping[str, StudyKind] = {
     "ablate-coefficient": StudyKind(
         "Coefficient of the consistency loss, loss alone (figure 5c)",
         rows="variants",
-        varies=frozenset({"prior.consistency_coef"}),
         common={"prior.kind": "consistency", **PAPER_PRIOR},
         variants={f"c = {c:g}": {"prior.consistency_coef": c} for c in COEFFICIENTS},
         all_rows=True,
@@ -125,7 +124,6 @@ KINDS: Mapping[str, StudyKind] = {
     "ablate-modules": StudyKind(
         "Consistency loss and augmentation, each alone and both (figure 6a)",
         rows="variants",
-        varies=frozenset({"prior.kind"}),
         common=PAPER_PRIOR,
         variants={
             "none": {"prior.kind": "none"},
@@ -135,27 +133,11 @@ KINDS: Mapping[str, StudyKind] = {
         },
     ),
     "ablate-prior": StudyKind(
-        "Each learner with the prior and without it",
-        rows="panels",
-        varies=frozenset({"prior.kind"}),
-        variants=PLAIN_AND_ESP,
-        algorithms=("mappo",),
+        "Each learner with the prior and without it", rows="panels", variants=PLAIN_AND_ESP, algorithms=("mappo",)
     ),
     "ablate-breaking": StudyKind(
         "Methods for imperfect symmetry over the strength of breaking",
         rows="variants",
-        varies=frozenset(
-            {
-                "prior.kind",
-                "prior.fade",
-                "prior.trust",
-                "prior.compass",
-                "network.name",
-                "network.group",
-                "network.relax",
-            }
-            | {f"task.{setting}" for settings in BREAKINGS.values() for setting in settings}
-        ),
         variants={
             "plain": {"prior.kind": "none"},
             "ESP": {"prior.kind": "esp"},
@@ -182,7 +164,6 @@ KINDS: Mapping[str, StudyKind] = {
     "homomorphic": StudyKind(
         "Symmetry in the network and symmetry in the prior (figure 6b)",
         rows="variants",
-        varies=frozenset({"network.name", "network.group", "network.symmetrise", "prior.kind", "prior.transforms"}),
         variants={
             "mpn": {"network.name": "mpn", "prior.kind": "none"},
             "mpn-esp": {"network.name": "mpn", "prior.kind": "esp", "prior.transforms": GROUP},
@@ -199,7 +180,7 @@ KINDS: Mapping[str, StudyKind] = {
         network_cost=True,
     ),
 }
-_OTHER = StudyKind("", rows="variants", varies=frozenset(), variants={})
+_OTHER = StudyKind("", rows="variants", variants={})
 _TUNED = replace(
     _OTHER,
     reference="the plain run, tuned beside tuned and default beside default, and of a tuned plain run the default one",
