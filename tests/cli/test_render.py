@@ -141,14 +141,8 @@ def test_robots_are_drawn_in_space_and_from_above(robots: Path, tmp_path: Path) 
             esp("render", robots, "-o", file, "--size", 64, *options)
             with Image.open(file) as picture:
                 sizes[file.name] = picture.size
-    assert sizes == {
-        "auto.gif": (64, 48),
-        "auto.png": (64, 48),
-        "space.gif": (64, 48),
-        "space.png": (64, 48),
-        "top.gif": (64, 64),
-        "top.png": (64, 64),
-    }
+    assert sizes == {name: (64, 64) if name.startswith("top") else (64, 48) for name in sizes}
+    assert len(sizes) == 6
     assert (tmp_path / "auto.gif").read_bytes() == (tmp_path / "space.gif").read_bytes()
 
 

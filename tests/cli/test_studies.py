@@ -41,17 +41,10 @@ def test_names_and_steps_are_read_from_lists() -> None:
     assert parse_names(None) is None
     with pytest.raises(ValueError, match="',,' names nothing; name something, or leave the option out"):
         parse_names([",,"])
-    assert parse_names(["none,rot90,rot90, rot180", "C4,drawn"], KINDS["ablate-transforms"].variants) == (
-        "none",
-        "rot90",
-        "rot90, rot180",
-        "C4, drawn",
-    )
-    assert parse_study_steps(["500k,formation=1M", "3M"]) == (
-        (None, 500_000),
-        ("formation", 1_000_000),
-        (None, 3_000_000),
-    )
+    names = parse_names(["none,rot90,rot90, rot180", "C4,drawn"], KINDS["ablate-transforms"].variants)
+    assert names == ("none", "rot90", "rot90, rot180", "C4, drawn")
+    steps = parse_study_steps(["500k,formation=1M", "3M"])
+    assert steps == ((None, 500_000), ("formation", 1_000_000), (None, 3_000_000))
     with pytest.raises(ValueError, match="'soon' is not a number of steps"):
         parse_study_steps(["formation=soon"])
 

@@ -274,21 +274,6 @@ def test_the_names_that_are_offered_are_those_of_the_registries() -> None:
     assert tuple(TRACKERS) == known.TRACKERS
 
 
-def test_neither_help_nor_completion_imports_torch() -> None:
-    code = "import sys, runpy\ntry: from esp_cli.app import app; app()\nfinally: assert 'torch' not in sys.modules"
-    for words, environment in (
-        (["--help"], {}),
-        (["train", "--help"], {}),
-        ([], {"_ESP_COMPLETE": "complete_bash", "COMP_WORDS": "esp train --task na", "COMP_CWORD": "3"}),
-    ):
-        command = [sys.executable, "-c", code, *words]
-        done = subprocess.run(
-            command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False
-        )
-        assert "AssertionError" not in done.stderr, words
-        assert done.returncode == 0, done.stderr
-
-
 @pytest.mark.parametrize(
     ("shell", "part"), [("bash", "complete -o default -F"), ("zsh", "#compdef esp"), ("fish", "complete --command esp")]
 )

@@ -48,11 +48,8 @@ def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
 
 def test_the_paper_preset_is_rot90_with_a_recurrent_network(tmp_path: Path) -> None:
     config = config_of(train_tiny(tmp_path / "run", "--preset", "paper", steps=50))
-    assert (config["preset"], config["prior"]["transforms"], config["prior"]["consistency_coef"]) == (
-        "paper",
-        "rot90",
-        0.5,
-    )
+    prior = config["prior"]
+    assert (config["preset"], prior["transforms"], prior["consistency_coef"]) == ("paper", "rot90", 0.5)
     assert (config["network"]["name"], config["network"]["layer_norm"]) == ("gru", True)
     assert config["algorithm_settings"]["clip_value"] is True
     assert config["algorithm_settings"]["num_envs"] == 2, "--set has the last word over the preset"

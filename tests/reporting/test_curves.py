@@ -75,13 +75,8 @@ def test_a_curve_is_read_from_the_rows_that_evaluate(tmp_path):
 def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there():
     one = curve([[-9.0], [-7.0], [-5.0]], steps=(0, 800, 1600), seeds=(0,))
     assert one.config.evaluation.every_steps == 100
-    assert [one.until(step).values[-1].tolist() for step in (0, 399, 401, 1100, 1600)] == [
-        [-9.0],
-        [-9.0],
-        [-7.0],
-        [-7.0],
-        [-5.0],
-    ]
+    ends = [one.until(step).values[-1].item() for step in (0, 399, 401, 1100, 1600)]
+    assert ends == [-9.0, -9.0, -7.0, -7.0, -5.0]
     assert one.until(1601) is None, "it did not get there"
     further = replace(one, trained=1700).until(1650)
     assert further is not None

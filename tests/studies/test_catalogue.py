@@ -44,14 +44,8 @@ READ_OFF = {
 def test_table_1_has_the_papers_rows_and_columns():
     study = plan("table1", Request())
     assert study.panels == ["predator-prey, 500k", "navigation, 500k", "formation, 200k"]
-    assert list(dict.fromkeys(cell.variant for cell in study.cells)) == [
-        "MADDPG",
-        "MADDPG-ESP",
-        "QMIX",
-        "QMIX-ESP",
-        "MAPPO",
-        "MAPPO-ESP",
-    ]
+    variants = list(dict.fromkeys(cell.variant for cell in study.cells))
+    assert variants == ["MADDPG", "MADDPG-ESP", "QMIX", "QMIX-ESP", "MAPPO", "MAPPO-ESP"]
     assert {cell.config.seeds for cell in study.cells} == {tuple(range(10))}
     for cell in study.cells:
         esp = cell.variant.endswith("-ESP")
