@@ -134,19 +134,6 @@ def test_mappo_learns_that_a_state_in_which_nobody_lives_any_more_is_worth_nothi
     assert float(value[:, :, 1:].mean()) == pytest.approx(0, abs=0.1)
 
 
-@pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
-def test_an_off_policy_learner_learns_that_a_state_in_which_nobody_lives_any_more_is_worth_nothing(algorithm):
-    slow = {"prior.kind": "none", f"{algorithm}.learning_rate": 5e-3, f"{algorithm}.gamma": 0.5}
-    trained = small_learner(register(Brief), algorithm, **slow)
-    for _ in range(150):
-        trained.iterate(0.0)
-    with torch.no_grad():
-        value = trained.answers(trained.replay.sample(5, trained.generators["learner"]))["value"]
-    first, beyond = float(value[:, :, 0].mean()), float(value[:, :, 1:].mean())
-    assert first < -0.5
-    assert beyond / first == pytest.approx(0, abs=0.1)
-
-
 def test_a_rollout_says_who_has_ended():
     _, rollout = collected()
     arrived = rollout.reward > 0.5

@@ -326,17 +326,6 @@ def test_old_probabilities_and_values_are_those_of_the_networks_that_collected()
     assert (now.value - before.value).abs().max() > 0.1, "the control"
 
 
-@pytest.mark.parametrize("rule", ["recompute", "copy"])
-def test_the_old_value_of_a_copy_is_what_the_critic_said_of_the_copy(rule):
-    trained = learner(**RECOMPUTED | {"prior__old_log_prob": rule})
-    batch, _ = trained.prepare(trained.collector.collect(25))
-    trained._remember_old_networks()
-    copies = trained.prior.copies(batch, trained.generators["prior"], trained.reevaluated)
-    rows = copies.rows.map(lambda x: x[:, batch.count :])
-    torch.testing.assert_close(rows.value, trained.critic.unroll(rows.obs, rows.state).detach())
-    assert (rows.value - batch.value).abs().max() > 0.1, "the control"
-
-
 @pytest.mark.parametrize(("clip", "expected"), [(True, 3.92), (False, 0.5)])
 def test_value_clipping_by_hand(clip, expected):
     """The old value is 0, the value 2, the target 3: an error of 1, and of 2.8 where the value is clipped to 0.2."""

@@ -8,6 +8,7 @@ from esp_cli.networks.build import NETWORKS, build_network
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.recurrent import SeedGRU
 from tests.networks.gradients import assert_same_gradients
+from tests.networks.kernels.compiler import needs_compiler
 
 
 def generators(*seeds):
@@ -21,18 +22,6 @@ def reference(mlp, x):
         if k < len(mlp.layers) - 1 or mlp.activate_output:
             x = torch.relu(x) if mlp.activation == "relu" else torch.tanh(x)
     return x
-
-
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
-@pytest.mark.parametrize("activate_output", [False, True])
-def test_hand_written_backward_equals_autograd(activation, activate_output):
-    mlp = SeedMLP(generators(0, 1, 2), (7, 16, 8, 5), activation, 1.0, activate_output=activate_output)
-    x = torch.randn(3, 11, 7, requires_grad=True)
-    weight = torch.randn(3, 11, 5)
-    ours, theirs = mlp(x), reference(mlp, x)
-    torch.testing.assert_close(ours, theirs)
-    inputs = [x, *mlp.parameters()]
-    assert_same_gradients(ours, theirs, weight, inputs)
 
 
 @pytest.mark.parametrize("activate_output", [False, True])
@@ -53,10 +42,11 @@ def test_rows_go_through_in_pieces_as_they_do_at_once(activate_output, outputs, 
         torch.testing.assert_close(mlp(x), whole)
 
 
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
 @pytest.mark.parametrize("rows_innermost", [False, True])
-def test_parts_side_by_side_equal_whole_rows_and_get_gradients_where_they_ask(rows_innermost, monkeypatch):
+def test_parts_side_by_side_equal_whole_rows_and_get_gradients_where_they_ask(rows_innermost, compiled, monkeypatch):
     monkeypatch.setattr(perceptron, "CACHED_ROWS", 8)  # pieces of four, four and three rows
-    mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0)
+    mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0, compiled=compiled)
     fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
     ours, theirs = (mlp(fixed, moving, rows_innermost=rows_innermost), reference(mlp, torch.cat([fixed, moving], -1)))
     torch.testing.assert_close(ours, theirs)

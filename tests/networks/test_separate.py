@@ -5,7 +5,7 @@ import torch
 
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.plain import MlpConfig
-from esp_cli.networks.policy import HistoryPolicy, StochasticPolicy
+from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.networks.separate import action_parts
 from esp_cli.symmetry import mirror
 from esp_cli.symmetry.transforms import build_transform
@@ -40,16 +40,6 @@ def test_a_pair_is_worth_the_sum_of_its_wheels():
     mixed = table[..., 3, 7] + table[..., 0, 0] - table[..., 3, 0] - table[..., 0, 7]
     torch.testing.assert_close(mixed, torch.zeros_like(mixed), rtol=0, atol=1e-5)
     assert table.std() > 0.1
-
-
-def test_a_distribution_is_one_for_each_wheel():
-    spec = formation()
-    policy = StochasticPolicy(spec, MlpConfig(hidden=(8,), separate_parts=True), generators())
-    policy.actor.network.layers[-1].weight.data.mul_(100.0)
-    obs = torch.randn(2, 3, 2, spec.observation.width)
-    joint = policy.step(obs, policy.initial_memory(3, obs))[0].exp().unflatten(-1, (11, 11))
-    product = joint.sum(-1, keepdim=True) * joint.sum(-2, keepdim=True)
-    torch.testing.assert_close(joint, product, rtol=1e-4, atol=1e-7)
 
 
 def test_a_mirror_swaps_the_wheels_of_the_sums_too():

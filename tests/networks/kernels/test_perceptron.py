@@ -12,13 +12,13 @@ from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_t
 from tests.networks.test_layers import generators, reference
 
 
-@needs_compiler
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 @pytest.mark.parametrize("activate_output", [False, True])
 @pytest.mark.parametrize("sizes", [(14, 64, 64, 5), (43, 64, 161), (7, 30, 17, 1), (3, 1), (5, 150, 40, 3)])
-@pytest.mark.parametrize("rows", [1, 127, 300, 1100])
-def test_outputs_and_gradients_equal_those_of_autograd(activation, activate_output, sizes, rows):
-    mlp = SeedMLP(generators(0, 1, 2), sizes, activation, 1.0, activate_output=activate_output, compiled=True)
+@pytest.mark.parametrize("rows", [1, 300, 1100])
+def test_outputs_and_gradients_equal_those_of_autograd(activation, activate_output, sizes, rows, compiled):
+    mlp = SeedMLP(generators(0, 1, 2), sizes, activation, 1.0, activate_output=activate_output, compiled=compiled)
     x, weight = torch.randn(3, rows, sizes[0], requires_grad=True), torch.randn(3, rows, sizes[-1])
     ours, theirs = mlp(x), reference(mlp, x)
     assert type(ours.grad_fn).__name__ == "_PerceptronBackward"
@@ -69,17 +69,6 @@ def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits(rows):
         return [run.outputs, *run.backward(grad[seeds])]
 
     assert_same_bits_alone_and_for_any_threads(passed, 3)
-
-
-@needs_compiler
-def test_parts_side_by_side_and_frozen_parameters():
-    mlp = SeedMLP(generators(0, 1), (7, 16, 20), "relu", 1.0, compiled=True).requires_grad_(False)
-    fixed, moving = torch.randn(2, 11, 5), torch.randn(2, 11, 2, requires_grad=True)
-    ours = mlp(fixed, moving, rows_innermost=True)
-    theirs = reference(mlp, torch.cat([fixed, moving], -1))
-    assert ours.transpose(1, 2).is_contiguous()
-    torch.testing.assert_close(ours, theirs)
-    assert_same_gradients(ours, theirs, torch.randn(2, 11, 20), [moving])
 
 
 @needs_compiler
