@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from esp_cli.symmetry import Transform
-from esp_cli.symmetry.maps import Gather
 
 
 class Frame:
@@ -26,21 +24,13 @@ class Frame:
     def __init__(self, transforms: Sequence[Transform]) -> None:
         self._transforms = list(transforms)
         self._moves_agents = any(g.agents is not None for g in self._transforms)
-        maps = [g.output_map for g in self._transforms if g.is_uniform and g.action_index is not None]
-        self._orders = [m for m in maps if isinstance(m, Gather)]
-        self._reorders = not self._moves_agents and len(self._orders) == len(self._transforms)
 
     def pull_outputs(self, outputs: Tensor) -> Tensor:
         """Return a policy's outputs [S, (1 + K) B, ..., N, A] in the frame: [S, 1 + K, B, ..., N, A]."""
-        parts = self._parts(outputs)
-        if self._reorders:
-            return _reordered(parts, [m.back for m in self._orders])
-        return self._each(parts, lambda g: g.pull_back)
+        return self._each(self._parts(outputs), lambda g: g.pull_back)
 
     def push_outputs(self, outputs: Tensor) -> Tensor:
         """Undo `pull_outputs`; a slope goes the same way, since the maps are orthogonal."""
-        if self._reorders:
-            return _reordered(outputs, [m.source for m in self._orders]).flatten(1, 2)
         return self._each(outputs, lambda g: g.push_outputs).flatten(1, 2)
 
     def pull_values(self, values: Tensor) -> Tensor:
@@ -76,29 +66,3 @@ class Values:
     def back(self, slope: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values and the slope by them."""
         return [(self._values, self._frame.push_values(slope.view(self._shape)))]
-
-
-def _reordered(x: Tensor, orders: Sequence[Tensor]) -> Tensor:
-    """Give the numbers of every copy another order; whole columns are moved.
-
-    Args:
-        x: [S, 1 + K, ..., A], whose first part, the originals, stays as it is.
-        orders: K, [S or 1, A] each: which number comes to each place.
-    """
-    if not orders:
-        return x
-    columns = x.movedim(-1, 1)
-    num_seeds, width, parts = columns.shape[:3]
-    stays, below = _places(num_seeds, width, parts, x.device)
-    order = torch.stack([stays, *(order.expand(num_seeds, -1) for order in orders)], 2)  # [S, A, 1 + K]
-    index = torch.add(below, order, alpha=parts).view(-1)
-    moved = columns.reshape(num_seeds * width * parts, -1).index_select(0, index)
-    return moved.view(columns.shape).movedim(1, -1)
-
-
-@lru_cache
-def _places(num_seeds: int, width: int, parts: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return each number's own place [S, A], and where the columns [S, 1, parts] of number 0 begin."""
-    own = torch.arange(width, device=device).expand(num_seeds, -1)
-    first = torch.arange(num_seeds, device=device).view(-1, 1, 1) * (width * parts)
-    return own, first + torch.arange(parts, device=device)

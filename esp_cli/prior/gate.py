@@ -44,10 +44,6 @@ class GatedTransform(Transform):
 
     open: Tensor  # [S, B, T] bool; a last state behind the T steps goes with the last step
 
-    @property
-    def is_uniform(self) -> bool:
-        return False
-
     def part(self, start: int, stop: int) -> GatedTransform:
         return gated(self, self.open[:, start:stop])
 

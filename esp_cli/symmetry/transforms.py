@@ -58,11 +58,6 @@ class Transform:
         return len(self.elements)
 
     @property
-    def is_uniform(self) -> bool:
-        """Whether all rows of one seed are moved by the same element."""
-        return True
-
-    @property
     def is_identity(self) -> bool:
         """Whether it moves no number of the task, as a turn of scalars alone."""
         maps = (self.obs_map, self.state_map, self.output_map)

@@ -11,7 +11,7 @@ import torch
 
 from esp_cli.checking.measured import prepared
 from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
-from esp_cli.prior.gate import Gate, fit_gate, gated, inputs_of
+from esp_cli.prior.gate import Gate, GatedTransform, fit_gate, gated, inputs_of
 from esp_cli.symmetry import transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.checkpoint import read_policy
@@ -123,9 +123,9 @@ def test_elements_that_hold_are_never_gated_and_a_prior_without_its_gate_says_so
         prior.copies(batch, generators(1))
     prior.gate = one_body(1e6, certain=("flip-x",))
     turn, mirror = prior.copies(batch, generators(1)).transforms
-    assert (turn.is_uniform, mirror.is_uniform) == (False, True)
+    assert [isinstance(g, GatedTransform) for g in (turn, mirror)] == [True, False]
     certain = SymmetryPrior(config.model_copy(update={"weights": {"rot90": 1.0, "flip-x": 1.0}}), ONE)
-    assert all(g.is_uniform for g in certain.copies(batch, generators(1)).transforms)
+    assert not any(isinstance(g, GatedTransform) for g in certain.copies(batch, generators(1)).transforms)
 
 
 LEFT_AND_BROKEN = [
