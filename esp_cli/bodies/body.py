@@ -13,22 +13,22 @@ import numpy as np
 from esp_cli.bodies import kinds
 from esp_cli.bodies.asymmetry import Difference, differences
 from esp_cli.bodies.deriving import Frame, Match, derive
+from esp_cli.bodies.parts import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY, Proof, prove
-from esp_cli.bodies.reading import check_size, printable, read_model
-from esp_cli.bodies.tables import Moves, by_element, closed, moves_of
+from esp_cli.bodies.reading import MOST_DOFS, printable, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
 
-_TURNS = [Fraction(k, n) for n in (8, 6, 5, 4, 3, 2) for k in range(1, n)]
-_AXES = [Fraction(k, 24) for k in range(24)] + [Fraction(k, n) for n in (10, 16) for k in range(1, n)]
+_TURNS = sorted({Fraction(k, n) for n in (2, 3, 4, 5, 6, 8) for k in range(1, n)})
+_AXES = sorted({Fraction(k, n) for n in (10, 16, 24) for k in range(n)})
 TRIED = tuple(
     dict.fromkeys(
         [PlaneElement(mirrored=True), PlaneElement(Fraction(1, 2), mirrored=True)]
-        + [PlaneElement(turn) for turn in sorted(set(_TURNS))]
-        + [PlaneElement(turn, mirrored=True) for turn in sorted(set(_AXES))]
+        + [PlaneElement(turn) for turn in _TURNS]
+        + [PlaneElement(turn, mirrored=True) for turn in _AXES]
     )
 )
 """The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
@@ -64,6 +64,8 @@ class Body:
     Attributes:
         joints: names of the joints that are no free base.
         actuators: names of the actuators, which for a body given by names are the joints.
+        limbs: names of the bodies of a model.
+        elements: the symmetries that the body has, without the identity.
         found: of a model, what is known of each element that holds, by its name.
         refused: of a model, elements that nearly hold, each with the reason why they do not.
 
@@ -77,41 +79,33 @@ class Body:
         mirror: Mapping[str, str] | Mapping[str, Mapping[str, str]],
         limbs: Mapping[str, str] | Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        self.joints, self.actuators = tuple(joints), tuple(joints)
+        named = named_parts("joints", list(joints), mirror)
+        pairs = [(k, v) for k, v in (limbs or {}).items() if isinstance(v, str)]
+        pairs += [pair for table in (limbs or {}).values() if not isinstance(table, str) for pair in table.items()]
+        ends = list(dict.fromkeys(name for pair in pairs for name in pair))
+        self._numbers: dict[str, int] = {}
         self.found: dict[str, Found] = {}
         self.refused: dict[str, str] = {}
-        ends = by_element(limbs or {})
-        self.limb_names = tuple(dict.fromkeys(x for table in ends.values() for pair in table.items() for x in pair))
-        generators = {
-            element: moves_of(self.joints, table, ends.get(element, {}))
-            for element, table in by_element(mirror).items()
-        }
-        self._moves = closed(generators)
-        self._at = {name: slice(i, i + 1) for i, name in enumerate(self.joints)}
-        self._speed_at, self._control_at = self._at, self._at
-        self._numbers: dict[str, int] = {}
-        self._idle: set[PlaneElement] = set()
+        self._set(named, named, named, named_parts("limbs", ends, limbs or {}))
+
+    def _set(self, positions: Parts, velocities: Parts, controls: Parts, limbs: Parts) -> None:
+        self._positions, self._velocities, self._controls, self._limbs = positions, velocities, controls, limbs
+        self.joints, self.actuators, self.limbs = tuple(positions.places), tuple(controls.places), tuple(limbs.places)
+        self.elements = tuple(positions.moves)
 
     @classmethod
     def from_mjcf(cls, model: Path | str | Any, root: Path | str | None = None, tolerated: float = NEARLY) -> Body:
         """Find and prove the symmetries of a model.
 
         Args:
-            model: an MJCF file, or a `mujoco.MjModel`.
+            model: an MJCF or URDF file, or a `mujoco.MjModel`.
             root: the folder that holds all its files; by default that of the file.
             tolerated: the largest share by which accelerations of a joint may be off.
 
         Raises:
             UserError: the file cannot be read, or nothing of the model moves.
         """
-        model = read_model(model, root) if isinstance(model, str | Path) else model
-        check_size(model)
-        return cls._from_model(model, tolerated)
-
-    @classmethod
-    def from_file(cls, path: Path | str, root: Path | str | None = None) -> Body:
-        """Find and prove the symmetries of an MJCF or URDF file, whichever it is; see `from_mjcf`."""
-        return cls._from_model(read_model(path, root), NEARLY)
+        return cls._from_model(read_model(model, root) if isinstance(model, str | Path) else model, tolerated)
 
     @classmethod
     def from_urdf(
@@ -122,30 +116,45 @@ class Body:
 
     @classmethod
     def _from_model(cls, model: Any, tolerated: float) -> Body:
-        frame = Frame(model)
-        inner = [j for j in range(model.njnt) if j != frame.base]
-        numbers = {frame.name("joint", j): j for j in inner}
-        self = cls(tuple(numbers), {})
-        self._numbers = numbers
-        self._at = {name: frame.qpos_of(j) for name, j in numbers.items()}
-        self._speed_at = {name: frame.dofs_of(j) for name, j in numbers.items()}
-        self.actuators = tuple(frame.name("actuator", a) for a in range(model.nu))
-        self._control_at = {name: slice(a, a + 1) for a, name in enumerate(self.actuators)}
-        self.limb_names = tuple(frame.name("body", b) for b in range(model.nbody))
+        if not 0 < model.nv <= MOST_DOFS:
+            raise UserError(f"the model has {model.nv} degrees of freedom; give one robot, of 1 to {MOST_DOFS}")
+        self, frame = cls([], {}), Frame(model)
+        idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot
+        found: dict[PlaneElement, Found] = {}
         for element in TRIED:
-            if not any(element @ idle in self._moves for idle in self._idle):
-                self._try(frame, element, tolerated)
-        self._keep_a_group()
+            if not any(element @ still in found for still in idle):
+                self._try(frame, element, tolerated, found, idle)
+        while lost := _outside(found, idle):
+            del found[lost]
+            self.refused[lost.name] = "its products with the other symmetries do not hold"
+        self.found = {element.name: one for element, one in found.items()}
+        matches = {element: one.match for element, one in found.items()}
+        names = {frame.name("joint", j): j for j in range(model.njnt) if j != frame.base}
+        controls = {frame.name("actuator", a): slice(a, a + 1) for a in range(model.nu)}
+        limbs = {frame.name("body", b): slice(b, b + 1) for b in range(model.nbody)}
+        self._set(
+            Parts("joints", {n: frame.qpos_of(j) for n, j in names.items()}, {g: m.qpos for g, m in matches.items()}),
+            Parts("joints", {n: frame.dofs_of(j) for n, j in names.items()}, {g: m.qvel for g, m in matches.items()}),
+            Parts("actuators", controls, {g: m.ctrl for g, m in matches.items()}),
+            Parts("limbs", limbs, {g: m.bodies for g, m in matches.items()}),
+        )
+        self._numbers = names
         return self
 
-    def _try(self, frame: Frame, element: PlaneElement, tolerated: float) -> None:
+    def _try(
+        self,
+        frame: Frame,
+        element: PlaneElement,
+        tolerated: float,
+        found: dict[PlaneElement, Found],
+        idle: set[PlaneElement],
+    ) -> None:
         """Derive and prove one element, and keep it or the reason against it."""
-        try:
-            match = derive(frame, element)
-        except UserError:
+        match = derive(frame, element)
+        if match is None:
             return
-        if match.is_trivial:  # a mirror in the plane of a planar robot
-            self._idle.add(element)
+        if match.is_trivial:
+            idle.add(element)
             return
         proof = prove(frame, match)
         if match.unmatched:
@@ -155,52 +164,29 @@ class Body:
             self.refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
         else:
             differ = differences(frame, match)
-            base = None if frame.base is None else differ[frame.base]
-            self.found[element.name] = Found(match, proof, differ, base)
-            limbs = {self.limb_names[b]: self.limb_names[c] for b, c in enumerate(match.body) if c >= 0}
-            self._moves[element] = Moves(match.qpos, match.qvel, match.ctrl, limbs)
-
-    def _keep_a_group(self) -> None:
-        """Drop elements that do not multiply as turns and mirrors do."""
-        for g in list(self._moves):
-            for h in list(self._moves):
-                if g not in self._moves or h not in self._moves or (g @ h).is_identity or g @ h in self._idle:
-                    continue
-                product = self._moves.get(g @ h)
-                made = self._moves[g].velocities @ self._moves[h].velocities
-                if product is None or not np.allclose(product.velocities, made, atol=1e-6):
-                    dropped = max(g, h, key=TRIED.index)
-                    del self._moves[dropped]
-                    self.found.pop(dropped.name, None)
-                    self.refused[dropped.name] = "its products with the other symmetries do not hold"
-
-    @property
-    def elements(self) -> tuple[PlaneElement, ...]:
-        """The symmetries that the body has, without the identity."""
-        return tuple(self._moves)
+            found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
 
     @property
     def group(self) -> str:
         """The symmetries as `Symmetry` and `--transforms` read them: "d2", "flip-x"; "c1" where there is none."""
-        own = {PlaneElement(), *self._moves}
+        own = {PlaneElement(), *self.elements}
         for name in ("flip-x", "flip-y", *(f"{kind}{n}" for n in (2, 3, 4, 5, 6, 8) for kind in "cd")):
             if {PlaneElement(), *map(PlaneElement.of, parse_elements(name, 1))} == own:  # type: ignore[arg-type] # finite
                 return name
-        return ",".join(element.name for element in self._moves) or "c1"
+        return ",".join(element.name for element in self.elements) or "c1"
 
     def rows(self, element: str) -> list[tuple[str, str, int, float, float, Difference]]:
         """Return of each joint of a model, for one of `found`: name, image, sign, gap, planted gap, difference.
 
         The sign is 0 for ball joints, which turn about three axes.
         """
-        one = self.found[element]
-        rows = []
-        for name in self.joints:
-            joint = self._numbers[name]
-            image = next(n for n, j in self._numbers.items() if j == one.match.joint[joint])
-            block = one.match.qvel[self._speed_at[image], self._speed_at[name]]
-            sign = int(np.sign(block[0, 0])) if block.size == 1 else 0
+        one, rows = self.found[element], []
+        names = {j: name for name, j in self._numbers.items()}
+        for name, joint in self._numbers.items():
+            image = names[int(one.match.joint[joint])]
+            block = one.match.qvel[self._velocities.places[image], self._velocities.places[name]]
             gaps = float(one.proof.joints[joint]), float(one.proof.planted[joint])
+            sign = int(np.sign(block[0, 0])) if block.size == 1 else 0
             rows.append((name, image, sign, *gaps, one.differences[joint]))
         return rows
 
@@ -215,15 +201,15 @@ class Body:
         Raises:
             UserError: a joint is unknown, or its image is not among them.
         """
-        return self._field(name, "positions", "joints", self._at, joints or self.joints, history)
+        return self._positions.field(name, joints or self.joints, history)
 
     def velocities(self, joints: Sequence[str] | None = None, history: int = 1, name: str = "velocities") -> Field:
         """Return the field of joint velocities, accelerations or torques, see `positions`."""
-        return self._field(name, "velocities", "joints", self._speed_at, joints or self.joints, history)
+        return self._velocities.field(name, joints or self.joints, history)
 
     def controls(self, actuators: Sequence[str] | None = None, history: int = 1, name: str = "controls") -> Field:
         """Return the field of controls by actuator: targets, or the last action; see `positions`."""
-        return self._field(name, "actuators", "actuators", self._control_at, actuators or self.actuators, history)
+        return self._controls.field(name, actuators or self.actuators, history)
 
     def contacts(self, limbs: Sequence[str], width: int = 1, history: int = 1, name: str = "contacts") -> Field:
         """Return the field of numbers by limb: contacts, air times, phases (`width` 2: cosine and sine).
@@ -231,17 +217,7 @@ class Body:
         Raises:
             UserError: a limb is unknown, or its image is not among them.
         """
-        moves, limbs = {}, list(limbs)
-        for element, move in self._moves.items():
-            table = np.zeros((len(limbs), len(limbs)))
-            for i, limb in enumerate(limbs):
-                image = move.limbs.get(limb)
-                if image is None or image not in limbs:
-                    known = f"its image under {element.name}, {image}, is not among them" if image else "it is unknown"
-                    raise UserError(f"field '{name}': limb {printable(limb)}: {known}; name {self._some_limbs()}")
-                table[limbs.index(image), i] = 1
-            moves[element] = np.kron(table, np.eye(width)).astype(np.float64)
-        return kinds.parts_field(name, "limbs", moves, history)
+        return self._limbs.field(name, limbs, history, width)
 
     def scan(self, points: Sequence[Sequence[float]] | Floats, history: int = 1, name: str = "scan") -> Field:
         """Return the field of a height scan or of rays, see `points_field` and `grid`."""
@@ -276,53 +252,33 @@ class Body:
         """Refuse a pose that is not its own image: positions relative to it would not transform as `positions`.
 
         Args:
-            pose: by joint its angle relative to the model's rest; joints that are left out are at rest.
+            pose: by joint its angle relative to `qpos0`; joints that are left out are at rest. No ball joints.
             tolerance: rad or m.
 
         Raises:
             UserError: a joint's image has another angle.
         """
-        angles = np.array([pose.get(joint, 0.0) for joint in self.joints])
-        for element in self.elements:
-            matrix = self.positions().kind.matrix(element.matrix)  # type: ignore[attr-defined]
-            if matrix.shape != (len(angles), len(angles)):
-                raise UserError("a pose of ball joints is not a number by joint; leave it out")
+        places = {joint: self._velocities.places[joint].start for joint in self.joints}
+        for element, matrix in self._velocities.moves.items():
+            angles = np.zeros(len(matrix))
+            for joint, angle in pose.items():
+                angles[places[joint]] = angle
             off = np.abs(matrix @ angles - angles)
             if off.max(initial=0) > tolerance:
-                joint = printable(self.joints[int(off.argmax())])
+                joint = next(printable(name) for name, start in places.items() if start == off.argmax())
                 raise UserError(
                     f"the pose is not its own image under {element.name}: {joint} is off by {off.max():.3g}"
                 )
 
-    def _some_limbs(self) -> str:
-        return ", ".join(map(printable, self.limb_names[:8])) + (", ..." if len(self.limb_names) > 8 else "")
 
-    def _field(
-        self, name: str, part: str, what: str, places: Mapping[str, slice], names: Sequence[str], history: int
-    ) -> Field:
-        """Return a field of some joints or actuators."""
-        if unknown := next((n for n in names if n not in places), None):
-            known = ", ".join(printable(n) for n in list(places)[:8]) + (", ..." if len(places) > 8 else "")
-            raise UserError(
-                f"field '{name}': the body has no {printable(str(unknown))} among its {what}; it has {known}"
-            )
-        if len(set(names)) < len(names):
-            raise UserError(f"field '{name}' names one of the {what} twice")
-        index = (
-            np.concatenate([np.arange(places[n].start, places[n].stop) for n in names]) if names else np.zeros(0, int)
-        )
-        moves = {}
-        for element, move in self._moves.items():
-            block = getattr(move, part)[np.ix_(index, index)]
-            if not np.allclose(block @ block.T, np.eye(len(index)), atol=1e-6):
-                lost = printable(names[self._row(names, places, int(np.abs(block).sum(0).argmin()))])
-                raise UserError(f"field '{name}': the image of {lost} under {element.name} is not among its {what}")
-            moves[element] = block
-        if not moves:
-            moves = {PlaneElement(): np.eye(len(index))}
-        return kinds.parts_field(name, what, moves, history)
-
-    @staticmethod
-    def _row(names: Sequence[str], places: Mapping[str, slice], number: int) -> int:
-        ends = np.cumsum([places[n].stop - places[n].start for n in names])
-        return int(np.searchsorted(ends, number, side="right"))
+def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> PlaneElement | None:
+    """Return the last of two elements whose product is not among them, or does something else."""
+    for g, first in found.items():
+        for h, second in found.items():
+            product = found.get(g @ h)
+            if (g @ h).is_identity or g @ h in idle:
+                continue
+            made = first.match.qvel @ second.match.qvel
+            if product is None or not np.allclose(product.match.qvel, made, atol=1e-6):
+                return max(g, h, key=TRIED.index)
+    return None

@@ -15,17 +15,16 @@ import mujoco
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from esp_cli.bodies.kinds import space
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
-from esp_envs.errors import UserError
 
 LOOSE = 0.1
 """How far a joint's line may be off, as a share of the robot's size, or of the length of its axis, to be matched."""
 FAR = 0.25
 """How far a body's middle of mass may be off, as a share of the robot's size, to be matched."""
 _APART = 1e6
-_NOT = "the model at rest is not its own image"
 FREE, BALL, SLIDE, HINGE = range(4)
 """MuJoCo's types of joints."""
 QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)
@@ -38,7 +37,7 @@ class Match:
 
     Attributes:
         element: of the plane.
-        body: [bodies] the image of each body, -1 where it has none.
+        bodies: [bodies, bodies] where each goes; a column of 0 where it has no image.
         joint: [joints] the image of each joint.
         qpos: [nq, nq].
         offset: [nq]; 0 but for joints whose reference is not 0, and a base away from the origin.
@@ -48,7 +47,7 @@ class Match:
     """
 
     element: PlaneElement
-    body: Indices
+    bodies: Floats
     joint: Indices
     qpos: Floats
     offset: Floats
@@ -134,18 +133,15 @@ class Frame:
         return list(range(first, first + int(self.model.body_jntnum[body])))
 
 
-def derive(frame: Frame, element: PlaneElement) -> Match:
-    """Find what an element does to a model.
-
-    Raises:
-        UserError: the model at rest is not its own image, by so much that nothing corresponds.
-    """
-    R = np.eye(3)
-    R[:2, :2] = element.matrix
+def derive(frame: Frame, element: PlaneElement) -> Match | None:
+    """Find what an element does to a model; None where the model at rest is far from being its own image."""
+    R = space(element.matrix)
     com = frame.com[frame.moving]
     if np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1).max() > FAR * frame.size:
-        raise UserError(_NOT)
+        return None
     bodies, joints = _matched(frame, R)
+    if not joints:
+        return None
     qpos, offset, qvel = _state_maps(frame, R, joints)
     ctrl, unmatched = _control_map(frame, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
@@ -153,7 +149,7 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
 
 
 def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
-    """Return the image of each moving body, and of each joint."""
+    """Return the image of each moving body, and of each joint; nothing where there is none."""
     mirrored, total = np.linalg.det(R) < 0, max(frame.mass.sum(), 1e-12)
 
     @cache
@@ -170,7 +166,7 @@ def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
 
     worst, waiting = _assigned(frame.children[0], frame.children[0], lambda x, y: cost(x, y)[0])
     if worst >= _APART:
-        raise UserError(_NOT)
+        return {}, {}
     bodies, joints = {0: 0}, dict[int, int]()
     while waiting:
         b, c = waiting.pop()
@@ -290,16 +286,17 @@ def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
     return ctrl, tuple(printable(frame.name("actuator", a)) for a in sorted(unmatched))
 
 
-def _all_bodies(frame: Frame, R: Floats, bodies: dict[int, int]) -> Indices:
-    """Return [bodies] the image of each, of fixed ones among those that are fixed to their carrier's image."""
-    model, image = frame.model, np.full(frame.model.nbody, -1)
-    for b in range(model.nbody):
-        if b in bodies:
-            image[b] = bodies[b]
+def _all_bodies(frame: Frame, R: Floats, moved: dict[int, int]) -> Floats:
+    """Return [bodies, bodies] where each goes, fixed ones to the nearest that is fixed to their carrier's image."""
+    count = frame.model.nbody
+    where = np.zeros((count, count))
+    for b in range(count):
+        if b in moved:
+            where[moved[b], b] = 1
             continue
-        carrier = bodies[frame.carrier(b)]
-        others = [c for c in range(1, model.nbody) if c not in bodies and frame.carrier(c) == carrier]
-        gaps = [np.linalg.norm(R @ frame.place[b] - frame.place[c]) / frame.size for c in others]
+        carrier = moved[frame.carrier(b)]
+        like = [c for c in range(1, count) if c not in moved and frame.carrier(c) == carrier]
+        gaps = [float(np.linalg.norm(R @ frame.place[b] - frame.place[c])) / frame.size for c in like]
         if gaps and min(gaps) < LOOSE:
-            image[b] = others[int(np.argmin(gaps))]
-    return image
+            where[like[int(np.argmin(gaps))], b] = 1
+    return where

@@ -6,7 +6,7 @@ turns alike, since body and surroundings are mirrored together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,6 @@ from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.plane import KIND_MATRICES, PlaneElement
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
-
-_ROUNDING = 1e-9
 
 
 def space(planar: Floats) -> Floats:
@@ -31,27 +29,18 @@ def axial(planar: Floats) -> Floats:
     return np.rint(np.linalg.det(planar)) * space(planar) + 0.0
 
 
-def _quaternion(planar: Floats, real: int) -> Floats:
-    out = np.zeros((4, 4))
-    axis = [i for i in range(4) if i != real]
-    out[real, real], out[np.ix_(axis, axis)] = 1, axial(planar)
-    return out
-
-
-def _command(planar: Floats) -> Floats:
-    out = axial(planar)
-    out[:2, :2] = planar
-    return out
+def _beside(first: Floats, second: Floats) -> Floats:
+    """Return the matrix of two runs of numbers, each with its own."""
+    zeros = np.zeros((len(first), len(second)))
+    return np.block([[first, zeros], [zeros.T, second]])
 
 
 VECTOR_3D = Kind("3-d vector", 3, is_vector=True)
 """(x, y, z) of a place, a velocity, a force, or of gravity as the body sees it."""
 AXIAL_3D = Kind("axial vector", 3, is_vector=True)
 """(x, y, z) of an angular velocity or a torque."""
-QUATERNION = Kind("quaternion wxyz", 4, is_vector=True)
-"""(w, x, y, z) of the body's attitude in the world."""
-QUATERNION_XYZW = Kind("quaternion xyzw", 4, is_vector=True)
-"""The same with the real part last."""
+QUATERNION, QUATERNION_XYZW = Kind("quaternion wxyz", 4, is_vector=True), Kind("quaternion xyzw", 4, is_vector=True)
+"""The body's attitude in the world, with the real part first or last."""
 ATTITUDE_6D = Kind("attitude of 6", 6)
 """The first two columns of the body's rotation matrix, row after row."""
 PLANAR_COMMAND = Kind("planar command", 3)
@@ -60,10 +49,10 @@ PLANAR_COMMAND = Kind("planar command", 3)
 KIND_MATRICES |= {
     VECTOR_3D: space,
     AXIAL_3D: axial,
-    QUATERNION: lambda planar: _quaternion(planar, 0),
-    QUATERNION_XYZW: lambda planar: _quaternion(planar, 3),
+    QUATERNION: lambda planar: _beside(np.eye(1), axial(planar)),
+    QUATERNION_XYZW: lambda planar: _beside(axial(planar), np.eye(1)),
     ATTITUDE_6D: lambda planar: np.kron(space(planar), planar).astype(np.float64),
-    PLANAR_COMMAND: _command,
+    PLANAR_COMMAND: lambda planar: _beside(planar, axial(planar)[2:, 2:]),
 }
 
 
@@ -72,12 +61,12 @@ class PartsKind(Kind):
     """Numbers of parts that an element sends to each other: joints, actuators, limbs, points around a body.
 
     Attributes:
+        parts: what each number is called.
         moves: elements, each with its orthogonal matrix [width, width].
-        owner: what messages call the whole: "the body".
     """
 
+    parts: tuple[str, ...] = ()
     moves: tuple[tuple[PlaneElement, tuple[tuple[float, ...], ...]], ...] = ()
-    owner: str = "the body"
 
     def matrix(self, planar: Floats) -> Floats:
         """Return how the numbers of one item transform under a matrix of the plane.
@@ -86,21 +75,20 @@ class PartsKind(Kind):
             UserError: the body has no such symmetry.
         """
         for element, rows in self.moves:
-            if np.allclose(element.matrix, planar, atol=_ROUNDING):
+            if np.allclose(element.matrix, planar, atol=1e-9):
                 return np.array(rows)
-        if np.allclose(planar, np.eye(2), atol=_ROUNDING):
+        if np.allclose(planar, np.eye(2), atol=1e-9):
             return np.eye(self.width)
         known = ", ".join(element.name for element, _ in self.moves) or "none"
-        raise UserError(f"{self.owner} has no such symmetry for its {self.name}; it has {known}")
+        raise UserError(f"the body has no such symmetry for its {self.name}; it has {known}")
 
 
-def parts_field(name: str, what: str, moves: dict[PlaneElement, Floats], count: int, owner: str = "the body") -> Field:
+def parts_field(name: str, what: str, parts: Sequence[str], moves: Mapping[PlaneElement, Floats], count: int) -> Field:
     """Return a field of `count` items, each the numbers of all parts."""
-    width = len(next(iter(moves.values()))) if moves else 0
-    if not width:
+    if not parts:
         raise UserError(f"field '{name}' has no {what}; name some")
     rows = tuple((element, tuple(map(tuple, matrix.tolist()))) for element, matrix in moves.items())
-    kind = PartsKind(what, width, moves=rows, owner=owner)
+    kind = PartsKind(what, len(parts), parts=tuple(parts), moves=rows)
     KIND_MATRICES[kind] = kind.matrix
     return Field(name, kind, count)
 
@@ -122,18 +110,15 @@ def points_field(
     places = np.asarray(points, dtype=np.float64)
     if places.ndim != 2 or places.shape[1] not in (2, 3) or not len(places) or not np.isfinite(places).all():
         raise UserError(f"field '{name}': points have shape {list(places.shape)}; give [n, 2] or [n, 3] finite numbers")
-    size = max(np.abs(places).max(), 1e-9)
-    moves = {}
+    size, moves = max(np.abs(places).max(), 1e-9), {}
     for element in elements:
-        turn = element.matrix if places.shape[1] == 2 else space(element.matrix)
-        gap = np.abs((places @ turn.T)[:, None] - places[None]).max(-1) / size
-        image = gap.argmin(1)
-        if gap.min(1).max() > 1e-3 or len(set(image.tolist())) < len(image):
+        turn = space(element.matrix)[: places.shape[1], : places.shape[1]]
+        gap = np.abs((places @ turn.T)[:, None] - places).max(-1) / size
+        moves[element] = (gap < 1e-3).T.astype(np.float64)
+        if not (moves[element].sum(0) == 1).all():
             k = int(gap.min(1).argmax())
-            raise UserError(f"field '{name}': the image of point {k} under {element.name} is no point of it")
-        moves[element] = np.zeros((len(places), len(places)))
-        moves[element][image, np.arange(len(places))] = 1
-    return parts_field(name, "points", moves, count)
+            raise UserError(f"field '{name}': the image of point {k} under {element.name} is no point, or several")
+    return parts_field(name, "points", [str(k) for k in range(len(places))], moves, count)
 
 
 def grid(size: tuple[float, float], resolution: float, ordering: str = "xy") -> Floats:

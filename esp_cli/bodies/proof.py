@@ -7,14 +7,13 @@ its own control: planted mistakes (the sign of a joint pair, a joint that stays 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.deriving import BALL, FREE, QPOS_WIDTH, Frame, Match
+from esp_cli.bodies.deriving import BALL, FREE, Frame, Match
 from esp_cli.bodies.reading import quiet
 from esp_cli.symmetry.elements import Floats
 
@@ -22,8 +21,11 @@ EXACT, NEARLY = 1e-5, 0.05
 """Largest gap of a mirror that is exact up to rounding, and of one that holds but for a model's small asymmetry."""
 SEEN = 3.0
 """How many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it."""
-_Flag = mujoco.mjtDisableBit
-_SMOOTH, _LIMITED, _TOUCHING = int(_Flag.mjDSBL_CONSTRAINT), int(_Flag.mjDSBL_CONTACT), 0
+_STATES, _LYING, _PLANTED = 48, 24, 12
+"""States that are compared, those that are laid on the floor, and those for each planted mistake."""
+_NO_CONSTRAINTS, _NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+Sample = tuple[Floats, Floats, Floats, Floats]
+"""qpos, qvel, ctrl and forces on the degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -32,19 +34,17 @@ class Proof:
 
     Attributes:
         joints: [joints] the root mean square gap of the accelerations of each joint over theirs, without constraints.
+        planted: [joints] the smallest gap of mistakes planted at each.
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
         contacts: the same median where the robot lies on a floor; None where it cannot move freely, or touches none.
-        planted: by joint the smallest gap of mistakes planted there.
-        states: how many were compared.
     """
 
     joints: Floats
+    planted: Floats
     median: float
     constraints: float
     contacts: float | None
-    planted: Floats
-    states: int
 
     @property
     def gap(self) -> float:
@@ -57,56 +57,64 @@ class Proof:
         most = max(self.gap, self.constraints, self.contacts or 0.0)
         return "exact" if most <= EXACT else "nearly" if self.gap <= NEARLY else "broken"
 
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The verdict and all gaps, as JSON takes them."""
+        gaps = {"gap": self.gap, "median": self.median, "constraints": self.constraints, "contacts": self.contacts}
+        return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
+
     def would_show(self, planted: float) -> bool:
         """Return whether a mistake of this gap can be told from the gap that is there without one."""
         return planted > max(SEEN * self.gap, 2 * EXACT)
 
+    def __str__(self) -> str:
+        contact = "" if self.contacts is None else f", in contact to {self.contacts:.2g}"
+        return (
+            f"accelerations agree to {self.gap:.2g} at the worst joint, {self.median:.2g} in the median, with limits "
+            f"and friction to {self.constraints:.2g}{contact}; the least planted mistake is off by "
+            f"{self.planted.min():.2g}"
+        )
 
-def prove(frame: Frame, match: Match, states: int = 48, seed: int = 0) -> Proof:
+
+def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     """Compare accelerations of states and of their images, and of planted mistakes."""
-    model, rng = frame.model, np.random.default_rng(seed)
-    samples = [_state(frame, rng) for _ in range(states)]
+    rng, data = np.random.default_rng(seed), mujoco.MjData(frame.model)
     with quiet():
-        worlds = _Worlds(model)
-        with worlds.only(_SMOOTH):
-            here = worlds.accelerations(samples)
-            joints, median = _gaps(frame, match, here, worlds.accelerations(_images(match, samples)))
-            fewer = samples[:12]
-            planted = [
-                min(_gaps(frame, wrong, here[:12], worlds.accelerations(_images(wrong, fewer)))[0].max(initial=0)
-                    for wrong in _mistakes(frame, match, joint))
-                for joint in range(model.njnt)
-            ]  # fmt: skip
-        with worlds.only(_LIMITED):
-            _, constraints = worlds.compared(frame, match, samples)
-        contacts = None
-        lowered = [worlds.lowered(frame, sample) for sample in samples[:24]] if frame.base is not None else []
+        samples = [_state(frame, data, rng) for _ in range(_STATES)]
+        here = _accelerations(data, samples, _NO_CONSTRAINTS)
+
+        def compared(tried: Match, count: int) -> tuple[Floats, float]:
+            there = _accelerations(data, _images(tried, samples[:count]), _NO_CONSTRAINTS)
+            return _gaps(frame, tried, here[:count], there)
+
+        joints, median = compared(match, _STATES)
+        planted = [
+            min(compared(wrong, _PLANTED)[0].max() for wrong in _mistakes(frame, match, joint))
+            for joint in range(frame.model.njnt)
+        ]
+        lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
         lying = [sample for sample in lowered if sample is not None]
-        if lying:
-            with worlds.only(_TOUCHING):
-                _, contacts = worlds.compared(frame, match, lying)
-    return Proof(joints, median, constraints, contacts, np.array(planted), states)
+        medians = [
+            _gaps(frame, match, _accelerations(data, some, flag), _accelerations(data, _images(match, some), flag))[1]
+            for some, flag in ((samples, _NO_CONTACTS), (lying, 0))
+            if some
+        ]
+    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None)
 
 
-Sample = tuple[Floats, Floats, Floats, Floats]
-"""qpos, qvel, ctrl and forces on the degrees of freedom."""
-
-
-def _state(frame: Frame, rng: np.random.Generator) -> Sample:
+def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
     """Draw a state: joints within their limits, the base turned about any axis, controls within theirs."""
     model = frame.model
     qpos = model.qpos0.copy()
-    for j in range(model.njnt):
-        start, kind = model.jnt_qposadr[j], model.jnt_type[j]
+    for j, kind in enumerate(model.jnt_type):
+        where = frame.qpos_of(j)
         if kind in (FREE, BALL):
             turn = rng.normal(size=4) + (0 if kind == FREE else [4, 0, 0, 0])
-            qpos[start + QPOS_WIDTH[kind] - 4 :][:4] = turn / np.linalg.norm(turn)
+            qpos[where][-4:] = turn / np.linalg.norm(turn)
         else:
-            low, high = model.jnt_range[j] if model.jnt_limited[j] else qpos[start] + np.array([-1, 1])
-            qpos[start] = rng.uniform(low, high)
+            qpos[where] = rng.uniform(*(model.jnt_range[j] if model.jnt_limited[j] else qpos[where] + [-1, 1]))
     limited = model.actuator_ctrllimited.astype(bool)
     low, high = np.where(limited[:, None], model.actuator_ctrlrange, [-1, 1]).T
-    data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)
     force, column = rng.normal(size=model.nv), np.zeros(model.nv)
@@ -125,17 +133,29 @@ def _images(match: Match, samples: Sequence[Sample]) -> list[Sample]:
     ]
 
 
+def _accelerations(data: Any, samples: Sequence[Sample], disabled: int) -> Floats:
+    """Return qacc [states, nv] without what the flags disable."""
+    model = data.model
+    before = model.opt.disableflags
+    model.opt.disableflags = before | disabled
+    found = []
+    for sample in samples:
+        data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
+        data.qacc_warmstart[:] = 0
+        mujoco.mj_forward(model, data)
+        found.append(data.qacc.copy())
+    model.opt.disableflags = before
+    return np.stack(found)
+
+
 def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floats, float]:
     """Return the gap of each joint, and the median of the states' gaps, of accelerations [states, nv]."""
-    wanted, model = here @ match.qvel.T, frame.model
+    wanted = here @ match.qvel.T
     wrong, size = np.square(wanted - there), np.square(wanted)
-    joints = np.zeros(model.njnt)
-    total = max(size.mean(), 1e-24)
-    for j in range(model.njnt):
-        where = frame.dofs_of(j)
-        joints[j] = np.sqrt(wrong[:, where].mean() / max(size[:, where].mean(), 1e-12 * total))
-    states = np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))
-    return joints, float(np.median(states))
+    least = max(1e-12 * size.mean(), 1e-24)
+    spans = [frame.dofs_of(j) for j in range(frame.model.njnt)]
+    joints = np.array([np.sqrt(wrong[:, span].mean() / max(size[:, span].mean(), least)) for span in spans])
+    return joints, float(np.median(np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))))
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:
@@ -144,10 +164,8 @@ def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:
     pair = sorted({joint, partner})
     q, v = [np.r_[frame.qpos_of(j)] for j in pair], [np.r_[frame.dofs_of(j)] for j in pair]
     qpos, qvel = match.qpos.copy(), match.qvel.copy()
-    for rows_q, rows_v in zip(q, v, strict=True):
-        # of quaternions, only the part that is an axis
-        qpos[rows_q[-3:] if len(rows_q) > 1 else rows_q] *= -1
-        qvel[rows_v[-3:] if len(rows_v) > 1 else rows_v] *= -1
+    for matrix, rows in [*((qpos, x) for x in q), *((qvel, x) for x in v)]:
+        matrix[rows[-3:]] *= -1  # of quaternions, only the part that is an axis
     yield replace(match, qpos=qpos, qvel=qvel)
     if partner != joint and match.joint[partner] == joint:
         qpos, qvel = match.qpos.copy(), match.qvel.copy()
@@ -155,53 +173,25 @@ def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:
         yield replace(match, qpos=qpos, qvel=qvel)
 
 
-class _Worlds:
-    """A model to take accelerations from, with a floor to lie on."""
+def _lowered(frame: Frame, data: Any, sample: Sample) -> Sample | None:
+    """Return a state with the base so low that the robot just touches something; None where it never does."""
+    if frame.base is None:
+        return None
+    height = frame.qpos_of(frame.base).start + 2
 
-    def __init__(self, model: Any) -> None:
-        self.model, self.data = model, mujoco.MjData(model)
+    def touches(place: float) -> int:
+        data.qpos[:] = sample[0]
+        data.qpos[height] = place
+        mujoco.mj_fwdPosition(data.model, data)
+        return int(data.ncon)
 
-    @contextmanager
-    def only(self, disabled: int) -> Iterator[None]:
-        """Leave out what the flags disable."""
-        before = self.model.opt.disableflags
-        self.model.opt.disableflags = before | disabled
-        try:
-            yield
-        finally:
-            self.model.opt.disableflags = before
-
-    def accelerations(self, samples: Sequence[Sample]) -> Floats:
-        """Return qacc [states, nv]."""
-        return np.stack([self._forward(sample).qacc.copy() for sample in samples])
-
-    def compared(self, frame: Frame, match: Match, samples: Sequence[Sample]) -> tuple[Floats, float]:
-        """Return the gaps of some states, see `_gaps`."""
-        there = self.accelerations(_images(match, samples))
-        return _gaps(frame, match, self.accelerations(samples), there)
-
-    def lowered(self, frame: Frame, sample: Sample) -> Sample | None:
-        """Return a state with the base so low that the robot just touches something, or None where it never does."""
-        qpos, others = sample[0], sample[1:]
-        height = int(self.model.jnt_qposadr[frame.base]) + 2
-        high, low = qpos.copy(), qpos.copy()
-        high[height] += 4 * frame.size
-        low[height] -= 4 * frame.size
-        own = self._touches(high)
-        if self._touches(low) <= own:
-            return None
-        for _ in range(10):
-            middle = (high + low) / 2
-            high, low = (high, middle) if self._touches(middle) > own else (middle, low)
-        return (low, *others)
-
-    def _touches(self, qpos: Floats) -> int:
-        self.data.qpos[:] = qpos
-        mujoco.mj_fwdPosition(self.model, self.data)
-        return int(self.data.ncon)
-
-    def _forward(self, sample: Sample) -> Any:
-        self.data.qpos[:], self.data.qvel[:], self.data.ctrl[:], self.data.qfrc_applied[:] = sample
-        self.data.qacc_warmstart[:] = 0
-        mujoco.mj_forward(self.model, self.data)
-        return self.data
+    high, low = sample[0][height] + 4 * frame.size, sample[0][height] - 4 * frame.size
+    own = touches(high)
+    if touches(low) <= own:
+        return None
+    for _ in range(10):
+        middle = (high + low) / 2
+        high, low = (high, middle) if touches(middle) > own else (middle, low)
+    qpos = sample[0].copy()
+    qpos[height] = low
+    return (qpos, *sample[1:])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp mirror robot.xml\n
     esp mirror robot.urdf --json mirror.json\n
-    esp mirror robot.xml --order order.json --emit rsl_rl -o mirror.py\n
+    esp mirror robot.xml --numbers my_robot:numbers --emit rsl_rl -o mirror.py\n
     esp mirror robot.xml --check symmetry:compute_symmetric_states"""
 
 _SHOWN = 4
@@ -32,9 +32,11 @@ def mirror(
     root: Annotated[
         Path | None, typer.Option("--root", help="Folder that holds all its files; by default its own.", metavar="DIR")
     ] = None,
-    order: Annotated[
-        Path | None,
-        typer.Option("--order", help="JSON of joints, actions and observations, for the next two.", metavar="FILE"),
+    numbers: Annotated[
+        str | None,
+        typer.Option(
+            "--numbers", help="Function that says what your numbers are, for --emit and --check.", metavar="MODULE:NAME"
+        ),
     ] = None,
     emit: Annotated[
         Literal["rsl_rl", "isaaclab", "mjlab", "skrl", "sb3", "numpy"] | None,
@@ -42,7 +44,7 @@ def mirror(
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of that file.", metavar="FILE")] = None,
     check: Annotated[
-        str | None, typer.Option("--check", help="Audit a mirror that you wrote.", metavar="module:function")
+        str | None, typer.Option("--check", help="Audit a mirror that you wrote.", metavar="MODULE:NAME")
     ] = None,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -59,89 +61,94 @@ def mirror(
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
     if out is not None and out.exists() and not force:
         raise UserError(f"{out} exists; choose another path, or add --force")
-    body = Body.from_file(model, root)
-    found, failed = described(body, model), not body.found
+    body = Body.from_mjcf(model, root)
+    failed = not body.found
+    audited: list[Copy] = []
     if emit is not None and out is not None:
-        _write(body, model, order, emit, out)
-    elif check is not None:
-        from esp_cli.bodies.auditing import audit, named_function
-        from esp_cli.bodies.terms import read_numbers
+        _write(body, model, numbers, emit, out)
+    if check is not None:
+        from esp_cli.bodies.auditing import audit
+        from esp_cli.bodies.numbers import named_function, numbers_of
 
-        copies = audit(named_function(check), body, read_numbers(body, order))
-        failed = any(copy.wrong for copy in copies)
-        console.result(json, {**found, "check": copies}, lambda: _print_audit(check, copies))
-    else:
-        console.result(json, found, lambda: _print(body, model))
+        audited = audit(named_function(check), body, numbers_of(body, numbers))
+        failed = any(copy.wrong for copy in audited)
+    found = {**described(body, model), "check": audited}
+    if emit is None or json:
+        console.result(json, found, lambda: _print_audit(check, audited) if check else _print(body, model))
     if failed:
         raise typer.Exit(1)
 
 
-def _write(body: Body, model: Path, order: Path | None, host: str, out: Path) -> None:
+def described(body: Body, model: Path) -> dict[str, Any]:
+    """Return what is known of a body as JSON takes it."""
+    elements = {}
+    for name, one in body.found.items():
+        joints = [
+            {
+                "joint": joint,
+                "image": image,
+                "sign": sign,
+                "gap": gap,
+                "planted": planted,
+                "differs": d.what,
+                "by": d.share,
+            }
+            for joint, image, sign, gap, planted, d in body.rows(name)
+        ]
+        elements[name] = {**one.proof.summary, "joints": joints}
+    return {"model": str(model), "group": body.group, "elements": elements, "refused": body.refused}
+
+
+def _write(body: Body, model: Path, numbers: str | None, host: str, out: Path) -> None:
     from esp_cli.bodies.emitting import HOSTS, emitted
-    from esp_cli.bodies.terms import read_numbers
+    from esp_cli.bodies.numbers import numbers_of
     from esp_cli.files.writing import write_file
 
-    numbers = read_numbers(body, order)
-    write_file(out, emitted(body, numbers, model.name).encode())
-    groups = ", ".join(f"{group} ({layout.summary})" for group, layout in numbers.groups.items())
-    console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}: {groups}; actions ({numbers.action.summary})")
-    if order is None:
-        console.note("the observations are those of Isaac Lab's velocity tasks; --order FILE names yours")
+    layouts = numbers_of(body, numbers)
+    write_file(out, emitted(body, layouts, model.name).encode())
+    groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
+    console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
+    if numbers is None:
+        console.note("the numbers are those of Isaac Lab's velocity tasks; --numbers names a function with yours")
 
 
 def _print_audit(name: str, copies: Sequence[Copy]) -> None:
     wrong = [(copy.element, *row) for copy in copies for row in copy.wrong]
-    if wrong:
-        console.say(f"{name} is wrong in {len(wrong)} numbers")
-    else:
+    if not wrong:
         console.say(f"{name} is right: its copies are {', '.join(copy.element for copy in copies)}")
+        return
+    console.say(f"{name} is wrong in {len(wrong)} numbers")
     for k, copy in enumerate(copies):
-        if not copy.is_involution and copy.wrong:
+        if copy.wrong and not copy.is_involution:
             console.say(f"copy {k} ({copy.element}) does not undo itself")
-    if wrong:
-        console.table(("element", "number", "takes", "right is"), wrong)
-
-
-def described(body: Body, model: Path) -> dict[str, Any]:
-    """Return what is known of a body as JSON takes it."""
-    elements = {
-        name: {
-            "verdict": one.proof.verdict,
-            "gap": one.proof.gap,
-            "median": one.proof.median,
-            "constraints": one.proof.constraints,
-            "contacts": one.proof.contacts,
-            "smallest_planted": float(one.proof.planted.min()),
-            "joints": {
-                joint: {"image": image, "sign": sign, "gap": gap, "planted": planted, "differs": d.what, "by": d.share}
-                for joint, image, sign, gap, planted, d in body.rows(name)
-            },
-        }
-        for name, one in body.found.items()
-    }
-    return {"model": str(model), "group": body.group, "elements": elements, "refused": body.refused}
+    console.table(("element", "number", "takes", "right is"), wrong)
 
 
 def _print(body: Body, model: Path) -> None:
-    console.say(_answer(body, model))
+    from esp_cli.bodies.parts import NAMES
+
+    called = {name: name for name in (*body.found, *body.refused)}
+    called |= {plain: f"{plain} ({word})" for word, plain in NAMES.items() if plain in called}
+    nearly = [name for name, one in body.found.items() if one.proof.verdict != "exact"]
+    rest = "exactly" if not nearly else f"but for asymmetries of the model itself ({', '.join(nearly)})"
+    holds = f"is symmetric under {body.group}, {rest}; {len(body.joints)} joints"
+    console.say(f"{model.name} {holds if body.found else 'has no mirror or turn that its accelerations show'}")
     for name, one in body.found.items():
-        console.say(f"{_called(name)}: {_proven(one.proof)}")
+        console.say(f"{called[name]}: {one.proof}")
         if one.base is not None and _differs(one.base):
             console.say(f"  the base differs from its image: {_differs(one.base)}")
-        unseen = [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]
-        if unseen:
+        if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
             console.say(f"  not covered: a mistake at {', '.join(unseen)} would not show in accelerations")
     for name, reason in body.refused.items():
-        console.say(f"{_called(name)} does not hold: {reason}")
+        console.say(f"{called[name]} does not hold: {reason}")
     if not body.found:
         return
     shown = list(body.found)[:_SHOWN]
-    tables = {name: body.rows(name) for name in shown}
     rows = []
-    for k, (joint, *_) in enumerate(tables[shown[0]]):
-        images = [("-" if tables[name][k][2] == -1 else "") + tables[name][k][1] for name in shown]
-        worst = max((tables[name][k] for name in shown), key=lambda row: row[3])
-        rows.append((joint, *images, f"{worst[3]:.1g}", _differs(worst[5])))
+    for joints in zip(*(body.rows(name) for name in shown), strict=True):
+        images = [("-" if sign < 0 else "") + image for _, image, sign, *_ in joints]
+        worst = max(joints, key=lambda row: row[3])
+        rows.append((worst[0], *images, f"{worst[3]:.1g}", _differs(worst[5])))
     caption = "gap: of the joint's accelerations, as a share of them; differs: what of the model is not its own image"
     console.table(("joint", *shown, "gap>", "differs"), rows, caption=caption)
     if len(body.found) > _SHOWN:
@@ -150,25 +157,3 @@ def _print(body: Body, model: Path) -> None:
 
 def _differs(difference: Difference) -> str:
     return f"{difference.what} {difference.share:.2%}" if difference.share >= 1e-4 else ""
-
-
-def _answer(body: Body, model: Path) -> str:
-    if not body.found:
-        return f"{model.name} has no mirror or turn that its accelerations show"
-    nearly = [name for name, one in body.found.items() if one.proof.verdict != "exact"]
-    rest = "exactly" if not nearly else f"but for asymmetries of the model itself ({', '.join(nearly)})"
-    return f"{model.name} is symmetric under {body.group}, {rest}; {len(body.joints)} joints"
-
-
-def _called(name: str) -> str:
-    from esp_cli.bodies.tables import NAMES
-
-    word = next((word for word, plain in NAMES.items() if plain == name), None)
-    return f"{name} ({word})" if word else name
-
-
-def _proven(proof: Any) -> str:
-    parts = [f"accelerations agree to {proof.gap:.2g} at the worst joint, {proof.median:.2g} in the median"]
-    parts.append(f"with limits and friction to {proof.constraints:.2g}")
-    parts += [] if proof.contacts is None else [f"in contact to {proof.contacts:.2g}"]
-    return f"{', '.join(parts)}; the least planted mistake is off by {proof.planted.min():.2g}"

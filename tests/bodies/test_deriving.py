@@ -167,5 +167,5 @@ def test_a_site_that_pushes_is_refused_where_no_image_pushes():
 
 
 def test_models_without_a_joint_are_refused():
-    with pytest.raises(UserError, match="no joint"):
+    with pytest.raises(UserError, match="0 degrees of freedom"):
         body_of("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")

@@ -14,34 +14,36 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli import Body
+from esp_cli import Body, layout
 from esp_cli.bodies.auditing import audit
 from esp_cli.bodies.emitting import emitted
-from esp_cli.bodies.terms import map_of, read_numbers
+from esp_cli.bodies.kinds import grid
+from esp_cli.bodies.numbers import ACTION, Numbers, map_of, numbers_of
 from esp_envs.errors import UserError
 from tests.bodies.models import QUADRUPED, biped
 from tests.bodies.test_deriving import GYMNASIUM
 from tests.bodies.test_fields import JOINTS, anymal
 from tests.cli.running import esp, refused
 
-GROUPS = {
-    "observations": {
-        "policy": ["base_ang_vel", "projected_gravity", "joint_pos", {"term": "actions", "history": 2}],
-        "critic": ["base_lin_vel", {"term": "contacts", "names": ["left_foot", "right_foot"]}, "joint_vel",
-                   {"term": "height_scan", "size": [1, 2], "resolution": 0.5}, {"term": "quaternion", "name": "q"}],
+
+def groups(body: Body) -> Numbers:
+    """Say what numbers are, as a user does in a module of her own."""
+    seen = layout(body.spin(), body.gravity(), body.positions(), body.positions(history=2, name="actions"))
+    feet = body.contacts(["left_foot", "right_foot"])
+    scan = body.scan(grid((1, 2), 0.5))
+    return {
+        "policy": seen,
+        "critic": layout(body.velocity(), feet, body.velocities(), scan, body.attitude()),
+        "action": layout(body.positions()),
     }
-}  # fmt: skip
+
+
 ODD = "left\n\"'*/}knee"
 
 
 @pytest.fixture
 def body() -> Body:
     return Body.from_mjcf(mujoco.MjModel.from_xml_string(biped()))
-
-
-def numbers_of(body: Body, told: object, folder: Path):
-    (folder / "order.json").write_text(json.dumps(told))
-    return read_numbers(body, folder / "order.json")
 
 
 def imported(text: str, folder: Path, name: str = "mirror"):
@@ -53,18 +55,16 @@ def imported(text: str, folder: Path, name: str = "mirror"):
 
 
 def test_the_file_does_what_the_layouts_say(body, tmp_path):
-    numbers = numbers_of(body, GROUPS, tmp_path)
+    numbers = groups(body)
     module = imported(emitted(body, numbers, "biped.xml"), tmp_path)
     assert module.ELEMENTS == ("flip-x",)
     (element,) = body.elements
-    for group, layout in [*numbers.groups.items(), (None, numbers.action)]:
-        rows = np.random.default_rng(0).normal(size=(5, layout.width))
-        np.testing.assert_allclose(module.mirrored(rows, "flip-x", group), rows @ map_of(layout, element).T)
-        np.testing.assert_allclose(
-            module.mirrored(torch.tensor(rows), "flip-x", group), rows @ map_of(layout, element).T
-        )
+    for name, told in numbers.items():
+        rows, group = np.random.default_rng(0).normal(size=(5, told.width)), None if name == ACTION else name
+        np.testing.assert_allclose(module.mirrored(rows, "flip-x", group), rows @ map_of(told, element).T)
+        np.testing.assert_allclose(module.mirrored(torch.tensor(rows), "flip-x", group), rows @ map_of(told, element).T)
     obs, actions, reward = module.augment(
-        np.ones((7, 5, numbers.groups["policy"].width)), np.ones((7, 5, 9)), np.ones((7, 5)), axis=1
+        np.ones((7, 5, numbers["policy"].width)), np.ones((7, 5, 9)), np.ones((7, 5)), axis=1
     )
     assert (obs.shape[1], actions.shape[1], reward.shape[1]) == (10, 10, 10)
     with pytest.raises(ValueError, match="rows of actions have 8 numbers, the mirror 9"):
@@ -73,7 +73,7 @@ def test_the_file_does_what_the_layouts_say(body, tmp_path):
 
 def test_a_turn_that_mixes_numbers_is_written_as_a_matrix(tmp_path):
     third = Body(["a", "b", "c"], {"rot120": {"a": "b", "b": "c", "c": "a"}})
-    module = imported(emitted(third, read_numbers(third, None), "three"), tmp_path)
+    module = imported(emitted(third, numbers_of(third, None), "three"), tmp_path)
     rows = np.random.default_rng(0).normal(size=(4, 21))
     turned = module.mirrored(rows, "rot120", "policy")
     np.testing.assert_allclose(np.linalg.norm(turned[:, :3], axis=1), np.linalg.norm(rows[:, :3], axis=1))
@@ -84,13 +84,13 @@ def test_a_turn_that_mixes_numbers_is_written_as_a_matrix(tmp_path):
 def test_names_of_strangers_stay_text(tmp_path):
     text = biped().replace("left_knee", ODD.replace("\n", "&#10;").replace('"', "&quot;"))
     body = Body.from_mjcf(mujoco.MjModel.from_xml_string(text))
-    module = imported(emitted(body, read_numbers(body, None), "a'''\n\"\"\".xml"), tmp_path)
+    module = imported(emitted(body, numbers_of(body, None), "a'''\n\"\"\".xml"), tmp_path)
     assert module.MODEL == "a'''\n\"\"\".xml"
-    assert repr(ODD) in "".join(module.NUMBERS["policy"])
+    assert f"positions.{ODD!r}" in module.NUMBERS["policy"]
 
 
 def test_the_file_needs_neither_this_package_nor_torch(body, tmp_path):
-    (tmp_path / "mirror.py").write_text(emitted(body, read_numbers(body, None), "biped.xml"))
+    (tmp_path / "mirror.py").write_text(emitted(body, numbers_of(body, None), "biped.xml"))
     code = (
         "import sys; sys.modules['esp_cli'] = sys.modules['torch'] = None; import numpy, mirror; "
         "print(mirror.compute_symmetric_states(None, numpy.ones((2, 39)), numpy.ones((2, 9)))[0].shape)"
@@ -103,11 +103,11 @@ def test_rsl_rl_takes_the_file(body, tmp_path):
     symmetry = pytest.importorskip("rsl_rl.extensions.symmetry")
     from tensordict import TensorDict
 
-    module = imported(emitted(body, numbers_of(body, GROUPS, tmp_path), "biped.xml"), tmp_path)
+    module = imported(emitted(body, groups(body), "biped.xml"), tmp_path)
     extension = symmetry.Symmetry(
         None, module.compute_symmetric_states, use_data_augmentation=True, use_mirror_loss=True
     )
-    widths = {group: len(labels) for group, labels in module.NUMBERS.items() if group}
+    widths = {group: len(labels) for group, labels in module.NUMBERS.items() if group != ACTION}
     obs = TensorDict({group: torch.randn(6, width) for group, width in widths.items()}, batch_size=[6])
     ones = torch.ones(6, 1)
     batch = type("Batch", (), {"observations": obs, "actions": torch.randn(6, 9), "old_actions_log_prob": ones,
@@ -124,8 +124,8 @@ def test_rsl_rl_takes_the_file(body, tmp_path):
 
 def test_the_audit_of_a_right_mirror_names_its_elements(tmp_path):
     body = anymal()
-    module = imported(emitted(body, read_numbers(body, None), "anymal"), tmp_path)
-    found = audit(module.compute_symmetric_states, body, read_numbers(body, None))
+    module = imported(emitted(body, numbers_of(body, None), "anymal"), tmp_path)
+    found = audit(module.compute_symmetric_states, body, numbers_of(body, None))
     assert [(copy.element, copy.wrong) for copy in found] == [
         (x, ()) for x in ("identity", "flip-x", "flip-y", "rot180")
     ]
@@ -137,10 +137,10 @@ def test_the_audit_names_what_is_wrong_and_what_is_right():
     def forgets_signs(obs, actions):
         return obs, torch.cat([actions, actions[:, [2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9]]])
 
-    (_, copy) = [*audit(lambda actions: forgets_signs(None, actions)[1], body, read_numbers(body, None))]
+    (_, copy) = [*audit(lambda actions: forgets_signs(None, actions)[1], body, numbers_of(body, None))]
     assert copy.element == "flip-x"
     assert copy.is_involution
-    assert copy.wrong[0] == ("action.LF_HAA", "action.RF_HAA", "-action.RF_HAA")
+    assert copy.wrong[0] == ("actions.LF_HAA", "actions.RF_HAA", "-actions.RF_HAA")
     assert len(copy.wrong) == 4
 
 
@@ -154,18 +154,16 @@ def robots() -> dict[str, Body]:
 
 def test_hundreds_of_wrong_mirrors_are_caught_and_relabelled_right_ones_never(tmp_path):
     caught = 0
-    terms = ["base_lin_vel", "base_ang_vel", "projected_gravity", "quaternion", "joint_vel"]
-    terms.append({"term": "joint_pos", "history": 3})
-    scan = {"term": "height_scan", "size": [2, 1], "resolution": 0.5}
     for body in robots().values():
-        order = list(np.random.default_rng(0).permutation(list(body.joints)))
-        seen = terms if body.group == "d4" else [*terms, scan]  # a grid that is no square does not turn by quarters
-        numbers = numbers_of(body, {"joints": order, "observations": seen}, tmp_path)
-        (layout,) = numbers.groups.values()
+        order = [str(x) for x in np.random.default_rng(0).permutation(list(body.joints))]
+        fields = [body.velocity(), body.spin(), body.gravity(), body.attitude(), body.positions(order, history=3)]
+        if body.group != "d4":  # a grid that is no square does not turn by quarters
+            fields.append(body.scan(grid((2, 1), 0.5)))
+        numbers = {"policy": layout(*fields), ACTION: layout(body.positions(order))}
         for element in body.elements[:3]:
-            right = map_of(layout, element), map_of(numbers.action, element)
+            right = map_of(numbers["policy"], element), map_of(numbers[ACTION], element)
             assert verdict(*right, body, numbers) == []
-            for wrong in mistakes(*right, layout):
+            for wrong in mistakes(*right, numbers["policy"]):
                 assert verdict(*wrong, body, numbers)
                 caught += 1
     assert caught >= 300
@@ -180,14 +178,14 @@ def verdict(seen: np.ndarray, acted: np.ndarray, body: Body, numbers) -> list:
     return [row for copy in audit(function, body, numbers) for row in copy.wrong]
 
 
-def mistakes(seen: np.ndarray, acted: np.ndarray, layout):
+def mistakes(seen: np.ndarray, acted: np.ndarray, told):
     """Yield maps with one mistake: signs, orders, polar for axial, quaternions, histories, scans."""
-    places = layout.slices()
+    places = told.slices()
     for k in range(len(acted)):
         yield seen, acted * np.where(np.arange(len(acted)) == k, -1, 1)[:, None]
-        start = places["joint_pos"].start + k
+        start = places["positions"].start + k
         yield seen * np.where(np.arange(len(seen)) == start, -1, 1)[:, None], acted
-    for name in ("base_lin_vel", "base_ang_vel", "quaternion"):
+    for name in ("velocity", "spin", "attitude"):
         part = places[name]
         for change in (-1.0, None):
             wrong = seen.copy()
@@ -198,7 +196,7 @@ def mistakes(seen: np.ndarray, acted: np.ndarray, layout):
     swapped[:3, :3], swapped[3:6, 3:6] = seen[3:6, 3:6], seen[:3, :3]
     if not np.array_equal(swapped, seen):  # a turn does the same to both
         yield swapped, acted
-    for part in (places["joint_pos"], places.get("height_scan")):
+    for part in (places["positions"], places.get("scan")):
         if part is not None:
             wrong = seen.copy()
             wrong[part] = np.roll(wrong[part], 1, axis=0)
@@ -208,22 +206,21 @@ def mistakes(seen: np.ndarray, acted: np.ndarray, layout):
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("text", "words"),
     [
-        ([1], "holds something else"),
-        ({"joint": []}, "holds 'joint'"),
-        ({"joints": "hip"}, "no list of names"),
-        ({"joints": ["paw"]}, "no paw among its joints"),
-        ({"observations": ["speed"]}, "'speed' is no term; a term is base_lin_vel"),
-        ({"observations": []}, "no list of terms"),
-        ({"observations": [{"term": "joint_pos", "history": 0}]}, "whole numbers from 1"),
-        ({"observations": [{"term": "contacts"}]}, "no list of names"),
-        ({"observations": ["joint_pos", "joint_pos"]}, "field names must differ"),
+        ("x = 1", "has no function 'numbers'"),
+        ("numbers = lambda body: 1", "returns int; return layouts"),
+        ("numbers = lambda body: {'action': 1}", "returns dict"),
+        ("numbers = lambda body: {}", "returns dict"),
+        ("1 / 0", "cannot import the module 'my_{}': ZeroDivisionError"),
     ],
 )
-def test_orders_that_fit_nothing_are_refused(body, tmp_path, told, words):
-    with pytest.raises(UserError, match=words):
-        numbers_of(body, told, tmp_path)
+def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text, words):
+    monkeypatch.chdir(tmp_path)
+    name = f"my_{abs(hash(text))}"
+    Path(f"{name}.py").write_text(text)
+    with pytest.raises(UserError, match=words.format(name.removeprefix("my_"))):
+        numbers_of(body, f"{name}:numbers")
 
 
 @pytest.mark.parametrize(
@@ -237,7 +234,7 @@ def test_orders_that_fit_nothing_are_refused(body, tmp_path, told, words):
 )
 def test_functions_that_are_no_mirror_are_refused(body, function, words):
     with pytest.raises(UserError, match=words):
-        audit(function, body, read_numbers(body, None))
+        audit(function, body, numbers_of(body, None))
 
 
 def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
@@ -245,19 +242,19 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     Path("biped.xml").write_text(biped())
     told = esp("mirror", "biped.xml", "--emit", "rsl_rl", "-o", "my_mirror.py").stdout
-    assert told.startswith("my_mirror.py has compute_symmetric_states for flip-x: policy (base_lin_vel 3,")
+    assert told.startswith("my_mirror.py has compute_symmetric_states for flip-x; policy: velocity 3, spin 3")
     assert esp("mirror", "biped.xml", "--check", "my_mirror:compute_symmetric_states").stdout == (
         "my_mirror:compute_symmetric_states is right: its copies are identity, flip-x\n"
     )
     text = Path("my_mirror.py").read_text().replace("'sign': [-1,", "'sign': [1,")
     Path("my_wrong.py").write_text(text)
     result = esp("mirror", "biped.xml", "--check", "my_wrong:compute_symmetric_states", "--json", "-", code=1)
-    assert json.loads(result.stdout)["check"][1]["wrong"] == [["action.waist", "action.waist", "-action.waist"]]
+    assert json.loads(result.stdout)["check"][1]["wrong"] == [["actions.waist", "actions.waist", "-actions.waist"]]
     assert "exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
     assert "belong together" in refused("mirror", "biped.xml", "--emit", "numpy")
     assert "cannot import" in refused("mirror", "biped.xml", "--check", "nowhere:mirror")
     assert "names no function" in refused("mirror", "biped.xml", "--check", "nowhere")
-    assert "not JSON" in refused("mirror", "biped.xml", "--check", "my_mirror:augment", "--order", "biped.xml")
+    assert "names no function" in refused("mirror", "biped.xml", "--check", "my_mirror:augment", "--numbers", "1")
 
 
 def test_joint_names_of_the_page_are_isaac_sims():

@@ -38,7 +38,6 @@ def sentence(path, **choice) -> str:
         ("<mujoco>", "not an XML file"),
         ("\0\1", "not an XML file"),
         ("<a/>", "neither MJCF nor URDF"),
-        ("<mujoco/>", "no joint"),
         ("<b>" * 200 + "</b>" * 200, "neither"),
         ("<mujoco>" + "<b>" * 200 + "</b>" * 200 + "</mujoco>", "too deep"),
         ('<mujoco><replicate count="999"><replicate count="999"><geom/></replicate></replicate></mujoco>', "more than"),
