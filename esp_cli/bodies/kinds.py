@@ -89,7 +89,6 @@ def parts_field(name: str, what: str, parts: Sequence[str], moves: Mapping[Plane
         raise UserError(f"field '{name}' has no {what}; name some")
     rows = tuple((element, tuple(map(tuple, matrix.tolist()))) for element, matrix in moves.items())
     kind = PartsKind(what, len(parts), parts=tuple(parts), moves=rows)
-    KIND_MATRICES[kind] = kind.matrix
     return Field(name, kind, count)
 
 

@@ -13,12 +13,9 @@ from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.groups import FiniteGroup
 from esp_cli.symmetry.parse import parse_elements
-from esp_cli.symmetry.plane import PlaneElement
+from esp_cli.symmetry.plane import BODY_NAMES, PlaneElement
 from esp_envs.errors import UserError
 from esp_envs.spec import Field
-
-NAMES = {"left-right": "flip-x", "front-back": "flip-y", "half-turn": "rot180", "quarter-turn": "rot90"}
-"""What a robot that faces x calls elements."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +84,9 @@ def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> P
 
 def _element_of(word: str) -> PlaneElement:
     """Return the element of a robot's word, "left-right", or of the plane's, "flip-x"."""
-    found = parse_elements(NAMES.get(word, word), 1)
+    found = parse_elements(word, 1)
     if not isinstance(found, tuple) or len(found) != 1 or len(found[0].geometry) != 1 or found[0].orders:
-        raise UserError(f"'{word}' is not one turn or mirror; write {', '.join(NAMES)} or rot60")
+        raise UserError(f"'{word}' is not one turn or mirror; write {', '.join(BODY_NAMES)} or rot60")
     return PlaneElement.of(found[0])
 
 

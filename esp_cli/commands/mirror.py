@@ -125,10 +125,10 @@ def _print_audit(name: str, copies: Sequence[Copy]) -> None:
 
 
 def _print(body: Body, model: Path) -> None:
-    from esp_cli.bodies.parts import NAMES
+    from esp_cli.symmetry.plane import BODY_NAMES
 
     called = {name: name for name in (*body.found, *body.refused)}
-    called |= {plain: f"{plain} ({word})" for word, plain in NAMES.items() if plain in called}
+    called |= {plain: f"{plain} ({word})" for word, plain in BODY_NAMES.items() if plain in called}
     nearly = [name for name, one in body.found.items() if one.proof.verdict != "exact"]
     rest = "exactly" if not nearly else f"but for asymmetries of the model itself ({', '.join(nearly)})"
     holds = f"is symmetric under {body.group}, {rest}; {len(body.joints)} joints"

@@ -90,9 +90,10 @@ class PlaneElement(Geometry):
             return picture_sources(field.pixels, self.matrix)
         if field.rays:
             return ring_sources(field.rays, self.matrix)
-        if field.kind not in KIND_MATRICES:
+        matrix = getattr(field.kind, "matrix", None) or KIND_MATRICES.get(field.kind)
+        if matrix is None:
             raise UserError(f"a planar transform does not say how field '{field.name}' of kind {field.kind.name} turns")
-        return KIND_MATRICES[field.kind](self.matrix)
+        return matrix(self.matrix)
 
 
 @lru_cache(maxsize=1024)
@@ -218,8 +219,13 @@ def orthogonal() -> PlaneGroup:
     return PlaneGroup(mirrors=True)
 
 
+BODY_NAMES = {"left-right": "flip-x", "front-back": "flip-y", "half-turn": "rot180", "quarter-turn": "rot90"}
+"""What a robot that faces x calls elements."""
+
+
 def read_plane(word: str, _: int) -> Element | Group | None:
     """Read a turn, a mirror or a group of these; see `parse_elements`."""
+    word = BODY_NAMES.get(word, word)
     if word == "identity":
         return Element()
     if word in _MIRRORS:

@@ -138,6 +138,7 @@ def test_joints_come_in_the_simulators_order():
     order = ["right_knee", "waist", "left_knee"]
     assert moved(body.positions(order), "flip-x", [1, 2, 3]) == [3, -2, 1]
     assert moved(body.positions(order, history=2), "flip-x", [1, 2, 3, 10, 20, 30]) == [3, -2, 1, 30, -20, 10]
+    assert moved(body.positions(order), "left-right", [1, 2, 3]) == [3, -2, 1]
     assert moved(body.controls(["a_right_pitch", "a_left_pitch"]), "flip-x", [1, 2]) == [2, 1]
     assert moved(body.contacts(["left_foot", "right_foot"], width=2), "flip-x", [1, 2, 3, 4]) == [3, 4, 1, 2]
 
