@@ -150,8 +150,11 @@ class Body:
         idle: set[PlaneElement],
     ) -> None:
         """Derive and prove one element, and keep it or the reason against it."""
-        match = derive(frame, element)
-        if match is None:
+        try:
+            match = derive(frame, element)
+        except UserError as error:
+            if element in TRIED[:2]:
+                self.refused[element.name] = str(error)
             return
         if match.is_trivial:
             idle.add(element)

@@ -19,6 +19,7 @@ from esp_cli.bodies.kinds import space
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
+from esp_envs.errors import UserError
 
 LOOSE = 0.1
 """How far a joint's line may be off, as a share of the robot's size, or of the length of its axis, to be matched."""
@@ -133,15 +134,29 @@ class Frame:
         return list(range(first, first + int(self.model.body_jntnum[body])))
 
 
-def derive(frame: Frame, element: PlaneElement) -> Match | None:
-    """Find what an element does to a model; None where the model at rest is far from being its own image."""
+def derive(frame: Frame, element: PlaneElement) -> Match:
+    """Find what an element does to a model.
+
+    Raises:
+        UserError: the model at rest is far from being its own image; it names a joint or body without an image.
+    """
     R = space(element.matrix)
     com = frame.com[frame.moving]
-    if np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1).max() > FAR * frame.size:
-        return None
+    gaps = np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1)
+    if gaps.max() > FAR * frame.size:
+        raise UserError(
+            f"no mass is where that of {frame.name('body', frame.moving[int(gaps.argmax())])} would come to lie"
+        )
     bodies, joints = _matched(frame, R)
     if not joints:
-        return None
+        every = range(frame.model.njnt)
+        lost = [i for i in every if min(_joint_gap(frame, R, i, j) for j in every) >= _APART]
+        part = (
+            f"no joint is like the image of {frame.name('joint', lost[0])}"
+            if lost
+            else "its bodies hang together otherwise"
+        )
+        raise UserError(part)
     qpos, offset, qvel = _state_maps(frame, R, joints)
     ctrl, unmatched = _control_map(frame, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])

@@ -83,6 +83,7 @@ def test_an_asymmetric_joint_is_named_with_what_differs():
 def test_a_robot_with_one_leg_moved_has_no_mirror():
     body = body_of(biped(right_y=-0.2))
     assert (body.group, body.found) == ("c1", {})
+    assert body.refused["flip-x"].startswith("no joint is like the image of left_")
 
 
 def test_a_heavy_backpack_on_one_side_is_refused_with_its_gap():

@@ -1,0 +1,71 @@
+"""Write docs/measurements/robot-models.md: the symmetries of every robot model that installed packages bring.
+
+    python docs/make_robots.py mjlab gymnasium dm_control gymnasium_robotics
+
+A package that is not installed is left out. Times are those of one process of one core.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from esp_cli.bodies import Body, read_model
+from esp_envs.errors import UserError
+
+PAGE = Path(__file__).parent / "measurements" / "robot-models.md"
+_HEAD = """# Robot models
+
+What `esp mirror` finds in the models that packages bring: {held} of {tried} models with joints have a mirror or turn.
+`python docs/make_robots.py PACKAGE...` writes this page; [Legged robots](../legged-robots.md) says how a mirror is derived
+and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. Files without a
+joint, and parts that are no model by themselves, are left out ({left}).
+
+| package | model | joints | symmetry | verdict | gap | least planted mistake | reading, s | all elements, s |
+|---|---|---:|---|---|---:|---:|---:|---:|
+"""
+
+
+def rows(package: str, root: Path) -> Iterator[str | None]:
+    """Yield a row of the table for each model of a package; None for a file that is none."""
+    for path in sorted(root.rglob("*.xml")):
+        start = time.process_time()
+        try:
+            model = read_model(path, root)
+            read = time.process_time()
+            body = Body.from_mjcf(model)
+        except UserError:
+            yield None
+            continue
+        took = time.process_time()
+        name = path.relative_to(root).as_posix().removeprefix("envs/").replace("/assets/", "/")
+        cells = ["none", "; ".join(f"{k}: {v}" for k, v in list(body.refused.items())[:1]), "", ""]
+        if body.found:
+            proof = next(iter(body.found.values())).proof
+            cells = [body.group, proof.verdict, f"{proof.gap:.1g}", f"{proof.planted.min():.2g}"]
+        cells = [package, name, str(len(body.joints)), *cells, f"{read - start:.2f}", f"{took - read:.2f}"]
+        yield f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    """Write the page."""
+    table: list[str] = []
+    left = 0
+    for package in sys.argv[1:]:
+        spec = importlib.util.find_spec(package)
+        if spec is None or not spec.submodule_search_locations:
+            print(f"{package} is not installed")
+            continue
+        for row in rows(package, Path(spec.submodule_search_locations[0])):
+            table += [] if row is None else [row]
+            left += row is None
+    held = sum("| none |" not in row for row in table)
+    text = _HEAD.format(held=held, tried=len(table), left=left) + "\n".join(table) + "\n"
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
