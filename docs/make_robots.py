@@ -21,8 +21,8 @@ _HEAD = """# Robot models
 
 What `esp mirror` finds in the models that packages bring: {held} of {tried} models with joints have a mirror or turn.
 `python docs/make_robots.py PACKAGE...` writes this page; [Legged robots](../legged-robots.md) says how a mirror is
-derived and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. Files without a
-joint, and parts that are no model by themselves, are left out ({left}).
+derived and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. Files
+without a joint, and parts that are no model by themselves, are left out ({left}).
 
 | package | model | joints | symmetry | verdict | gap | least planted mistake | reading, s | all elements, s |
 |---|---|---:|---|---|---:|---:|---:|---:|
