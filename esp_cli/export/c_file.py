@@ -52,7 +52,7 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
     body = _body(program)
     comment = comment.replace("*/", "* /").replace("/*", "/ *")
     values = {
-        **_shape(program),
+        "program": program,
         "comment": "\n".join(f" * {line}".rstrip() for line in comment.splitlines()),
         "act": _signature(program),
         "outputs": f"const float *esp_policy_outputs({'int agent' if program.team > 1 else 'void'})",
@@ -74,7 +74,7 @@ def example_source(program: Program, observation: list[float], action: list[floa
     choose = program.head == "choose"
     return filled(
         "policy_example.c",
-        **_shape(program),
+        program=program,
         kind="int" if choose else "float",
         count=len(action),
         observation=numbers(observation),
@@ -82,11 +82,6 @@ def example_source(program: Program, observation: list[float], action: list[floa
         allowed=", ".join(str(int(flag)) for flag in allowed),
         given=", ".join(["observation", *["allowed"] * program.masked, *["memory"] * (program.memory_width > 0)]),
     )
-
-
-def _shape(program: Program) -> dict[str, object]:
-    names = ("num_inputs", "num_outputs", "hidden", "memory_width", "head", "team", "masked")
-    return {name: getattr(program, name) for name in names}
 
 
 def numbers(values: Iterable[float]) -> str:
