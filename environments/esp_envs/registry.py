@@ -32,20 +32,12 @@ def task_names() -> tuple[str, ...]:
 
 
 def register(task: str | type[Environment]) -> str:
-    """Admit a task that is not installed and return its name; see `Registry.register`.
-
-    Raises:
-        UserError: the module cannot be imported, or holds no such task.
-    """
+    """Admit a task that is not installed and return its name; `Registry.register` says what it refuses."""
     return TASKS.register(task)
 
 
 def task_class(name: str) -> type[Environment]:
-    """Return the environment class of a task; see `Registry.__getitem__`.
-
-    Raises:
-        UserError: no such task, or one that is neither installed nor registered.
-    """
+    """Return the environment class of a task; a UserError says what is wrong with a name that has none."""
     return TASKS[name]
 
 

@@ -73,12 +73,9 @@ def flip(content: bytearray, draw: random.Random) -> bytearray:
     return content
 
 
-def truncate(content: bytearray, draw: random.Random) -> bytearray:
-    return content[: draw.randrange(len(content))]
-
-
-def extend(content: bytearray, draw: random.Random) -> bytearray:
-    return content + draw.randbytes(draw.choice((1, 8, 4096)))
+def resize(content: bytearray, draw: random.Random) -> bytearray:
+    longer = content + draw.randbytes(draw.choice((1, 8, 4096)))
+    return draw.choice((longer, content[: draw.randrange(len(content))]))
 
 
 def overwrite(content: bytearray, draw: random.Random) -> bytearray:
@@ -114,7 +111,7 @@ def digits(content: bytearray, draw: random.Random) -> bytearray:
     return content
 
 
-SPOILERS = (flip, truncate, extend, overwrite, move, length, digits)
+SPOILERS = (flip, resize, overwrite, move, length, digits)
 
 
 @pytest.fixture(scope="module")
@@ -161,25 +158,27 @@ def with_hostile_value(meta: dict[str, Any], draw: random.Random) -> dict[str, A
     return changed
 
 
+SHAPES = [(0,), (), (2, 0, 5), (1000, 1, 1), (2, 4096, 8), (2,)]
+TYPES = [torch.float64, torch.float16, torch.int64, torch.uint8, torch.bool]
+HOSTILE_TENSORS: list[Callable[[Tensor, random.Random], Tensor]] = [
+    lambda tensor, _: tensor.reshape(-1),
+    lambda _, draw: torch.zeros(draw.choice(SHAPES)),
+    lambda tensor, draw: tensor.to(draw.choice(TYPES)),
+    lambda tensor, draw: tensor.clone().fill_(draw.choice([float("nan"), float("inf"), float("-inf")])),
+    lambda tensor, _: tensor.transpose(0, -1).contiguous(),
+    lambda tensor, _: torch.cat([tensor, tensor]),
+]
+HOSTILE_NAMES = ["actor", "head.epsilon", "x" * 500, "../x", "actor.layers.9.weight"]
+
+
 def with_hostile_tensor(tensors: dict[str, Tensor], draw: random.Random) -> dict[str, Tensor]:
     """Spoil one tensor: its shape, its dtype, its numbers, its name, or its being there."""
-    changed, name = dict(tensors), draw.choice(sorted(tensors))
+    changed, name, kind = dict(tensors), draw.choice(sorted(tensors)), draw.randrange(8)
     tensor = changed.pop(name)
-    kind = draw.randrange(8)
-    if kind == 0:
-        changed[name] = tensor.reshape(-1)
-    elif kind == 1:
-        changed[name] = torch.zeros(draw.choice([(0,), (), (2, 0, 5), (1000, 1, 1), (2, 4096, 8), (2,)]))
-    elif kind == 2:
-        changed[name] = tensor.to(draw.choice([torch.float64, torch.float16, torch.int64, torch.uint8, torch.bool]))
-    elif kind == 3:
-        changed[name] = tensor.clone().fill_(draw.choice([float("nan"), float("inf"), float("-inf")]))
-    elif kind == 4:
-        changed[draw.choice(["actor", "head.epsilon", "x" * 500, "../x", "actor.layers.9.weight"])] = tensor
-    elif kind == 5:
-        changed[name] = tensor.transpose(0, -1).contiguous()
-    elif kind == 6:
-        changed[name] = torch.cat([tensor, tensor])
+    if kind < len(HOSTILE_TENSORS):
+        changed[name] = HOSTILE_TENSORS[kind](tensor, draw)
+    elif kind == len(HOSTILE_TENSORS):
+        changed[draw.choice(HOSTILE_NAMES)] = tensor
     return changed
 
 
@@ -208,7 +207,7 @@ def test_spoilt_manifests_give_a_sentence_or_entries(tmp_path: Path) -> None:
     file, draw = tmp_path / MANIFEST, random.Random("manifest")
     content, entries = file.read_bytes(), read_bundled(tmp_path)
     for k in range(MANIFESTS):
-        file.write_bytes(SPOILERS[k % 5](bytearray(content), draw))
+        file.write_bytes(SPOILERS[k % 4](bytearray(content), draw))
         found = attempt(lambda: read_bundled(tmp_path))
         assert found is None or all(len(e.sha256) == 64 and "/" not in e.file for e in found)
     write_bundled(tmp_path, entries)
