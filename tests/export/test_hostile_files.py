@@ -24,6 +24,7 @@ from esp_cli.policies.bundled import MANIFEST, read_bundled, write_bundled
 from esp_cli.policies.bundling import bundle
 from esp_cli.policies.loaded import load_policy
 from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.training import checkpoint
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.export.policies import drawn_policy, write_policy
@@ -266,7 +267,7 @@ def test_a_crafted_file_gives_a_sentence(kind: str, tmp_path: Path, monkeypatch:
     assert peak_kb() - before < MOST_MEMORY_KB
 
 
-def test_a_newer_format_and_another_task_version_are_explained(tmp_path: Path) -> None:
+def test_a_newer_format_and_another_task_version_are_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained = drawn_policy("choice")
     path = write_policy(trained, tmp_path / "policy.safetensors")
     tensors, meta = load_checkpoint(path, format_name=POLICY_FORMAT)
@@ -283,6 +284,8 @@ def test_a_newer_format_and_another_task_version_are_explained(tmp_path: Path) -
             r"unknown setting 'config\.mood'.*written by esp 7\.0, this is 0\.1\.0",
         ),
     ):
-        save_checkpoint(path, tensors, changed, POLICY_FORMAT, version)
+        with monkeypatch.context() as patch:
+            patch.setattr(checkpoint, "_VERSION", version)
+            save_checkpoint(path, tensors, changed, POLICY_FORMAT)
         with pytest.raises(ValueError, match=sentence):
             load_policy(path)
