@@ -28,7 +28,7 @@ def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, 
     assert (result["task"], result["task_version"], result["episodes"]) == ("navigation", 1, 4)
     assert (result["source"], result["step"], result["seeds"]) == (str(finished), 150, [3, 7])
     assert set(result["anchors"]) == {"random", "heuristic", "cover"}
-    assert set(result["metrics"]) == {"collisions", "landmark_distance", "coverage"}
+    assert set(result["metrics"]) == {"collisions", "collisions_per_agent", "landmark_distance", "coverage"}
     for mode in ("greedy", "stochastic"):
         verdict = result[mode]
         assert set(verdict) == {"mean", "sem", "ci95", "per_seed"}
