@@ -27,58 +27,50 @@ EPILOG = """Examples:\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --at 500k --at 3M --threshold -125 --plot curves.png\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --out comparison"""
 
-RunsArgument = Annotated[
-    list[str],
-    typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
-]
-OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
-]
-ResultsOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--results",
-        help="Also write every seed's numbers and the configurations as JSON.",
-        callback=options.not_over_a_run,
-    ),
-]
-AtOption = Annotated[
-    list[str] | None,
-    typer.Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
-]
-ReferenceOption = Annotated[
-    list[str] | None, typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE")
-]
-ThresholdOption = Annotated[
-    list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
-]
-ModeOption = Annotated[
-    Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
-]
-LimitsOption = Annotated[
-    tuple[float, float] | None,
-    typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
-]
-CsvOption = Annotated[
-    Path | None,
-    typer.Option("--csv", help="Write every logged number of every seed as a table.", callback=options.not_over_a_run),
-]
-PlotOption = Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")]
-
 
 def report(
-    runs: RunsArgument,
-    out: OutOption = None,
+    runs: Annotated[
+        list[str],
+        typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
+    ] = None,
     films: Annotated[bool, typer.Option("--films", help="Draw the trained policies for the page.")] = False,
-    results: ResultsOption = None,
-    at: AtOption = None,
-    threshold: ThresholdOption = None,
-    reference: ReferenceOption = None,
-    mode: ModeOption = None,
-    y_limits: LimitsOption = None,
-    plot: PlotOption = None,
-    csv: CsvOption = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            "--results",
+            help="Also write every seed's numbers and the configurations as JSON.",
+            callback=options.not_over_a_run,
+        ),
+    ] = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
+    ] = None,
+    threshold: Annotated[
+        list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
+    ] = None,
+    reference: Annotated[
+        list[str] | None,
+        typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE"),
+    ] = None,
+    mode: Annotated[
+        Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
+    ] = None,
+    y_limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")] = None,
+    csv: Annotated[
+        Path | None,
+        typer.Option(
+            "--csv", help="Write every logged number of every seed as a table.", callback=options.not_over_a_run
+        ),
+    ] = None,
     task: options.OwnTaskOption = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,

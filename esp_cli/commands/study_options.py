@@ -35,54 +35,6 @@ if TYPE_CHECKING:
 else:
     StudySeedsOption = _changed(options.SeedsOption, show_default=str(len(STUDY_SEEDS)))
 
-TasksOption = Annotated[
-    list[str] | None,
-    typer.Option("--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's."),
-]
-AlgosOption = Annotated[
-    list[str] | None, typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's.")
-]
-StudyStepsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--steps",
-        "-n",
-        help="Environment steps per seed; several give a row each. 500k and 3M name the paper's rows, which formation "
-        "has at 200k and 1M; formation=500k is taken as it is.",
-        metavar="STEPS",
-    ),
-]
-StudyOutOption = Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.")]
-JobsOption = Annotated[
-    int | None,
-    typer.Option("--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."),
-]
-EngineOption = Annotated[
-    Literal["local", "ray"],
-    typer.Option("--engine", help="What runs the study: this machine, or the nodes of a Ray cluster."),
-]
-AddressOption = Annotated[
-    str | None,
-    typer.Option(
-        "--address",
-        help="Of the Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a cluster of this machine.",
-    ),
-]
-GpuShareOption = Annotated[
-    float, typer.Option("--gpu-share", min=0.01, max=1.0, help="Share of a GPU that a run takes on a Ray cluster.")
-]
-DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
-]
-ReuseOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--reuse",
-        help="Take finished runs of the same configuration from this study instead of training them again; may be "
-        "repeated.",
-    ),
-]
-
 
 def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
     """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix").
@@ -115,22 +67,62 @@ def parse_study_steps(items: Sequence[str] | None) -> tuple[tuple[str | None, in
 class StudyChoices:
     """The options that all study commands share: annotations hold flags and help, values what was given."""
 
-    tasks: TasksOption = None
-    algos: AlgosOption = None
-    steps: StudyStepsOption = None
+    tasks: Annotated[
+        list[str] | None,
+        typer.Option("--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's."),
+    ] = None
+    algos: Annotated[
+        list[str] | None,
+        typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's."),
+    ] = None
+    steps: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--steps",
+            "-n",
+            help="Environment steps per seed; several give a row each. 500k and 3M name the paper's rows, which "
+            "formation has at 200k and 1M; formation=500k is taken as it is.",
+            metavar="STEPS",
+        ),
+    ] = None
     seeds: StudySeedsOption = None
     seed_list: options.SeedListOption = None
-    out: StudyOutOption = None
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.")] = None
     preset: options.PresetOption = "default"
     settings: options.SetOption = None
     device: options.DeviceOption = "cpu"
     episodes: options.EpisodesOption = EPISODES
-    jobs: JobsOption = None
-    engine: EngineOption = "local"
-    address: AddressOption = None
-    gpu_share: GpuShareOption = 1.0
-    dry_run: DryRunOption = False
-    reuse: ReuseOption = None
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."
+        ),
+    ] = None
+    engine: Annotated[
+        Literal["local", "ray"],
+        typer.Option("--engine", help="What runs the study: this machine, or the nodes of a Ray cluster."),
+    ] = "local"
+    address: Annotated[
+        str | None,
+        typer.Option(
+            "--address",
+            help="Of the Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a cluster of this machine.",
+        ),
+    ] = None
+    gpu_share: Annotated[
+        float, typer.Option("--gpu-share", min=0.01, max=1.0, help="Share of a GPU that a run takes on a Ray cluster.")
+    ] = 1.0
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
+    ] = False
+    reuse: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--reuse",
+            help="Take finished runs of the same configuration from this study instead of training them again; may be "
+            "repeated.",
+        ),
+    ] = None
     no_check: options.NoCheckOption = False
     json: options.JsonOption = None
     words: Sequence[str] = field(init=False, default=())  # the command without these options: "reproduce", "table1"
