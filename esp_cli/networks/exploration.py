@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
 
 from esp_cli.networks.heads import MASKED, Categorical, Choice, Head, best, drawn, same_disc, squash
 from esp_envs.base import random_choice
@@ -93,11 +94,7 @@ class ExploringCategorical(ExploringChoice, Categorical):
         Gumbel), which is a draw from p. Backward: the gradient of softmax(log p + Gumbel).
         """
         gumbel = noise.clamp(1e-7, 1 - 1e-7).log_().neg_().log_().neg_()
-        soft = torch.softmax((log_probs + gumbel).movedim(-1, 1).contiguous(), 1)
-        with torch.no_grad():
-            largest = (soft == soft.amax(1, keepdim=True)).to(soft.dtype)
-            hard = largest.div_(largest.sum(1, keepdim=True))  # equal ones share the one
-        return (hard + (soft - soft.detach())).movedim(1, -1)
+        return _StraightThrough.apply(log_probs + gumbel)  # type: ignore[no-untyped-call]
 
     def penalty(self, log_probs: Tensor) -> Tensor:
         """Return the mean square of the centred logits, which keeps a policy from getting too sure: [S, B, N]."""
@@ -112,6 +109,24 @@ class ExploringCategorical(ExploringChoice, Categorical):
     def statistics(self, log_probs: Tensor) -> dict[str, Tensor]:
         """Return what is worth logging of the outputs: the entropy without epsilon, [S, B, N]."""
         return {"entropy": self.entropy(log_probs)}
+
+
+class _StraightThrough(Function):
+    """One-hot rows of the largest of logits [..., A], with the gradient of their softmax; equal ones share the one."""
+
+    @staticmethod
+    def forward(ctx, logits):  # type: ignore[no-untyped-def]
+        columns = logits.movedim(-1, 1).contiguous()
+        soft = torch.softmax(columns, 1)
+        ctx.save_for_backward(soft)
+        largest = (soft - soft.amax(1, keepdim=True)).sign_().add_(1)
+        return largest.div_(largest.sum(1, keepdim=True)).movedim(1, -1)
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        (soft,) = ctx.saved_tensors
+        inner = soft * grad.movedim(-1, 1)
+        return inner.addcmul_(soft, inner.sum(1, keepdim=True), value=-1).movedim(1, -1)
 
 
 class BoundedPoint(ExploringHead):
