@@ -20,24 +20,14 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from esp_cli.console.progress import TrainingProgress as TrainingProgress
-from esp_cli.console.progress import live_progress as live_progress
-from esp_cli.console.streams import SafeConsole
-from esp_cli.console.streams import err as err
-from esp_cli.console.streams import error as error
-from esp_cli.console.streams import fit_encoding as fit_encoding
-from esp_cli.console.streams import note as note
-from esp_cli.console.streams import out as out
-from esp_cli.console.streams import paged as paged
-from esp_cli.console.streams import say as say
-from esp_cli.console.streams import text as text
-from esp_cli.files.formatting import escaped
-from esp_cli.files.formatting import format_count as format_count  # also console's
-from esp_cli.files.formatting import format_duration as format_duration  # also console's
-from esp_cli.files.formatting import format_interval as format_interval  # also console's
-from esp_cli.files.formatting import format_mean as format_mean  # also console's
-from esp_cli.files.formatting import format_span as format_span  # also console's
+from esp_cli.console.progress import TrainingProgress, live_progress
+from esp_cli.console.streams import SafeConsole, err, error, fit_encoding, note, out, paged, say, text
+from esp_cli.files.formatting import escaped, format_count, format_duration, format_interval, format_mean, format_span
 from esp_cli.files.writing import write_file
+
+__all__ = ["TrainingProgress", "err", "error", "fit_encoding", "format_count", "format_duration", "format_interval"]
+__all__ += ["format_mean", "format_span", "live_progress", "note", "out", "paged", "say", "text"]  # of its parts
+__all__ += ["lay_out", "result", "table", "write_json"]
 
 _LEAST_TEXT = 14  # columns that a longer text gets at least; narrower ones are hard to read
 PIPE_WIDTH = 200  # columns of a table written to a file or a pipe, which has no width of its own
