@@ -24,7 +24,7 @@ from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
-from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.robot import Arena
 from esp_envs.errors import UserError
 
 STATES = 10_000  # states on which the observations built from poses are compared with the task's

@@ -26,10 +26,9 @@ from rich.console import Console
 from rich.table import Table
 
 from esp_envs import make
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import ENGINES, make_physics
 from esp_envs.epuck.physics import Bodies
-from esp_envs.epuck.robot import MAX_WHEEL_SPEED
+from esp_envs.epuck.robot import MAX_WHEEL_SPEED, Arena
 
 ARENA = Arena(side_m=2.0, num_robots=8, num_pillars=2, pillar_radius_m=0.1)
 PERIOD_S = 0.1

@@ -17,7 +17,7 @@ import pytest
 from esp_cli.export import c_file, check, epuck
 from esp_cli.export.export import export
 from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
-from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.robot import Arena
 from tests.export.policies import drawn_policy, imported
 
 needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")

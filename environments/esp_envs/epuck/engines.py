@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.physics import Physics
+from esp_envs.epuck.robot import Arena
 from esp_envs.errors import UserError
 from esp_envs.installed import load
 

@@ -8,7 +8,7 @@ from pydantic import Field as Setting
 from pydantic import model_validator
 from torch import Tensor
 
-from esp_envs.epuck.arena import Arena
+from esp_envs.epuck.robot import Arena
 from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, TaskSpec, filled_layout, layout
 

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
 from esp_envs.epuck.robot import (
     AXLE_M,
@@ -25,6 +24,7 @@ from esp_envs.epuck.robot import (
     MASS_KG,
     WHEEL_MASS_KG,
     WHEEL_RADIUS_M,
+    Arena,
     Array,
     chord,
 )

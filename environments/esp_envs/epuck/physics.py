@@ -8,8 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from esp_envs.epuck.arena import Arena
-from esp_envs.epuck.robot import Array
+from esp_envs.epuck.robot import Arena, Array
 from esp_envs.errors import UserError
 
 TIMESTEP_S = 0.01

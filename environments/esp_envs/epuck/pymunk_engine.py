@@ -16,9 +16,8 @@ import numpy as np
 import pymunk
 from pymunk.batch import BodyFields, Buffer, get_space_bodies, set_space_bodies
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
-from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, MASS_KG, Array, chord
+from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, MASS_KG, Arena, Array, chord
 
 ITERATIONS = 100  # iterations of the solver, which treats contacts in turn; with these many their order does not matter
 CONTACT_SLOP_M = 1e-4  # overlap that is left alone

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.physics import Bodies, Physics
-from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED, Array
+from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED, Arena, Array
 
 PERIOD_S = 0.1
 

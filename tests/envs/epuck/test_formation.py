@@ -12,9 +12,8 @@ from torch import Tensor
 from esp_envs import make
 from esp_envs.epuck import formation_rules as rules
 from esp_envs.epuck import formation_spec
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.formation import Formation
-from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S
+from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Arena
 from tests.envs.playing import episode_return
 
 PERIOD_S = 0.1

@@ -8,9 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import ENGINES, make_physics
-from esp_envs.epuck.robot import MAX_SPEED_M_S, Array
+from esp_envs.epuck.robot import MAX_SPEED_M_S, Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, engine
 
 OPEN = Arena(2.0, 1, 0, 0.1)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import ENGINES
-from esp_envs.epuck.robot import BODY_RADIUS_M, MASS_KG, MAX_SPEED_M_S, MAX_WHEEL_SPEED, Array
+from esp_envs.epuck.robot import BODY_RADIUS_M, MASS_KG, MAX_SPEED_M_S, MAX_WHEEL_SPEED, Arena, Array
 from tests.envs.epuck.driving import (
     PERIOD_S,
     at_posts,

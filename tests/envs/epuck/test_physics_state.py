@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import ENGINES, make_physics
 from esp_envs.epuck.physics import Physics
-from esp_envs.epuck.robot import Array
+from esp_envs.epuck.robot import Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, at_posts, at_random, bodies, engine, gap_between_robots, to_the_middle
 
 ARENA = Arena(1.0, 8, 2, 0.06)

@@ -8,9 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from esp_envs.epuck.arena import Arena
 from esp_envs.epuck.engines import ENGINES
-from esp_envs.epuck.robot import Array
+from esp_envs.epuck.robot import Arena, Array
 from tests.envs.epuck.driving import (
     at_posts,
     at_random,
