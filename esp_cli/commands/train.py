@@ -53,7 +53,7 @@ def train(
         str | None,
         typer.Option(
             "--network",
-            help="mlp, gru (recurrent), mpn (message passing), empn (equivariant mpn), equivariant, or module:Class.",
+            help="mlp, gru (recurrent), set, set-equivariant, mpn (message passing), empn, equivariant or module:Class",
         ),
     ] = None,
     steps: options.StepsOption = STEPS,

@@ -30,6 +30,7 @@ NETWORKS: Registry[NetworkConfig] = Registry(
         "mpn": "esp_cli.networks.message_passing:MpnConfig",
         "empn": "esp_cli.networks.message_passing:EmpnConfig",
         "set": "esp_cli.networks.sets:SetConfig",
+        "set-equivariant": "esp_cli.networks.set_equivariant:SetEquivariantConfig",
         "equivariant": "esp_cli.networks.constrained:EquivariantConfig",
     },
     base="esp_cli.networks.contract:NetworkConfig",

@@ -37,6 +37,11 @@ class SetShape(CompiledConfig, ABC):
         0, ge=0, le=4096, description="how many of each set an agent looks at, the nearest ones; 0: all of them"
     )
 
+    @property
+    def rows(self) -> type[Rows]:
+        """What splits the rows of such a network."""
+        return Rows
+
 
 class Rows:
     """Splits rows into the own numbers and the numbers of the things of each family, in parts that stand side by side.
@@ -70,22 +75,27 @@ class Rows:
 
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
         """Return the own numbers [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
+        own, things = self.numbers(x)
+        return own, [[numbers, *far] for numbers, far in zip(things, self.distances(things), strict=True)]
+
+    def numbers(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """Return the own numbers [S, B, d] and those of the things of each family [S, B, K, .], undescribed."""
         x = self._from_the_middle(x) if self._places else x
         own = torch.cat([x[..., where] for where in self._own], -1) if self._own else x[..., :0]
-        things, places = [], []
+        things = []
         for family, at in zip(self.families, self._offsets, strict=True):
-            numbers = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
-            if at is not None:
-                joined = numbers[0] if len(numbers) == 1 else torch.cat(numbers, -1)
-                numbers = [_nearest(joined, at, self._near)]
-                places.append(numbers[0][..., at : at + 2])
-            things.append(numbers)
-        compiled = bool(places) and computes(self.compiled, x)
-        distances = iter((compiled_distances if compiled else distances_among)(places))
-        for numbers, at in zip(things, self._offsets, strict=True):
-            if at is not None:
-                numbers.append(next(distances))
+            parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
+            joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+            things.append(joined if at is None else _nearest(joined, at, self._near))
         return own, things
+
+    def distances(self, things: Sequence[Tensor]) -> list[list[Tensor]]:
+        """Return for each family the distances of its things, [S, B, K, .], or nothing where they have no place."""
+        each = zip(things, self._offsets, strict=True)
+        places = [numbers[..., at : at + 2] for numbers, at in each if at is not None]
+        compiled = bool(places) and computes(self.compiled, places[0])
+        found = iter((compiled_distances if compiled else distances_among)(places) if places else [])
+        return [[] if at is None else [next(found)] for at in self._offsets]
 
     def _from_the_middle(self, x: Tensor) -> Tensor:
         places = torch.cat([x[..., where] for where in self._places], -1)
@@ -207,7 +217,7 @@ class TeamFeatures(nn.Module):
         if compiled:
             begin("sets")
         layout = io.layout if io.reads == "state" else spaces.observation
-        rows = Rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
+        rows = config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
         self.encoder = SetEncoder(generators, rows, config)
         self.num_agents = spaces.num_agents if joint else 0
         found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []

@@ -38,12 +38,7 @@ class SetConfig(SetShape):
         Raises:
             UserError: an actor whose observation shows no like things.
         """
-        io = self.io_or_refuse(io)
-        if io.num_values is None and not io.spaces.observation.families:
-            raise UserError(
-                f"{self.name} reads sets of like things, but {io.spaces.label} shows none; say which fields are some "
-                "(Field.family), or use mlp"
-            )
+        io = sets_or_refuse(self.name, self.io_or_refuse(io))
         return SetNetwork(generators, io, outputs, self, output_gain)
 
     def joint_critic(
@@ -59,6 +54,16 @@ class SetConfig(SetShape):
     def least_parameters(self, inputs: int) -> int:
         """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
         return self.width + self.hidden[0]
+
+
+def sets_or_refuse(name: str, io: IoSpec) -> IoSpec:
+    """Return what a network reads, where an actor sees like things; else raise a UserError."""
+    if io.num_values is None and not io.spaces.observation.families:
+        raise UserError(
+            f"{name} reads sets of like things, but {io.spaces.label} shows none; say which fields are some "
+            "(Field.family), or use mlp"
+        )
+    return io
 
 
 class SetNetwork(Memoryless):

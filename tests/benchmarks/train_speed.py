@@ -42,12 +42,19 @@ PEER_LAYOUT: dict[str, object] = {
 PLAIN: dict[str, object] = {"prior.kind": "none"}
 BFLOAT16: dict[str, object] = {"network.precision": "bfloat16"}
 GRU: dict[str, object] = {"network.name": "gru"}
+STATE: dict[str, object] = PLAIN | {"mappo.critic_input": "state", "network.compiled": True}
+SET: dict[str, object] = STATE | {"network.name": "set"}
+EIGHT: dict[str, object] = {"task.num_agents": 8}
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "mappo 128 x 25, 10 x 1, plain": ("mappo", PEER_LAYOUT | PLAIN),
     "mappo 128 x 25, 10 x 1, plain, bfloat16": ("mappo", PEER_LAYOUT | PLAIN | BFLOAT16),
     "mappo default, plain": ("mappo", PLAIN),
     "mappo default, esp": ("mappo", {}),
     "mappo default, esp, bfloat16": ("mappo", BFLOAT16),
+    "mappo compiled, 3 agents": ("mappo", STATE),
+    "mappo set, 3 agents": ("mappo", SET),
+    "mappo compiled, 8 agents": ("mappo", STATE | EIGHT),
+    "mappo set, 8 agents": ("mappo", SET | EIGHT),
     "maddpg, plain": ("maddpg", PLAIN),
     "maddpg, esp": ("maddpg", {}),
     "qmix, plain": ("qmix", PLAIN),
@@ -105,7 +112,7 @@ def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, ob
         "seed_steps_per_second": statistics.median(rates),
         "most": max(rates),
     }
-    if isinstance(learner, Mappo):
+    if isinstance(learner, Mappo) and hasattr(learner.policy.actor, "layers"):
         work = flops_per_step(learner)
         rows = learner.config.chunk_steps // seeds * learner.spec.num_agents
         rate = matrix_rate(seeds, rows, str(overrides.get("network.precision", "float32")), device)

@@ -9,6 +9,7 @@ from esp_cli.networks.build import build_network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.plain import MlpConfig
+from esp_cli.networks.set_equivariant import SetEquivariantConfig
 from esp_cli.networks.set_features import Rows, distances_among
 from esp_cli.networks.sets import SetConfig
 from esp_cli.training.build import build_learner
@@ -97,7 +98,9 @@ def reordered(spec, obs, name, order):
     return out
 
 
-@pytest.mark.parametrize(("config", "holds"), [(SetConfig(), True), (MlpConfig(), False)])
+@pytest.mark.parametrize(
+    ("config", "holds"), [(SetConfig(), True), (SetEquivariantConfig(), True), (MlpConfig(), False)]
+)
 @pytest.mark.parametrize(("field", "order"), [("landmarks", [2, 0, 1]), ("others", [1, 0])])
 def test_the_order_of_like_things_changes_nothing(config, holds, field, order):
     spec, seen = scene()
@@ -272,3 +275,55 @@ def test_qmix_learns_with_a_mixer_over_a_set():
 
 
 OFF = {"maddpg.num_envs": 4, "maddpg.batch_episodes": 4, "maddpg.warmup_episodes": 2}
+
+
+def turned(spec, x, element, reads):
+    """Apply a turn or mirror of the plane, a matrix [2, 2], to every vector of rows."""
+    out = x.clone()
+    for field, where in zip(spec.fields, spec.slices().values(), strict=True):
+        assert field.kind == Kind.VECTOR
+        out[..., where] = (x[..., where].unflatten(-1, (-1, 2)) @ element.T).flatten(-2)
+    return out
+
+
+TURNS = {
+    "rot90": torch.tensor([[0.0, -1.0], [1.0, 0.0]]),
+    "flip": torch.tensor([[-1.0, 0.0], [0.0, 1.0]]),
+    "by 1 rad": torch.tensor([[math.cos(1), -math.sin(1)], [math.sin(1), math.cos(1)]]),
+}
+
+
+@pytest.mark.parametrize("task", ["navigation", "predator-prey"])
+@pytest.mark.parametrize("element", TURNS)
+def test_a_force_turns_with_what_is_seen_and_a_value_does_not(task, element):
+    env = make(task, 6, [0, 1], {"actions": "continuous"})
+    spec, matrix = env.spec, TURNS[element]
+    env.reset()
+    seen = env.step(env.random_action()).next
+    for config, holds in ((SetEquivariantConfig(), True), (SetConfig(), False)):
+        io = IoSpec(spec, "own")
+        actor = joint(spec, lambda g, _, config=config, io=io: build_network(g, 0, 2, config, 1.0, io), "own")
+        rows = seen.obs.flatten(1, 2)
+        force, other = actor(rows), actor(turned(spec.observation, rows, matrix, "own"))
+        assert force.abs().amax() > 1e-2
+        assert bool((force @ matrix.T - other).abs().amax() < 1e-4) is holds
+        critic = network(spec, "state", config)
+        gap = critic(seen.state) - critic(turned(spec.state, seen.state, matrix, "state"))
+        assert bool(gap.abs().amax() < 1e-4) is holds
+
+
+@pytest.mark.parametrize("element", ["rot90", "flip"])
+def test_preferences_among_moves_change_places_when_the_scene_turns(element):
+    spec, seen = scene()
+    actor, rows, matrix = network(spec, config=SetEquivariantConfig()), seen.obs.flatten(1, 2), TURNS[element]
+    points = torch.tensor(spec.action.points)
+    goes_to = [int((points - points[a] @ matrix.T).norm(dim=-1).argmin()) for a in range(5)]
+    logits, other = actor(rows), actor(turned(spec.observation, rows, matrix, "own"))
+    torch.testing.assert_close(other[..., goes_to], logits, **CLOSE)
+    assert (other - logits).abs().amax() > 1e-2, "negative control: the scene did turn"
+
+
+def test_what_has_no_direction_is_refused_by_the_equivariant_network():
+    wheels = make("formation", 1, [0], {"actions": "discrete"}).spec
+    with pytest.raises(UserError, match="acts along directions of the plane; use set"):
+        network(wheels, config=SetEquivariantConfig())
