@@ -1,0 +1,130 @@
+"""PPO of rsl_rl for recurrent policies, with whole mirrored histories: `class_name: rsl_rl_recurrent:MirroredPPO`.
+
+rsl_rl refuses symmetry for recurrent networks, since the hidden state of an original is not that of its mirror image.
+Here each mirror has hidden states of its own: while data is collected, actor and critic also see the mirrored
+observations, from the first step of each episode. Training then sees mirrored trajectories with their own states.
+`esp mirror ROBOT.xml --emit rsl_rl -o my_mirror.py` writes the module that is named as `mirror`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+State = torch.Tensor | tuple[torch.Tensor, ...] | None
+
+
+def parts_of(state: State) -> tuple[torch.Tensor, ...]:
+    """Return the tensors [layers, envs, width] of a hidden state: one of a GRU, two of an LSTM, none before a start."""
+    return () if state is None else state if isinstance(state, tuple) else (state,)
+
+
+class MirroredPPO(PPO):
+    """PPO whose batches hold each trajectory, then its image under each element of a mirror.
+
+    Args:
+        mirror: the module that `esp mirror` wrote, or its name.
+        others: those of PPO; `symmetry_cfg` stays None.
+    """
+
+    def __init__(self, *args: Any, mirror: str | ModuleType, **others: Any) -> None:
+        super().__init__(*args, **others)
+        self.mirror = import_module(mirror) if isinstance(mirror, str) else mirror
+        self.models = (self.actor, self.critic)
+        self.states: dict[tuple[str, int], State] = {}
+        self.saved: dict[tuple[str, int], list[torch.Tensor]] = {}
+
+    def image(self, obs: TensorDict, element: str) -> TensorDict:
+        """Return observations under an element."""
+        moved = {group: self.mirror.mirrored(obs[group], element, group) for group in obs.keys()}  # noqa: SIM118
+        return TensorDict(moved, batch_size=obs.batch_size)
+
+    def act(self, obs: TensorDict) -> torch.Tensor:
+        """Sample actions, and let each mirror's hidden states see the mirrored observations."""
+        actions = super().act(obs)
+        for element in self.mirror.ELEMENTS:
+            seen = self.image(obs, element)
+            for k, model in enumerate(self.models):
+                own, key = model.get_hidden_state(), (element, k)
+                self.keep(key, self.states.get(key))
+                model.reset(hidden_state=self.states.get(key))
+                with torch.no_grad():
+                    model(seen)
+                self.states[key] = model.get_hidden_state()
+                model.reset(hidden_state=own)
+        return actions
+
+    def keep(self, key: tuple[str, int], state: State) -> None:
+        """Store a hidden state from before the current step: [steps, layers, envs, width] by part."""
+        steps, now = self.storage.num_transitions_per_env, self.storage.step
+        for part, tensor in enumerate(parts_of(state)):
+            buffers = self.saved.setdefault(key, [])
+            if part == len(buffers):
+                buffers.append(torch.zeros(steps, *tensor.shape, device=tensor.device))
+            buffers[part][now] = tensor
+
+    def process_env_step(self, obs: TensorDict, rewards: Any, dones: torch.Tensor, extras: Any) -> None:
+        """Record a step; hidden states of episodes that ended begin anew, those of mirrors too."""
+        super().process_env_step(obs, rewards, dones, extras)
+        for state in self.states.values():
+            for tensor in parts_of(state):
+                tensor[..., dones == 1, :] = 0.0
+
+    def update(self) -> dict[str, float]:
+        """Train on the trajectories and their images."""
+        generate = self.storage.recurrent_mini_batch_generator
+        self.storage.recurrent_mini_batch_generator = lambda *args: map(
+            self.with_images, self.numbered(generate(*args))
+        )
+        try:
+            return super().update()
+        finally:
+            del self.storage.recurrent_mini_batch_generator
+
+    def numbered(self, batches: Iterator[Any]) -> Iterator[tuple[int, Any]]:
+        """Yield each batch with the number of its first trajectory; every epoch counts anew."""
+        first = 0
+        for k, batch in enumerate(batches):
+            first *= k % self.num_mini_batches > 0
+            count = batch.masks.shape[1]
+            yield first, batch
+            first += count
+
+    def with_images(self, numbered: tuple[int, Any]) -> RolloutStorage.Batch:
+        """Return a batch followed by its image under each element, along the axis of trajectories and environments."""
+        first, batch = numbered
+        starts = torch.ones_like(self.storage.dones.squeeze(-1), dtype=torch.bool)
+        starts[1:] = self.storage.dones.squeeze(-1)[:-1].bool()
+        chosen = slice(first, first + batch.masks.shape[1])
+        elements, mirrored = self.mirror.ELEMENTS, self.mirror.mirrored
+
+        def state(k: int) -> State:
+            parts = [[part] for part in parts_of(batch.hidden_states[k])]
+            for element in elements:
+                for part, saved in zip(parts, self.saved.get((element, k), []), strict=True):
+                    part.append(saved.permute(2, 0, 1, 3)[starts.T][chosen].transpose(0, 1))
+            joined = tuple(torch.cat(part, 1).contiguous() for part in parts)
+            return joined[0] if len(joined) == 1 else joined or None
+
+        def images(rows: torch.Tensor) -> torch.Tensor:
+            return torch.cat([rows, *(mirrored(rows, element) for element in elements)], 1)
+
+        def again(rows: torch.Tensor) -> torch.Tensor:
+            return torch.cat([rows] * (1 + len(elements)), 1)
+
+        mean, *spreads = batch.old_distribution_params
+        batch.hidden_states = (state(0), state(1))
+        seen = [batch.observations, *(self.image(batch.observations, element) for element in elements)]
+        batch.observations = torch.cat(seen, 1)
+        batch.actions, batch.masks = images(batch.actions), again(batch.masks)
+        batch.old_distribution_params = (images(mean), *(images(spread).abs() for spread in spreads))
+        for name in ("values", "advantages", "returns", "old_actions_log_prob"):
+            setattr(batch, name, again(getattr(batch, name)))
+        return batch

@@ -1,0 +1,108 @@
+"""Recurrent PPO of rsl_rl with mirrored histories: hidden states of mirrors are those of the whole mirrored history."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("rsl_rl.algorithms")
+from rsl_rl.models import RNNModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+
+from esp_cli import Body, Field, Kind, layout
+from esp_cli.bodies.emitting import emitted
+from tests.bodies.test_emitting import imported
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+from rsl_rl_recurrent import MirroredPPO
+
+ENVS, STEPS = 6, 10
+GROUPS = {"actor": ["policy"], "critic": ["policy"]}
+
+
+@pytest.fixture
+def mirror(tmp_path):
+    body = Body(["left", "right"], {"left": "-right"})
+    seen = layout(Field("cue", Kind.PSEUDOSCALAR), Field("clock", Kind.SCALAR), body.positions())
+    return imported(emitted(body, {"policy": seen, "action": layout(body.positions())}, "two"), tmp_path)
+
+
+def learner(mirror, kind="gru", seed=0, **settings) -> MirroredPPO:
+    torch.manual_seed(seed)
+    obs = TensorDict({"policy": torch.zeros(ENVS, 4)}, batch_size=[ENVS])
+    shape = {"hidden_dims": [16], "rnn_type": kind, "rnn_hidden_dim": 8}
+    gauss = {"class_name": "GaussianDistribution", "init_std": 0.5}
+    actor = RNNModel(obs, GROUPS, "actor", 2, distribution_cfg=gauss, **shape)
+    storage = RolloutStorage("rl", ENVS, STEPS, obs, [2])
+    return MirroredPPO(actor, RNNModel(obs, GROUPS, "critic", 1, **shape), storage, mirror=mirror, num_mini_batches=2,
+                       num_learning_epochs=2, **settings)  # fmt: skip
+
+
+def train(ppo: MirroredPPO) -> dict[str, float]:
+    with torch.inference_mode():
+        ppo.compute_returns(TensorDict({"policy": torch.zeros(ENVS, 4)}, batch_size=[ENVS]))
+    return ppo.update()
+
+
+def collect(ppo: MirroredPPO, rollouts: int = 1) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Play random observations in episodes of 7 steps; return observations and ends."""
+    generator, history = torch.Generator().manual_seed(1), []
+    for step in range(rollouts * STEPS):
+        if step and step % STEPS == 0:
+            train(ppo)
+        obs = torch.randn(ENVS, 4, generator=generator)
+        dones = torch.arange(ENVS) % 7 == step % 7
+        with torch.inference_mode():  # as the runner does
+            ppo.act(TensorDict({"policy": obs}, batch_size=[ENVS]))
+            ppo.process_env_step(None, torch.randn(ENVS, generator=generator), dones, {})
+        history.append((obs, dones))
+    return history
+
+
+@pytest.mark.parametrize("kind", ["gru", "lstm"])
+def test_states_of_mirrors_are_those_of_whole_mirrored_histories(mirror, kind):
+    ppo = learner(mirror, kind)
+    history = collect(ppo)
+    state = None
+    for obs, dones in history:
+        ppo.actor.reset(hidden_state=state)
+        ppo.actor(TensorDict({"policy": mirror.mirrored(obs, "flip-x", "policy")}, batch_size=[ENVS]))
+        state = ppo.actor.get_hidden_state()
+        ppo.actor.reset(dones)
+    kept = ppo.states["flip-x", 0]
+    assert torch.equal(kept[0] if kind == "lstm" else kept, state[0] if kind == "lstm" else state)
+
+
+def test_a_batch_holds_each_trajectory_and_its_image(mirror):
+    ppo = learner(mirror)
+    collect(ppo, 2)  # trajectories that go on from an earlier rollout have states that are not 0
+    batches = list(map(ppo.with_images, ppo.numbered(ppo.storage.recurrent_mini_batch_generator(2, 2))))
+    assert len(batches) == 4
+    for batch in batches:
+        half = batch.masks.shape[1] // 2
+        assert torch.equal(batch.masks[:, :half], batch.masks[:, half:])
+        own, image = batch.observations["policy"].split(half, 1)
+        assert torch.equal(image, own[..., [0, 1, 3, 2]] * torch.tensor([-1, 1, -1, -1]))
+        assert torch.equal(batch.actions[:, 3:], -batch.actions[:, :3][..., [1, 0]])
+        assert torch.equal(batch.returns[:, :3], batch.returns[:, 3:])
+        states = batch.hidden_states[0].split(half, 1)
+        assert not torch.equal(*states)
+        # in batch mode, outputs on images are those that the mirrored stream gave while data was collected
+    first = batches[0]
+    half = first.masks.shape[1] // 2
+    ppo.actor(first.observations, masks=first.masks, hidden_state=first.hidden_states[0])
+    assert ppo.saved["flip-x", 0][0][0].abs().sum() > 0
+    started = ppo.saved["flip-x", 0][0][0][:, 0]
+    assert torch.equal(first.hidden_states[0][:, half], started)
+
+
+def test_training_uses_the_images_and_leaves_the_storage_as_it_was(mirror):
+    ppo = learner(mirror)
+    collect(ppo, 3)
+    losses = train(ppo)
+    assert all(torch.isfinite(torch.tensor(x)) for x in losses.values())
+    assert "recurrent_mini_batch_generator" not in vars(ppo.storage)
