@@ -160,7 +160,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--set", "mappo.learning_rate=Infinity"], "it has to be a finite number"),
         (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is not a setting"),
         (["--set", "task.prey=still"], "unknown setting 'task.prey'"),
-        (["--set", "task.num_agents=99"], "bad value 99 for 'task.num_agents'"),
+        (["--set", "task.num_agents=0"], "bad value 0 for 'task.num_agents'"),
         (["--task", "predator-prey", "--set", "task.prey=policy"], "give both or neither"),
     ],
 )
