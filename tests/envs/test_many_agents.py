@@ -11,7 +11,7 @@ import torch
 
 from esp_cli.training.play import ScriptedController, play
 from esp_envs import make
-from esp_envs.mpe import covering
+from esp_envs.mpe import covering, many
 
 
 @pytest.mark.parametrize("settings", [{}, {"convention": "pettingzoo"}, {"num_landmarks": 4}, {"reward_offset": 0.5}])
@@ -27,6 +27,26 @@ def test_pairs_by_broadcasting_are_those_of_the_list(agents, settings):
         torch.testing.assert_close(here.reward, there.reward, atol=1e-4, rtol=1e-6)
         for name, value in here.metrics.items():
             torch.testing.assert_close(value, there.metrics[name], atol=1e-6, rtol=0)
+
+
+def test_what_a_tree_finds_is_what_all_pairs_show(monkeypatch):
+    settings = {"num_agents": 30, "num_landmarks": 20, "sees": 4}
+    pairs, tree = (make("navigation", 3, [0, 1], settings) for _ in range(2))
+    state = pairs.reset().state
+    state[..., 60:64] = 0.5  # two agents in one place
+    pairs.set_state(state)
+    monkeypatch.setattr(many, "BY_TREE", 1)
+    tree.set_state(state)
+    for _ in range(10):
+        action = pairs.heuristic()
+        monkeypatch.setattr(many, "BY_TREE", 1)
+        there = tree.step(action)
+        monkeypatch.setattr(many, "BY_TREE", 99)
+        here = pairs.step(action)
+        torch.testing.assert_close(here.next.state, there.next.state, atol=1e-4, rtol=0)
+        torch.testing.assert_close(here.next.obs, there.next.obs, atol=1e-4, rtol=0)
+        for name, value in here.metrics.items():
+            torch.testing.assert_close(value, there.metrics[name], atol=1e-5, rtol=0)
 
 
 def test_contacts_happen_in_what_is_compared_above():

@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 LOOKAHEAD_S = 0.2
@@ -65,6 +64,8 @@ def assigned(position: Tensor, landmark: Tensor) -> Tensor:
     Returns:
         The goals [N, 2, W]; agents left over when all landmarks are taken stay where they are.
     """
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - few need it, and it takes long to import
+
     goals = position.clone()
     for world in range(position.shape[2]):
         here, there = position[:, :, world], landmark[:, :, world]

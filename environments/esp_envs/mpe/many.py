@@ -9,6 +9,8 @@ from esp_envs.mpe.particles import CONTACT_MARGIN, Bodies, ParticleWorlds, conta
 
 MOST_BODIES = 8
 """Agents up to which pairs are listed and observations are one matrix product, which is faster for few of them."""
+BY_TREE = 200
+"""Agents from which on the near ones are found by a tree, on the CPU: N log N, where all pairs are N^2."""
 _PAIRS = 1 << 21
 """Pairs that are looked at together."""
 _NO_PUSH = 60 * CONTACT_MARGIN
@@ -43,22 +45,54 @@ class ManyWorlds(ParticleWorlds):
         super().__init__(bodies, num_worlds, device, velocity_first)
 
     def measure(self) -> None:
-        """Look at all pairs in their present positions."""
-        agents, near = self.bodies.num_agents, []
-        for worlds in self._chunks:
-            x, y = self.entity[:, :, worlds].permute(1, 2, 0).contiguous()  # [w, bodies] each
-            square = (x[:, :agents, None] - x[:, None]).square_()
-            square += (y[:, :agents, None] - y[:, None]).square_()
-            others, landmarks = square[:, :, :agents], square[:, :, agents:]
-            others.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-            self.touching[:, worlds] = (others < self._reach**2).sum(2).t().to(x.dtype)
-            self.squared_to_landmarks[:, worlds] = landmarks.amin(1).t()
-            world, first, second = (others < (self._reach + _NO_PUSH) ** 2).nonzero().unbind(1)
-            near.append(torch.stack([world + worlds.start, first, second]))
-            if self.seen_agents is not None and self.seen_landmarks is not None:
-                self.seen_agents[worlds] = _nearest(others, self._sees[0])
-                self.seen_landmarks[worlds] = _nearest(landmarks, self._sees[1])
+        """Look at all pairs in their present positions, or at the near ones where they are found by a tree."""
+        by_tree = (
+            self.seen_agents is not None and self.bodies.num_agents >= BY_TREE and self.entity.device.type == "cpu"
+        )
+        if by_tree:
+            near = [self._measure_by_tree(world) for world in range(self.num_worlds)]
+        else:
+            near = [self._measure_all(worlds) for worlds in self._chunks]
         self._near = torch.cat(near, 1)
+
+    def _measure_all(self, worlds: slice) -> Tensor:
+        """Look at all pairs of some worlds; return (world, agent, agent) of those that are near, [3, P]."""
+        agents = self.bodies.num_agents
+        x, y = self.entity[:, :, worlds].permute(1, 2, 0).contiguous()  # [w, bodies] each
+        square = (x[:, :agents, None] - x[:, None]).square_()
+        square += (y[:, :agents, None] - y[:, None]).square_()
+        others, landmarks = square[:, :, :agents], square[:, :, agents:]
+        others.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+        self.touching[:, worlds] = (others < self._reach**2).sum(2).t().to(x.dtype)
+        self.squared_to_landmarks[:, worlds] = landmarks.amin(1).t()
+        if self.seen_agents is not None and self.seen_landmarks is not None:
+            self.seen_agents[worlds] = _nearest(others, self._sees[0])
+            self.seen_landmarks[worlds] = _nearest(landmarks, self._sees[1])
+        world, first, second = (others < (self._reach + _NO_PUSH) ** 2).nonzero().unbind(1)
+        return torch.stack([world + worlds.start, first, second])
+
+    def _measure_by_tree(self, world: int) -> Tensor:
+        """Find the near pairs of one world; see `_measure_all`."""
+        from scipy.spatial import KDTree  # noqa: PLC0415 - few need it, and it takes long to import
+
+        assert self.seen_agents is not None
+        assert self.seen_landmarks is not None
+        agents = self.bodies.num_agents
+        entity = self.entity[:, :, world].contiguous()
+        position, landmark = entity[:agents], entity[agents:]
+        tree, others, landmarks = KDTree(position.numpy()), *self._sees
+        found = torch.from_numpy(tree.query(position.numpy(), k=range(1, others + 2))[1])
+        itself = found == torch.arange(agents).unsqueeze(1)  # once in a row, unless many are in one place
+        self.seen_agents[world] = found.gather(1, itself.int().argsort(dim=1, stable=True)[:, :others])
+        ranks = range(1, landmarks + 1)
+        self.seen_landmarks[world] = torch.from_numpy(KDTree(landmark.numpy()).query(position.numpy(), k=ranks)[1])
+        nearest = position[torch.from_numpy(tree.query(landmark.numpy())[1])]
+        self.squared_to_landmarks[:, world] = (nearest - landmark).square().sum(1)
+        pairs = torch.from_numpy(tree.query_pairs(self._reach + _NO_PUSH, output_type="ndarray")).long()
+        pairs = torch.cat([pairs, pairs.flip(1)])
+        touch = (position[pairs[:, 0]] - position[pairs[:, 1]]).square().sum(1) < self._reach**2
+        self.touching[:, world] = torch.bincount(pairs[touch, 0], minlength=agents).float()
+        return torch.cat([torch.full((1, len(pairs)), world), pairs.t()])
 
     def _contact_impulses(self) -> Tensor:
         """Return the velocity change [A, 2, W'] that contacts cause in one step."""
