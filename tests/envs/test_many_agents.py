@@ -142,3 +142,20 @@ def test_the_hand_written_policy_beats_chance_with_fifty_agents():
         played = play(env, ScriptedController(policy))
         distance[name] = float(played.metrics["landmark_distance"].mean())
     assert distance["greedy"] < 0.6 * distance["random"]
+
+
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [
+        ("predator-prey", {"num_predators": 24}),
+        ("wildlife", {"num_agents": 60, "width": 21, "height": 21}),
+        ("formation", {"num_agents": 24, "arena_m": 5.0}),
+    ],
+)
+def test_the_other_tasks_take_many_agents_too(task, settings):
+    env = make(task, 2, [0], settings)
+    env.reset()
+    for _ in range(3):
+        step = env.step(env.heuristic())
+        assert bool(step.next.obs.isfinite().all())
+        assert step.reward.shape[-1] in settings.values()

@@ -39,7 +39,7 @@ class FormationSettings(TaskSettings):
     physics: Literal["mujoco", "mujoco-3d", "pymunk"] = Setting(
         "mujoco", description="planar MuJoCo, MuJoCo with wheels and casters, or pymunk"
     )
-    num_agents: int = Setting(8, ge=1, le=16, description="N, robots")
+    num_agents: int = Setting(8, ge=1, le=64, description="N, robots")
     num_obstacles: int = Setting(2, ge=0, le=8, description="M, pillars on a ring around the middle")
     obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
     arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")

@@ -17,7 +17,7 @@ from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 class PredatorPreySettings(ParticleSettings):
     """What a user may change of `predator-prey`."""
 
-    num_predators: int = Setting(3, ge=1, le=8, description="predators; 3 in the paper")
+    num_predators: int = Setting(3, ge=1, le=64, description="predators; 3 in the paper")
     num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
     control: Literal["predators", "prey"] = Setting(
         "predators", description="who learns; with 'prey' the predators follow the greedy heuristic"

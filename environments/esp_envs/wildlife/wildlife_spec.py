@@ -25,7 +25,7 @@ class WildlifeSettings(TaskSettings):
         "esp",
         description="whose rules: 'esp' is van der Pol's code, which the paper used, 'corrected' has its quirks mended",
     )
-    num_agents: int = Setting(3, ge=2, le=16, description="N, drones; van der Pol: 3")
+    num_agents: int = Setting(3, ge=2, le=256, description="N, drones; van der Pol: 3")
     width: int = Setting(7, ge=3, le=63, description="columns of the grid, an odd number; van der Pol: 7")
     height: int = Setting(7, ge=3, le=63, description="rows of the grid, an odd number")
     horizon: int = Setting(100, ge=1, le=100_000, description="steps of an episode, at most")
