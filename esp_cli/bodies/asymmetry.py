@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.deriving import HINGE, SLIDE, Frame, Match, image_of_axis
-from esp_cli.bodies.kinds import space
+from esp_cli.bodies.deriving import Match
+from esp_cli.bodies.frame import HINGE, SLIDE, Frame, image_of_axis
 from esp_cli.symmetry.elements import Floats
 
 
@@ -27,7 +27,7 @@ class Difference:
 
 def differences(frame: Frame, match: Match) -> list[Difference]:
     """Return for each joint what differs most: 0 of a joint that is the exact image of its partner's."""
-    model, R = frame.model, space(match.element.matrix)
+    model, R = frame.model, frame.image(match.element)
     found = []
     for i, j in enumerate(match.joint.tolist()):
         shares = _of_joint(frame, R, i, j)

@@ -12,7 +12,8 @@ import numpy as np
 
 from esp_cli.bodies import kinds
 from esp_cli.bodies.asymmetry import Difference, differences
-from esp_cli.bodies.deriving import Frame, Match, derive
+from esp_cli.bodies.deriving import Match, derive
+from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.parts import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY, Proof, prove
 from esp_cli.bodies.reading import MOST_DOFS, printable, read_model
@@ -52,7 +53,8 @@ class Body:
     observation = layout(body.gravity(), body.spin(), body.positions(), body.velocities())
     symmetry = Symmetry(observation=observation, action=Continuous(layout(body.controls())), group="flip-x")
 
-    Axes as in MuJoCo, ROS and Isaac Lab: x forward, y left, z up. Then `flip-x` is left-right, `flip-y` front-back.
+    Axes are those of the base, as in MuJoCo, ROS and Isaac Lab: x forward, y left, z up. Then `flip-x` is left-right,
+    `flip-y` front-back. Where the base is turned at rest, vectors are those that the body sees.
 
     Args:
         joints: names of the joints, in any order.

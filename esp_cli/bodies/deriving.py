@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
 
-from esp_cli.bodies.kinds import space
+from esp_cli.bodies.frame import BALL, FREE, HINGE, SLIDE, Frame, clean, image_of_axis
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
@@ -26,10 +27,6 @@ LOOSE = 0.1
 FAR = 0.25
 """How far a body's middle of mass may be off, as a share of the robot's size, to be matched."""
 _APART = 1e6
-FREE, BALL, SLIDE, HINGE = range(4)
-"""MuJoCo's types of joints."""
-QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)
-"""Numbers of a joint's position and velocity, by type."""
 
 
 @dataclass(frozen=True)
@@ -62,101 +59,24 @@ class Match:
         return all(np.array_equal(x, np.eye(len(x))) for x in (self.qpos, self.qvel, self.ctrl))
 
 
-class Frame:
-    """A model at rest: where its joints and masses are, all seen from the middle of its base.
-
-    Attributes:
-        model: the `mujoco.MjModel`.
-        base: its first free joint, or None.
-        centre: [3], what mirrors and turns leave where it is; z is 0.
-        size: largest distance of a joint or mass from their middle, m.
-        inertia: [bodies, 3, 3] of each body, along the world's axes.
-    """
-
-    def __init__(self, model: Any) -> None:
-        self.model, data = model, mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
-        self.base = free[0] if free else None
-        self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
-        self.parent = {b: self.carrier(b) for b in self.moving}
-        roots = [b for b in self.moving if self.parent[b] == 0]
-        self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else roots].reshape(-1, 3).mean(0)
-        self.centre[2] = 0
-        self.place = data.xpos - self.centre
-        self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
-        self.turned = data.xmat.reshape(-1, 3, 3).copy()
-        axes = data.ximat.reshape(-1, 3, 3)
-        self.inertia = axes * model.body_inertia[:, None] @ axes.transpose(0, 2, 1)
-        self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
-        spread = np.concatenate([self.anchor, self.com[self.moving]])
-        self.size = max(float(np.linalg.norm(spread - spread.mean(0), axis=1).max()), 1e-6)
-
-    def name(self, kind: str, index: int) -> str:
-        """Return the name of a body, joint or actuator, made of its number where it has none."""
-        return str(getattr(self.model, kind)(index).name) or f"{kind}{index}"
-
-    def carrier(self, body: int) -> int:
-        """Return the moving body that a body hangs on; 0 is the world."""
-        parent = self.model.body_parentid[body]
-        while parent and not self.model.body_jntnum[parent]:
-            parent = self.model.body_parentid[parent]
-        return int(parent)
-
-    def _rigid_parts(self, com: Floats) -> tuple[Floats, Floats]:
-        """Return [bodies] mass and [bodies, 3] middle of mass of each moving body with all that is fixed to it."""
-        mass, moment = np.zeros(self.model.nbody), np.zeros((self.model.nbody, 3))
-        for body in range(1, self.model.nbody):
-            owner = body if self.model.body_jntnum[body] else self.carrier(body)
-            mass[owner] += self.model.body_mass[body]
-            moment[owner] += self.model.body_mass[body] * com[body]
-        return mass, moment / np.maximum(mass, 1e-12)[:, None]
-
-    @cached_property
-    def children(self) -> dict[int, list[int]]:
-        """The moving bodies that hang on each moving body, and on the world (0)."""
-        return {b: [c for c in self.moving if self.parent[c] == b] for b in (0, *self.moving)}
-
-    def qpos_of(self, joint: int) -> slice:
-        """Return where the position of a joint is."""
-        start = int(self.model.jnt_qposadr[joint])
-        return slice(start, start + QPOS_WIDTH[self.model.jnt_type[joint]])
-
-    def dofs_of(self, joint: int) -> slice:
-        """Return where the velocity of a joint is."""
-        start = int(self.model.jnt_dofadr[joint])
-        return slice(start, start + DOF_WIDTH[self.model.jnt_type[joint]])
-
-    def joints(self, body: int) -> list[int]:
-        """Return the joints of a body."""
-        first = int(self.model.body_jntadr[body])
-        return list(range(first, first + int(self.model.body_jntnum[body])))
-
-
 def derive(frame: Frame, element: PlaneElement) -> Match:
     """Find what an element does to a model.
 
     Raises:
         UserError: the model at rest is far from being its own image; it names a joint or body without an image.
     """
-    R = space(element.matrix)
+    R = frame.image(element)
     com = frame.com[frame.moving]
     gaps = np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1)
     if gaps.max() > FAR * frame.size:
-        raise UserError(
-            f"no mass is where that of {frame.name('body', frame.moving[int(gaps.argmax())])} would come to lie"
-        )
+        lost = printable(frame.name("body", frame.moving[int(gaps.argmax())]))
+        raise UserError(f"no mass is where that of {lost} would come to lie")
     bodies, joints = _matched(frame, R)
     if not joints:
         every = range(frame.model.njnt)
-        lost = [i for i in every if min(_joint_gap(frame, R, i, j) for j in every) >= _APART]
-        part = (
-            f"no joint is like the image of {frame.name('joint', lost[0])}"
-            if lost
-            else "its bodies hang together otherwise"
-        )
-        raise UserError(part)
+        alone = [i for i in every if min(_joint_gap(frame, R, i, j) for j in every) >= _APART]
+        name = printable(frame.name("joint", alone[0])) if alone else ""
+        raise UserError(f"no joint is like the image of {name}" if name else "its bodies hang together otherwise")
     qpos, offset, qvel = _state_maps(frame, R, joints)
     ctrl, unmatched = _control_map(frame, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
@@ -217,12 +137,6 @@ def _joint_gap(frame: Frame, R: Floats, i: int, j: int) -> float:
     return _APART if max(gap, off) > LOOSE else gap + off
 
 
-def image_of_axis(frame: Frame, R: Floats, joint: int) -> Floats:
-    """Return R times the axis of a slide; of a hinge, whose axis is that of a turn, with the sign of its sense."""
-    sense = np.linalg.det(R) if frame.model.jnt_type[joint] == HINGE else 1.0
-    return np.rint(sense) * R @ frame.axis[joint]
-
-
 def _state_maps(frame: Frame, R: Floats, joints: dict[int, int]) -> tuple[Floats, Floats, Floats]:
     """Return the maps of qpos, with its offset, and of qvel."""
     model, det = frame.model, np.rint(np.linalg.det(R))
@@ -236,38 +150,22 @@ def _state_maps(frame: Frame, R: Floats, joints: dict[int, int]) -> tuple[Floats
             qpos[into, out], qvel[into_v, out_v] = sign, sign
             continue
         local = frame.turned[model.jnt_bodyid[j]].T @ R @ frame.turned[model.jnt_bodyid[i]]
-        turn = np.eye(4)
-        turn[1:, 1:] = det * local
-        if kind == FREE:
-            # the body's own image seen in the world: R Rot Rot0^-1 R^-1 Rot0'
-            turn[1:, 1:] = det * R
-            turn = _times(model.qpos0[into][3:]) @ turn @ _times(_conjugate(model.qpos0[out][3:]))
-            qpos[into, out][:3, :3], qpos[into, out][3:, 3:] = R, turn
-            qvel[into_v, out_v][:3, :3], qvel[into_v, out_v][3:, 3:] = R, det * local
-            fixed[out][:3], moved[into][:3] = frame.centre, frame.centre
-        else:
-            qpos[into, out], qvel[into_v, out_v] = turn, det * local
-            fixed[out], moved[into] = 0, 0
+        fixed[out][-4:], moved[into][-4:] = 0, 0
+        if kind == BALL:
+            qpos[into, out], qvel[into_v, out_v] = block_diag(1, det * local), det * local
+            continue
+        # the body's own image, seen in the world: R Rot Rot0^-1 R^-1 Rot0'
+        turn = _times(model.qpos0[into][3:]) @ block_diag(1, det * R) @ _times(model.qpos0[out][3:] * [1, -1, -1, -1])
+        qpos[into, out], qvel[into_v, out_v] = block_diag(R, turn), block_diag(R, det * local)
+        fixed[out][:3], moved[into][:3] = frame.centre, frame.centre
     offset = moved - qpos @ fixed
-    for start in model.jnt_qposadr[model.jnt_type == FREE]:
-        offset[start + 3 : start + 7] = 0
-    return _clean(qpos), _clean(offset), _clean(qvel)
+    return clean(qpos), clean(offset), clean(qvel)
 
 
 def _times(q: Floats) -> Floats:
     """Return the matrix M with M p = p q, of quaternions (w, x, y, z)."""
     w, x, y, z = q
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
-
-
-def _conjugate(q: Floats) -> Floats:
-    return q * [1, -1, -1, -1]
-
-
-def _clean(x: Floats) -> Floats:
-    """Return numbers with what differs from a whole number by rounding alone made whole."""
-    whole = np.rint(x)
-    return np.where(np.abs(x - whole) < 1e-9, whole, x) + 0.0
 
 
 def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:

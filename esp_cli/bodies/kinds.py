@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.plane import KIND_MATRICES, PlaneElement
@@ -29,12 +30,6 @@ def axial(planar: Floats) -> Floats:
     return np.rint(np.linalg.det(planar)) * space(planar) + 0.0
 
 
-def _beside(first: Floats, second: Floats) -> Floats:
-    """Return the matrix of two runs of numbers, each with its own."""
-    zeros = np.zeros((len(first), len(second)))
-    return np.block([[first, zeros], [zeros.T, second]])
-
-
 VECTOR_3D = Kind("3-d vector", 3, is_vector=True)
 """(x, y, z) of a place, a velocity, a force, or of gravity as the body sees it."""
 AXIAL_3D = Kind("axial vector", 3, is_vector=True)
@@ -49,10 +44,10 @@ PLANAR_COMMAND = Kind("planar command", 3)
 KIND_MATRICES |= {
     VECTOR_3D: space,
     AXIAL_3D: axial,
-    QUATERNION: lambda planar: _beside(np.eye(1), axial(planar)),
-    QUATERNION_XYZW: lambda planar: _beside(axial(planar), np.eye(1)),
+    QUATERNION: lambda planar: block_diag(1, axial(planar)),
+    QUATERNION_XYZW: lambda planar: block_diag(axial(planar), 1),
     ATTITUDE_6D: lambda planar: np.kron(space(planar), planar).astype(np.float64),
-    PLANAR_COMMAND: lambda planar: _beside(planar, axial(planar)[2:, 2:]),
+    PLANAR_COMMAND: lambda planar: block_diag(planar, np.linalg.det(planar).round()),
 }
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.deriving import BALL, FREE, Frame, Match
+from esp_cli.bodies.deriving import Match
+from esp_cli.bodies.frame import BALL, FREE, Frame
 from esp_cli.bodies.reading import quiet
 from esp_cli.symmetry.elements import Floats
 

@@ -11,8 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from esp_cli.bodies import Body
-from esp_cli.bodies.deriving import Frame, derive
+from esp_cli import Body, layout
+from esp_cli.bodies.deriving import derive
+from esp_cli.bodies.frame import Frame
+from esp_cli.bodies.numbers import map_of
 from esp_cli.bodies.proof import prove
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
@@ -135,6 +137,30 @@ def test_planar_robots_exchange_legs_that_lie_on_one_line():
     assert signed(body, "flip-x")["thigh_joint"] == "thigh_left_joint"
     assert Body.from_mjcf(GYMNASIUM / "half_cheetah.xml").group == "c1"
     assert signed(Body.from_mjcf(GYMNASIUM / "swimmer.xml"), "flip-x")["motor1_rot"] == "-motor1_rot"
+
+
+@pytest.mark.parametrize("turn", ["0 0 0", "0 0 90", "0 0 40"])
+def test_fields_are_what_the_simulator_says_the_body_sees(turn):
+    text = biped().replace('name="pelvis"', f'name="pelvis" euler="{turn}"')
+    model = mujoco.MjModel.from_xml_string(text)
+    body = Body.from_mjcf(model)
+    assert body.group == "flip-x"
+    match, rng = body.found["flip-x"].match, np.random.default_rng(0)
+
+    def seen(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(model, data)
+        axes = data.xmat[1].reshape(3, 3)
+        places = {name: k - 7 for k, name in enumerate(["root"] * 7 + list(body.joints))}
+        order = [places[name] for name in body.joints]
+        return np.concatenate([axes.T @ [0, 0, -1], axes.T @ qvel[:3], qvel[3:6], qpos[7:][order], qvel[6:][order]])
+
+    qpos, qvel = rng.normal(size=model.nq), rng.normal(size=model.nv)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    told = layout(body.gravity(), body.velocity(), body.spin(), body.positions(), body.velocities())
+    image = seen(match.qpos @ qpos + match.offset, match.qvel @ qvel)
+    np.testing.assert_allclose(map_of(told, LEFT_RIGHT) @ seen(qpos, qvel), image, atol=1e-12)
 
 
 def test_a_ball_joint_a_closed_loop_and_tendons_are_right():

@@ -1,0 +1,108 @@
+"""A robot's model at rest: where its joints and masses are."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from esp_cli.bodies.kinds import space
+from esp_cli.symmetry.elements import Floats
+from esp_cli.symmetry.plane import PlaneElement
+
+FREE, BALL, SLIDE, HINGE = range(4)
+"""MuJoCo's types of joints."""
+QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)
+"""Numbers of a joint's position and velocity, by type."""
+
+
+class Frame:
+    """A model at rest: where its joints and masses are, all seen from the middle of its base.
+
+    Attributes:
+        model: the `mujoco.MjModel`.
+        base: its first free joint, or None.
+        centre: [3], what mirrors and turns leave where it is; z is 0.
+        axes: [3, 3] the base's own, in columns: elements are told by them.
+        size: largest distance of a joint or mass from their middle, m.
+        inertia: [bodies, 3, 3] of each body, along the world's axes.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self.model, data = model, mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
+        self.base = free[0] if free else None
+        self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
+        self.parent = {b: self.carrier(b) for b in self.moving}
+        roots = [b for b in self.moving if self.parent[b] == 0]
+        self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else roots].reshape(-1, 3).mean(0)
+        self.centre[2] = 0
+        self.axes = data.xmat[model.jnt_bodyid[free[0]]].reshape(3, 3).copy() if free else np.eye(3)
+        self.place = data.xpos - self.centre
+        self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
+        self.turned = data.xmat.reshape(-1, 3, 3).copy()
+        axes = data.ximat.reshape(-1, 3, 3)
+        self.inertia = axes * model.body_inertia[:, None] @ axes.transpose(0, 2, 1)
+        self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
+        spread = np.concatenate([self.anchor, self.com[self.moving]])
+        self.size = max(float(np.linalg.norm(spread - spread.mean(0), axis=1).max()), 1e-6)
+
+    def image(self, element: PlaneElement) -> Floats:
+        """Return the matrix [3, 3] of an element on the world at rest."""
+        return clean(self.axes @ space(element.matrix) @ self.axes.T)
+
+    def name(self, kind: str, index: int) -> str:
+        """Return the name of a body, joint or actuator, made of its number where it has none."""
+        return str(getattr(self.model, kind)(index).name) or f"{kind}{index}"
+
+    def carrier(self, body: int) -> int:
+        """Return the moving body that a body hangs on; 0 is the world."""
+        parent = self.model.body_parentid[body]
+        while parent and not self.model.body_jntnum[parent]:
+            parent = self.model.body_parentid[parent]
+        return int(parent)
+
+    def _rigid_parts(self, com: Floats) -> tuple[Floats, Floats]:
+        """Return [bodies] mass and [bodies, 3] middle of mass of each moving body with all that is fixed to it."""
+        mass, moment = np.zeros(self.model.nbody), np.zeros((self.model.nbody, 3))
+        for body in range(1, self.model.nbody):
+            owner = body if self.model.body_jntnum[body] else self.carrier(body)
+            mass[owner] += self.model.body_mass[body]
+            moment[owner] += self.model.body_mass[body] * com[body]
+        return mass, moment / np.maximum(mass, 1e-12)[:, None]
+
+    @cached_property
+    def children(self) -> dict[int, list[int]]:
+        """The moving bodies that hang on each moving body, and on the world (0)."""
+        return {b: [c for c in self.moving if self.parent[c] == b] for b in (0, *self.moving)}
+
+    def qpos_of(self, joint: int) -> slice:
+        """Return where the position of a joint is."""
+        start = int(self.model.jnt_qposadr[joint])
+        return slice(start, start + QPOS_WIDTH[self.model.jnt_type[joint]])
+
+    def dofs_of(self, joint: int) -> slice:
+        """Return where the velocity of a joint is."""
+        start = int(self.model.jnt_dofadr[joint])
+        return slice(start, start + DOF_WIDTH[self.model.jnt_type[joint]])
+
+    def joints(self, body: int) -> list[int]:
+        """Return the joints of a body."""
+        first = int(self.model.body_jntadr[body])
+        return list(range(first, first + int(self.model.body_jntnum[body])))
+
+
+def image_of_axis(frame: Frame, R: Floats, joint: int) -> Floats:
+    """Return R times the axis of a slide; of a hinge, whose axis is that of a turn, with the sign of its sense."""
+    sense = np.linalg.det(R) if frame.model.jnt_type[joint] == HINGE else 1.0
+    return np.rint(sense) * R @ frame.axis[joint]
+
+
+def clean(x: Floats) -> Floats:
+    """Return numbers with what differs from a whole number by rounding alone made whole."""
+    whole = np.rint(x)
+    return np.where(np.abs(x - whole) < 1e-9, whole, x) + 0.0
