@@ -78,15 +78,16 @@ class MirroredPPO(PPO):
                 tensor[..., dones == 1, :] = 0.0
 
     def update(self) -> dict[str, float]:
-        """Train on the trajectories and their images."""
-        generate = self.storage.recurrent_mini_batch_generator
+        """Train on the trajectories and their images; the learning rate follows the divergence on originals alone."""
+        generate, divergence = self.storage.recurrent_mini_batch_generator, self.actor.get_kl_divergence
+        self.actor.get_kl_divergence = lambda old, new: divergence(old, tuple(x[:, : old[0].shape[1]] for x in new))
         self.storage.recurrent_mini_batch_generator = lambda *args: map(
             self.with_images, self.numbered(generate(*args))
         )
         try:
             return super().update()
         finally:
-            del self.storage.recurrent_mini_batch_generator
+            del self.storage.recurrent_mini_batch_generator, self.actor.get_kl_divergence
 
     def numbered(self, batches: Iterator[Any]) -> Iterator[tuple[int, Any]]:
         """Yield each batch with the number of its first trajectory; every epoch counts anew."""
@@ -119,12 +120,10 @@ class MirroredPPO(PPO):
         def again(rows: torch.Tensor) -> torch.Tensor:
             return torch.cat([rows] * (1 + len(elements)), 1)
 
-        mean, *spreads = batch.old_distribution_params
         batch.hidden_states = (state(0), state(1))
         seen = [batch.observations, *(self.image(batch.observations, element) for element in elements)]
         batch.observations = torch.cat(seen, 1)
         batch.actions, batch.masks = images(batch.actions), again(batch.masks)
-        batch.old_distribution_params = (images(mean), *(images(spread).abs() for spread in spreads))
         for name in ("values", "advantages", "returns", "old_actions_log_prob"):
             setattr(batch, name, again(getattr(batch, name)))
         return batch

@@ -164,7 +164,7 @@ class Body:
         proof = prove(frame, match)
         if match.unmatched:
             self.refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
-        elif proof.gap > tolerated:
+        elif not proof.gap <= tolerated:  # nor NaN
             worst = printable(frame.name("joint", int(proof.joints.argmax())))
             self.refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
         else:

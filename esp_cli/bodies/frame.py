@@ -57,7 +57,7 @@ class Frame:
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of a body, joint or actuator, made of its number where it has none."""
-        return str(getattr(self.model, kind)(index).name) or f"{kind}{index}"
+        return str(getattr(self.model, kind)(index).name) or f"{kind}#{index}"
 
     def carrier(self, body: int) -> int:
         """Return the moving body that a body hangs on; 0 is the world."""

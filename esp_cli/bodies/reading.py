@@ -13,8 +13,10 @@ import mujoco
 
 from esp_envs.errors import UserError
 
-MOST_BYTES, MOST_ELEMENTS, MOST_DEPTH, MOST_DOFS = 16 * 2**20, 50_000, 100, 1000
-"""Largest size of an XML file; most elements after replication, how deep they nest, and most degrees of freedom."""
+XML_MIB, ASSET_MIB = 16, 256
+"""Largest size of an XML file, and of a mesh or picture."""
+MOST_ELEMENTS, MOST_DEPTH, MOST_DOFS = 50_000, 100, 1000
+"""Most elements of a model after replication, how deep they nest, and most degrees of freedom."""
 _LIMITS = dict.fromkeys(("nrow", "ncol", "width", "height", "nuser", "nkey"), 65_536)
 _LIMITS |= dict.fromkeys(("njmax", "nconmax", "nstack"), 10**7) | {"memory": 2**30}
 """Largest numbers that ask MuJoCo for memory, by how their attributes begin."""
@@ -100,7 +102,8 @@ def _inspected(path: Path, allowed: Path) -> str:
                 raise UserError(f"{path} has more than {MOST_ELEMENTS} elements, or nests too deep")
             for key, value in element.attrib.items():
                 if key.startswith("file"):
-                    _files(path, value, folders, allowed)
+                    for found in _files(path, value, folders, allowed):
+                        _check_size(found, ASSET_MIB)
                 limit = next((most for name, most in _LIMITS.items() if key.startswith(name)), None)
                 if limit is not None and max(map(_whole, value.split()), default=0) > limit:
                     raise UserError(f"{path}: {key}={value[:40]!r} is more than {limit}; give a smaller one")
@@ -145,14 +148,18 @@ def _whole(word: str) -> int:
     return int(digits[:20]) * 1024**power if digits.isdecimal() else 1
 
 
+def _check_size(path: Path, most: int) -> None:
+    if (size := path.stat().st_size >> 20) >= most:
+        raise UserError(f"{printable(str(path))} has {size} MiB; a file of this kind has less than {most}")
+
+
 def _parsed(path: Path) -> ElementTree.Element:
     """Parse one XML file without a document type, so that no entity is defined.
 
     Raises:
         UserError: it is none, or too large.
     """
-    if path.stat().st_size > MOST_BYTES:
-        raise UserError(f"{path} has {path.stat().st_size >> 20} MiB; a model file has at most {MOST_BYTES >> 20}")
+    _check_size(path, XML_MIB)
     try:
         return ElementTree.fromstring(path.read_bytes(), ElementTree.XMLParser(target=_Builder()))
     except UserError as error:

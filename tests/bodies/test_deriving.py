@@ -193,6 +193,16 @@ def test_a_site_that_pushes_is_refused_where_no_image_pushes():
     assert body_of(text).refused["flip-x"] == "no image was found of the actuators thruster"
 
 
+def test_unnamed_joints_are_numbered_and_accelerations_that_are_no_numbers_prove_nothing(monkeypatch):
+    body = body_of(QUADRUPED.replace('name="hip0"', 'name="joint#3"').replace('joint="hip0"', 'joint="joint#3"'))
+    assert "joint#3" in body.joints
+    frame = Frame(mujoco.MjModel.from_xml_string(biped()))
+    broken = replace(prove(frame, derive(frame, LEFT_RIGHT)), joints=np.full(10, np.nan))
+    assert broken.verdict == "broken"
+    monkeypatch.setattr("esp_cli.bodies.body.prove", lambda frame, match: broken)
+    assert body_of(biped()).group == "c1"
+
+
 def test_models_without_a_joint_are_refused():
     with pytest.raises(UserError, match="0 degrees of freedom"):
         body_of("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")

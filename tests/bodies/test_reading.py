@@ -77,6 +77,10 @@ def test_missing_and_huge_files_are_refused(tmp_path):
     assert "no model file" in sentence(tmp_path / "none.xml")
     (tmp_path / "huge.xml").write_bytes(b"<mujoco>" + b" " * (17 * 2**20) + b"</mujoco>")
     assert "MiB" in sentence(tmp_path / "huge.xml")
+    with (tmp_path / "huge.stl").open("wb") as mesh:
+        mesh.truncate(300 * 2**20)
+    (tmp_path / "mesh.xml").write_text('<mujoco><asset><mesh file="huge.stl"/></asset></mujoco>')
+    assert "has 300 MiB" in sentence(tmp_path / "mesh.xml")
 
 
 def test_a_urdf_moves_freely_and_keeps_its_mimic_joint(tmp_path):

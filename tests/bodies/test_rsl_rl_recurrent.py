@@ -89,9 +89,9 @@ def test_a_batch_holds_each_trajectory_and_its_image(mirror):
         assert torch.equal(image, own[..., [0, 1, 3, 2]] * torch.tensor([-1, 1, -1, -1]))
         assert torch.equal(batch.actions[:, 3:], -batch.actions[:, :3][..., [1, 0]])
         assert torch.equal(batch.returns[:, :3], batch.returns[:, 3:])
+        assert batch.old_distribution_params[0].shape[1] == 3  # the divergence is that of originals
         states = batch.hidden_states[0].split(half, 1)
         assert not torch.equal(*states)
-        # in batch mode, outputs on images are those that the mirrored stream gave while data was collected
     first = batches[0]
     half = first.masks.shape[1] // 2
     ppo.actor(first.observations, masks=first.masks, hidden_state=first.hidden_states[0])
@@ -106,3 +106,4 @@ def test_training_uses_the_images_and_leaves_the_storage_as_it_was(mirror):
     losses = train(ppo)
     assert all(torch.isfinite(torch.tensor(x)) for x in losses.values())
     assert "recurrent_mini_batch_generator" not in vars(ppo.storage)
+    assert "get_kl_divergence" not in vars(ppo.actor)
