@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -30,12 +31,13 @@ SETTINGS |= {"gamma": 0.9, "lam": 0.9}
 
 
 def written_mirror() -> ModuleType:
-    """Return the module that `esp mirror --emit rsl_rl` would write for this body."""
+    """Write what `esp mirror --emit rsl_rl` writes for a model of this body, and import it."""
     body = Body(["left", "right"], {"left": "-right"})
     seen = layout(Field("cue", Kind.PSEUDOSCALAR), Field("clock", Kind.SCALAR), body.positions())
-    module = ModuleType("recall_mirror")
-    exec(emitted(body, {"policy": seen, "action": layout(body.positions())}, "recall"), vars(module))
-    return module
+    text = emitted(body, {"policy": seen, "action": layout(body.positions())}, "recall")
+    Path("recall_mirror.py").write_text(text, encoding="utf-8")
+    sys.path.insert(0, str(Path.cwd()))
+    return import_module("recall_mirror")
 
 
 def target(cue: torch.Tensor) -> torch.Tensor:
