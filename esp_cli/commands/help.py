@@ -45,7 +45,7 @@ _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a comm
     "check": {"transforms": "Options"},
     "discover": {"task": _SEARCHED, "transforms": _SEARCHED, "logs": _SEARCHED},
     "tune": {"prior": _PRIOR},
-    "mirror": {"root": _SEARCHED, "order": _SEARCHED, "check": _SEARCHED, "emit": _OUTPUT},
+    "mirror": {"root": _SEARCHED, "numbers": _SEARCHED, "check": _SEARCHED, "emit": _OUTPUT},
 }
 _WORDS = {int: "COUNT", float: "NUMBER", Path: "PATH"}
 
