@@ -1,8 +1,9 @@
 """A network over sets that commutes with every turn and mirror of the plane, with any weights.
 
 Planar vectors enter by what neither turns nor mirrors change: their lengths and inner products, beside distances
-between things. Vectors leave as sums of vectors that came in, weighed by such numbers (scalars that multiply vectors:
-Villar et al., 2021). An action is valued by its direction's inner products with these sums.
+between things. A discrete action along a direction is valued by a network that also reads each vector's component along
+that direction, the same for all directions. A force is a sum of vectors that came in, weighed by unchanged numbers
+(scalars that multiply vectors: Villar et al., 2021).
 
 Shape letters: S seeds, B rows, K things of a family, V vectors, H features, A actions.
 """
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 from esp_cli.networks.contract import Memoryless, Network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedLinear, SeedMLP
-from esp_cli.networks.set_features import Rows, SetShape, TeamFeatures
+from esp_cli.networks.set_features import Rows, TeamFeatures
 from esp_cli.networks.sets import SetConfig, SetNetwork, sets_or_refuse
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Field, Kind, Layout
@@ -43,7 +44,13 @@ class SetEquivariantConfig(SetConfig):
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
-        return EquivariantActor(generators, io, self, output_gain)
+        action = io.spaces.action
+        kinds = {action.kind} if isinstance(action, Discrete) else {field.kind for field in action.layout.fields}
+        if kinds != {Kind.VECTOR}:
+            raise UserError("set-equivariant acts along directions of the plane; use set for other actions")
+        if isinstance(action, Discrete):
+            return DirectionActor(generators, io, self, output_gain)
+        return ForceActor(generators, io, self, action.layout.width // 2, output_gain)
 
     @property
     def rows(self) -> type[Rows]:
@@ -74,7 +81,13 @@ def _columns(fields: Sequence[Field]) -> tuple[list[int], list[int]]:
 
 
 class InvariantRows(Rows):
-    """Splits rows into numbers that neither turns nor mirrors change; see `Rows`."""
+    """Splits rows into numbers that neither turns nor mirrors change; see `Rows`.
+
+    With A directions, a row becomes A rows that also have each vector's component along one of them, and whether it is
+    one: [S, B, .] to [S, B A, .].
+    """
+
+    points: Tensor | None = None  # directions [A, 2]
 
     def __init__(self, layout: Layout, shifts: bool, near: int, compiled: bool) -> None:
         super().__init__(layout, shifts, near, compiled)
@@ -90,17 +103,36 @@ class InvariantRows(Rows):
             for (vectors, scalars), further in zip(self.columns, far, strict=True)
         ]
 
+    def along(self, points: Sequence[Sequence[float]]) -> None:
+        """Look along directions too."""
+        self.points = torch.tensor(points)
+        self.num_own += len(self.own_columns[0]) + 1
+        self.widths = [width + len(of) for width, (of, _) in zip(self.widths, self.columns, strict=True)]
+
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
         """Return own invariants [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
         own, things = self.numbers(x)
         vectors = _picked(own, self.own_columns[0])
         invariants = torch.cat([own[..., self.own_columns[1]], *_products(vectors)], -1)
-        parts = []
+        parts, families = [], []
         for numbers, (of, scalars), far in zip(things, self.columns, self.distances(things), strict=True):
-            mine = _picked(numbers, of)
-            across = torch.einsum("sbkvd,sbwd->sbkvw", mine, vectors).flatten(3)
-            parts.append([numbers[..., scalars], *_products(mine), across, *far])
-        return invariants, parts
+            families.append(_picked(numbers, of))
+            across = torch.einsum("sbkvd,sbwd->sbkvw", families[-1], vectors).flatten(3)
+            parts.append([numbers[..., scalars], *_products(families[-1]), across, *far])
+        if self.points is None:
+            return invariants, parts
+        points = self.points.to(x.device)
+        moves = points.square().sum(-1).expand(*x.shape[:2], -1).unsqueeze(-1)
+        own = torch.cat([_each(invariants, len(points)), torch.einsum("sbvd,ad->sbav", vectors, points), moves], -1)
+        for part, mine in zip(parts, families, strict=True):
+            part[:] = [_each(numbers, len(points)).flatten(1, 2) for numbers in part]
+            part.append(torch.einsum("sbkvd,ad->sbakv", mine, points).flatten(1, 2))
+        return own.flatten(1, 2), parts
+
+
+def _each(x: Tensor, count: int) -> Tensor:
+    """Return [S, B, ...] once for each direction: [S, B, A, ...]."""
+    return x.unsqueeze(2).expand(-1, -1, count, *x.shape[2:])
 
 
 def _one(field: Field) -> Field:
@@ -125,48 +157,46 @@ def _products(vectors: Tensor) -> list[Tensor]:
     return [products, (vectors.square().sum(-1) + _SMALLEST_SQUARE).sqrt()]
 
 
-class EquivariantActor(Memoryless):
-    """Outputs that turn and mirror with what is seen: a number for each direction, or a vector.
+class DirectionActor(Memoryless):
+    """A number for each direction, by one network over sets that reads all vectors along that direction."""
 
-    Raises:
-        UserError: actions that are neither planar directions nor planar vectors.
-    """
-
-    def __init__(self, generators: Sequence[torch.Generator], io: IoSpec, config: SetShape, output_gain: float) -> None:
+    def __init__(
+        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, output_gain: float
+    ) -> None:
         super().__init__()
         action = io.spaces.action
-        kinds = {action.kind} if isinstance(action, Discrete) else {f.kind for f in action.layout.fields}
-        if kinds != {Kind.VECTOR}:
-            raise UserError("set-equivariant acts along directions of the plane; use set for other actions")
+        assert isinstance(action, Discrete)
+        self.network = SetNetwork(generators, io, 1, config, output_gain, action.points)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map [S, B, in] to [S, B, A]."""
+        return self.network(x).unflatten(1, (x.shape[1], -1)).squeeze(-1)
+
+
+class ForceActor(Memoryless):
+    """Planar vectors that are weighed sums of those that are seen."""
+
+    def __init__(
+        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, forces: int, output_gain: float
+    ) -> None:
+        super().__init__()
         self.features = TeamFeatures(generators, io, config)
         rows = self.features.encoder.rows
         assert isinstance(rows, InvariantRows)
-        self.rows, width = rows, config.width
-        counts = [len(vectors) for vectors, _ in rows.columns]
-        self.weigh = nn.ModuleList(SeedLinear(generators, width, _SUMS * count, 1.0) for count in counts if count)
+        self.rows, counts = rows, [len(vectors) for vectors, _ in rows.columns]
+        self.weigh = nn.ModuleList(
+            SeedLinear(generators, config.width, _SUMS * count, 1.0) for count in counts if count
+        )
         num_vectors = _SUMS * sum(counts) + len(rows.own_columns[0])
-        inputs = self.features.width + num_vectors
-        self.points: Tensor | None
-        points = torch.tensor(action.points) if isinstance(action, Discrete) else None
-        self.register_buffer("points", points, False)
-        if isinstance(action, Discrete):
-            inputs, outputs = inputs + num_vectors + 1, 1
-        else:
-            outputs = action.layout.width // 2 * num_vectors
-        sizes = (inputs, *config.hidden, outputs)
+        sizes = (self.features.width + num_vectors, *config.hidden, forces * num_vectors)
         self.head = SeedMLP(generators, sizes, config.activation, output_gain, compiled=config.compiled is True)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, B, in] to [S, B, out]."""
         parts, vectors = self._seen(x)
         lengths = (vectors.square().sum(-1) + _SMALLEST_SQUARE).sqrt()
-        if self.points is None:
-            weights = self.head(*parts, lengths).unflatten(-1, (-1, vectors.shape[2]))
-            return (weights @ vectors).flatten(2)
-        along = torch.matmul(vectors, self.points.t()).transpose(2, 3)  # [S, B, A, V]
-        still = (self.points.square().sum(-1, keepdim=True) == 0).to(x.dtype).expand(*along.shape[:3], 1)
-        same = [part.unsqueeze(2).expand(-1, -1, len(self.points), -1) for part in (*parts, lengths)]
-        return self.head(*same, along, still).squeeze(-1)
+        weights = self.head(*parts, lengths).unflatten(-1, (-1, vectors.shape[2]))
+        return (weights @ vectors).flatten(2)
 
     def _seen(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
         """Return parts of invariant features [S, B, .], and vectors [S, B, V, 2]."""

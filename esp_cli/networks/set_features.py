@@ -73,6 +73,10 @@ class Rows:
         each = zip(self.families, self._offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
 
+    def along(self, points: Sequence[Sequence[float]]) -> None:
+        """Look at rows along directions too, where they are split so."""
+        raise NotImplementedError
+
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
         """Return the own numbers [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
         own, things = self.numbers(x)
@@ -206,18 +210,28 @@ class TeamFeatures(nn.Module):
         io: of the network.
         config: shape.
         beside: numbers that come along with each agent, such as its action.
+        points: directions along which rows are looked at too; see `Rows.along`.
 
     Attributes:
         width: features of a row.
     """
 
-    def __init__(self, generators: Sequence[torch.Generator], io: IoSpec, config: SetShape, beside: int = 0) -> None:
+    def __init__(
+        self,
+        generators: Sequence[torch.Generator],
+        io: IoSpec,
+        config: SetShape,
+        beside: int = 0,
+        points: Sequence[Sequence[float]] = (),
+    ) -> None:
         super().__init__()
         spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"
         if compiled:
             begin("sets")
         layout = io.layout if io.reads == "state" else spaces.observation
         rows = config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
+        if points:
+            rows.along(points)
         self.encoder = SetEncoder(generators, rows, config)
         self.num_agents = spaces.num_agents if joint else 0
         found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []

@@ -73,10 +73,16 @@ class SetNetwork(Memoryless):
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, outputs: int, config: SetConfig, output_gain: float
+        self,
+        generators: Sequence[torch.Generator],
+        io: IoSpec,
+        outputs: int,
+        config: SetConfig,
+        output_gain: float,
+        points: Sequence[Sequence[float]] = (),
     ) -> None:
         super().__init__()
-        self.features = TeamFeatures(generators, io, config)
+        self.features = TeamFeatures(generators, io, config, points=points)
         width, self.values_each = self.features.width, io.num_values is not None and outputs > 1
         if self.values_each:
             self.features.each_or_refuse(io)
