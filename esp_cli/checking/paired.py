@@ -25,8 +25,11 @@ from esp_cli.checking.verdicts import (
     SIGNIFICANT,
     ElementVerdict,
     FieldVerdict,
+    Watch,
     chance,
     concluded,
+    unwatched,
+    watched,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
@@ -42,28 +45,38 @@ TOLERATED = 0.15
 """Standard deviations that a field with chance may be off, where it is not found broken."""
 _BOUND = 0.05
 """Where the bounded distance levels off, in standard deviations of the field."""
+_NUDGE, _ROUNDINGS, _UNCLEAR = 1e-6, 10.0, 0.05
+"""How far a state is moved to see what rounding does, how often that may be exceeded without being a mismatch, and the
+share of the states that differ by no more than that, from which nothing is said."""
 Outcomes = dict[str, Tensor]
 """What a step gives, by field: [M, numbers]."""
 
 
-def check_paired(make: MakeWorlds, elements: Sequence[Element], most: int | None = None) -> list[ElementVerdict]:
+def check_paired(
+    make: MakeWorlds, elements: Sequence[Element], most: int | None = None, watch: Watch = unwatched
+) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state.
 
     Args:
         make: makes E worlds for some seeds.
         elements: to try.
         most: worlds in which outcomes are compared, at most.
+        watch: told of how many elements of how many are judged.
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
+    visited = _visit(make(worlds, [0]))
+    if most is None:  # one step of many worlds takes less time than many steps
+        states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
+        visited, worlds = [(states, actions)], states.shape[1]
     twins = [make(worlds, [seed]) for seed in (101, 102)]
     spec = twins[0].spec
-    visited = _visit(make(worlds, [0]))
     here = [_outcomes(env, visited, None) for env in twins]
     one, other = (_fields(steps, spec, None) for steps in here)
     if all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one):
         twins = twins[:1]  # nothing is left to chance, so one run from each image will do
-    return [_judge(element, spec, visited, twins, here) for element in elements]
+        here.append(_outcomes(twins[0], [(_nudged(state), action) for state, action in visited], None))
+    return [_judge(element, spec, visited, twins, here) for element in watched(elements, watch)]
 
 
 def _visit(env: Environment) -> list[tuple[Tensor, Tensor]]:
@@ -104,23 +117,36 @@ def _judge(
     except Exception as error:
         reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
         return ElementVerdict(element.name, declared, (), reason)
-    first, second = (_fields(steps, spec, transform) for steps in here)
+    first, second, *nudged = (_fields(steps, spec, transform) for steps in here)
     third, fourth = _fields(there[0], spec, None), _fields(there[-1], spec, None)
-    verdicts = [_verdict(name, first[name], second[name], third[name], fourth[name]) for name in first]
+    verdicts = [
+        _verdict(name, first[name], second[name], third[name], fourth[name], *(near[name] for near in nudged))
+        for name in first
+    ]
     return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
 
 
-def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:
-    """Judge one field from its outcomes [M, numbers]: x and x2 transformed, y and y2 from the transformed state."""
+def _nudged(state: Tensor) -> Tensor:
+    """Return states that differ by about what rounding leaves; whole numbers, as of cells, stay."""
+    noise = torch.randn(state.shape, generator=torch.Generator().manual_seed(0)).to(state.device)
+    return torch.where(state == state.round(), state, state + _NUDGE * (1 + state.abs()) * noise)
+
+
+def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, near: Tensor | None = None) -> FieldVerdict:
+    """Judge one field from its outcomes [M, numbers]: x and x2 transformed, y and y2 from the transformed state.
+
+    Where nothing is left to chance, `near` are transformed outcomes from states that differ by about a rounding.
+    """
     known = torch.isfinite(torch.stack([x, x2, y, y2])).all(-1).all(0)
-    x, x2, y, y2 = (part[known] for part in (x, x2, y, y2))
+    rounding = torch.zeros(len(x)) if near is None else (x - near).abs().amax(1).cpu().nan_to_num()
+    x, x2, y, y2, rounding = (part[known] for part in (x, x2, y, y2, rounding.to(x.device)))
     if not bool(known.any()):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
     scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
     if name == "reward" and not bool(torch.cat([x, y]).any()):  # it never came
         return FieldVerdict(name, "not covered", 0.0, 0.0)
     if max(float((x - x2).abs().max()), float((y - y2).abs().max())) <= NEGLIGIBLE * scale:
-        return _state_by_state(name, (x - y).abs().amax(1), scale)
+        return _state_by_state(name, (x - y).abs().amax(1), _ROUNDINGS * rounding, scale)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
     # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
     bound = _BOUND * scale
@@ -135,11 +161,13 @@ def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVe
     return concluded(name, gap, error, bool(broken.any()), chance(gap, TOLERATED, error))
 
 
-def _state_by_state(name: str, apart: Tensor, scale: float) -> FieldVerdict:
-    """Judge a field without chance by how far apart the two sides are in each state, [M]."""
-    differ = apart > NEGLIGIBLE * scale
-    share = float(differ.float().mean())
-    return concluded(name, float(apart.mean()) / scale, 0.0, bool(differ.any()), 0.0, share)
+def _state_by_state(name: str, apart: Tensor, rounding: Tensor, scale: float) -> FieldVerdict:
+    """Judge a field without chance by how far apart the two sides are in each state, [M], and rounding could be."""
+    unlike = apart > NEGLIGIBLE * scale
+    differ = unlike & (apart > rounding)
+    share, unclear = float(differ.float().mean()), float((unlike & ~differ).float().mean())
+    gap = float((apart * differ).mean()) / scale
+    return concluded(name, gap, 0.0, bool(differ.any()), float(unclear > _UNCLEAR), share)
 
 
 def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], across: Sequence[Tensor]) -> Tensor:

@@ -9,7 +9,7 @@ from esp_cli.checking import paired, transitions
 from esp_cli.checking.candidates import candidates, refused
 from esp_cli.checking.naming import named
 from esp_cli.checking.recorded import Transitions, collect
-from esp_cli.checking.verdicts import ElementVerdict
+from esp_cli.checking.verdicts import ElementVerdict, Watch, unwatched
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
 from esp_cli.symmetry.elements import AGENTS
@@ -66,20 +66,23 @@ class SymmetryReport:
         return tuple(e.element for e in self.elements if e.declared and e.outcome == outcome)
 
 
-def check_symmetry(make: MakeWorlds, transforms: str | None = None, from_transitions: bool = False) -> SymmetryReport:
+def check_symmetry(
+    make: MakeWorlds, transforms: str | None = None, from_transitions: bool = False, watch: Watch = unwatched
+) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
     Args:
         make: makes E worlds for some seeds.
         transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
         from_transitions: use transitions of the random policy even where the task can be set to states.
+        watch: told of how many elements of how many are judged.
 
     Raises:
         UserError: the transforms mean nothing, or the task can carry none of them.
     """
     spec = make(1, [0]).spec
     elements = candidates(spec, transforms)
-    method, verdicts = judged(make, elements, from_transitions)
+    method, verdicts = judged(make, elements, from_transitions, watch)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
@@ -91,14 +94,14 @@ def check_recorded(source: str, spaces: Spaces, data: Transitions, transforms: s
 
 
 def judged(
-    make: MakeWorlds, elements: Sequence[Element], from_transitions: bool = False
+    make: MakeWorlds, elements: Sequence[Element], from_transitions: bool = False, watch: Watch = unwatched
 ) -> tuple[str, list[ElementVerdict]]:
     """Return the method that a task allows, and what it says of some elements."""
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
     if from_transitions or not probe.settable():
         worlds = make(min(_COPIES, max(32, 8192 // seen.horizon)), [0])
-        return TRANSITIONS, transitions.check_transitions(seen, collect(worlds, _EPISODES), elements)
+        return TRANSITIONS, transitions.check_transitions(seen, collect(worlds, _EPISODES), elements, watch)
 
     def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
         env = make(num_envs, seeds)
@@ -106,7 +109,8 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    verdicts = dict(zip(carried, paired.check_paired(settable, carried, None if native else _FOREIGN), strict=True))
+    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch)
+    verdicts = dict(zip(carried, found, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
         verdicts |= dict(zip(rest, judged(make, rest, from_transitions=True)[1], strict=True))
     return PAIRED, [verdicts[element] for element in elements]

@@ -26,7 +26,7 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, strength
 from esp_cli.checking.predictor import Predictor
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, concluded
+from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, unwatched, watched
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
@@ -48,13 +48,16 @@ _PREFERS, _ELSEWHERE = 0.05, 0.5
 from the second on, of starts, images lie where no transition does."""
 
 
-def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Element]) -> list[ElementVerdict]:
+def check_transitions(
+    spaces: Spaces, data: Transitions, elements: Sequence[Element], watch: Watch = unwatched
+) -> list[ElementVerdict]:
     """Judge elements from transitions.
 
     Args:
         spaces: what the numbers are, and the declared symmetry.
         data: anybody's transitions, of a policy that prefers no direction; each episode counts once.
         elements: to try.
+        watch: told of how many elements of how many are judged.
 
     Raises:
         UserError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
@@ -69,7 +72,7 @@ def check_transitions(spaces: Spaces, data: Transitions, elements: Sequence[Elem
     controls = Controls(spaces.observation, thinned)
     halves = [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
     first = Transitions(*(part[:, :1] for part in vars(data).values() if part is not None))
-    return [_judge(element, spaces, halves, first) for element in elements]
+    return [_judge(element, spaces, halves, first) for element in watched(elements, watch)]
 
 
 def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions) -> ElementVerdict:

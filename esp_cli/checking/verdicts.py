@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from scipy.special import ndtr
 
+from esp_cli.symmetry import Element
+
+Watch = Callable[[int, int], object]
+"""Takes how many of how many are done."""
 Outcome = Literal["holds", "broken", "not covered"]
 RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}
 """The outcome of several verdicts is the one of the highest rank."""
@@ -85,3 +90,14 @@ def concluded(
 def chance(gap: float, tolerance: float, error: float) -> float:
     """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
     return float(ndtr((gap - tolerance) / max(error, 1e-12)))
+
+
+def unwatched(done: int, total: int) -> None:
+    """Take what nobody shows."""
+
+
+def watched(elements: Sequence[Element], watch: Watch) -> Iterator[Element]:
+    """Yield elements, and tell how many are done."""
+    for done, element in enumerate(elements, 1):
+        yield element
+        watch(done, len(elements))

@@ -96,7 +96,8 @@ def _of_the_symmetry(spec: TaskSpec) -> Finding:
 def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> int:
     from esp_cli.checking import check_policy, check_symmetry
 
-    report = check_symmetry(make_worlds, transforms)
+    with console.watching("elements") as watch:
+        report = check_symmetry(make_worlds, transforms, watch=watch)
     measured: list[PolicyVerdict] = []
     if policy is not None:
         from esp_cli.policies.loading import open_policy

@@ -91,7 +91,8 @@ def _discovery(
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
 
-    return check_symmetry(worlds, transforms, logs)
+    with console.watching("elements") as watch:
+        return check_symmetry(worlds, transforms, logs, watch)
 
 
 def _print(report: SymmetryReport) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -87,23 +85,9 @@ def render(
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
-    with _progress() as watch:
+    with console.watching("draw") as watch:
         drawing = draw(request, opened, [where.name for where in named], watch)
     film = f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)"
     picture = f"episode of {drawing.steps} steps -> {out}"
     for text in filter(None, (drawing.note, picture if request.kind == PICTURE else film)):
         console.note(text)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows how many frames of how many are drawn, from the first one on."""
-    with ExitStack() as stack:
-        bars: list[console.TrainingProgress] = []
-
-        def watch(done: int, total: int) -> None:
-            if not bars:
-                bars.append(stack.enter_context(console.TrainingProgress(total, description="draw")))
-            bars[0].update(done)
-
-        yield watch

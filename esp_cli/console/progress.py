@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
@@ -130,3 +131,17 @@ class TrainingProgress:
         self._shown = self._done
         share = self._done / self.total if self.total else 1.0
         note(f"{self.description}  {share:4.0%}  {'  '.join(self.parts())}")
+
+
+@contextmanager
+def watching(description: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows how many parts of how many are done, from the first one on."""
+    with ExitStack() as stack:
+        bars: list[TrainingProgress] = []
+
+        def watch(done: int, total: int) -> None:
+            if not bars:
+                bars.append(stack.enter_context(TrainingProgress(total, description=description)))
+            bars[0].update(done)
+
+        yield watch

@@ -181,3 +181,47 @@ def test_what_cannot_be_set_is_judged_by_transitions(task) -> None:
     assert found.method == "transitions"
     assert found.found == "c1"
     assert "holds" not in {element.outcome for element in found.elements}
+
+
+class Listed:
+    """Two agents in Tuple spaces: each moves by what it does, and both see the sum."""
+
+    action_space = gymnasium.spaces.Tuple([gymnasium.spaces.Discrete(3)] * 2)
+
+    def reset(self, seed=None):
+        self.sums = np.zeros(2, np.float32)
+        return tuple(self.sums[:, None]), {}
+
+    def step(self, actions):
+        self.sums = self.sums + np.array(actions, np.float32)
+        return tuple(self.sums[:, None]), list(self.sums), False, False, {}
+
+
+class Adding(ParallelTask):
+    observation = layout(Field("sum", Kind.SCALAR))
+    action = Discrete(Kind.SCALAR, ((0.0,), (1.0,), (2.0,)), ("none", "one", "two"))
+    symmetry, convention = "agents", "sum"
+
+    def make_one(self):
+        return Listed()
+
+    def acting(self, agent, action):
+        return 2 - action if agent == "agent_1" else action
+
+
+def test_agents_in_tuple_spaces_act_as_the_task_says() -> None:
+    env = Adding(Adding.Settings(workers=0), 2, generators_for([0]))
+    env.reset()
+    step = env.step(torch.tensor([[[2, 2], [1, 0]]]))
+    assert step.reward.tolist() == [[[2.0, 0.0], [1.0, 2.0]]]
+
+
+def test_unlike_agents_are_refused_with_what_to_do() -> None:
+    class Unlike(Adding):
+        def reading(self, agent, observation):
+            return np.repeat(observation, 2 if agent == "agent_1" else 1)
+
+    with pytest.raises(
+        ValueError, match=r"agent_0 sees 1 numbers .* agent_1 sees 2 .* must be alike; begin 'learners'"
+    ):
+        Unlike(Unlike.Settings(), 1, generators_for([0]))

@@ -49,6 +49,37 @@ def _kind(env: Any, wanted: str) -> str:
     return f"a {type(env).__name__}, which has no '{missing if methods else 'reset and step'}'"
 
 
+def by_agent(env: Any) -> Any:
+    """Return an environment whose agents are entries of Tuple spaces and of lists as one with agents by name."""
+    spaces = getattr(getattr(env, "action_space", None), "spaces", None)
+    return env if not isinstance(spaces, Sequence) or hasattr(env, "possible_agents") else _Listed(env, spaces)
+
+
+class _Listed:
+    """A Gymnasium environment of several agents, as in level-based foraging: "agent_0", "agent_1" and so on."""
+
+    def __init__(self, env: Any, spaces: Sequence[Any]) -> None:
+        self.unwrapped, self._env = getattr(env, "unwrapped", env), env
+        self.possible_agents = [f"agent_{k}" for k in range(len(spaces))]
+        self.action_spaces = dict(zip(self.possible_agents, spaces, strict=True))
+
+    def reset(self, seed: int) -> tuple[Mapping[Any, Any], ...]:
+        seen, _ = self._env.reset(seed=seed)
+        return self._named(seen), {}
+
+    def step(self, actions: Mapping[Any, Any]) -> tuple[Mapping[Any, Any], ...]:
+        seen, *parts, _ = self._env.step([actions[name] for name in self.possible_agents])
+        return self._named(seen), *map(self._named, parts), {}
+
+    def close(self) -> None:
+        self._env.close()
+
+    def _named(self, part: Any) -> dict[str, Any]:
+        """Return what each agent gets; one number or flag is for all."""
+        each = [part] * len(self.possible_agents) if np.ndim(part) == 0 and not isinstance(part, tuple) else part
+        return dict(zip(self.possible_agents, each, strict=True))
+
+
 def space_of(env: Any, agent: Any) -> Any:
     """Return an agent's action space, from the method `action_space` or from a mapping."""
     spaces = getattr(env, "action_space", None)

@@ -70,6 +70,10 @@ class CopyHooks(ABC):
         """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
         return np.asarray(observation["observation"] if _has(observation, "action_mask") else observation)
 
+    def acting(self, agent: str, action: Any) -> Any:
+        """Turn an action of the layout, stretched to the bounds of a Box, into what the environment takes."""
+        return action
+
     def allowed(self, agent: str, observation: Any, info: Mapping[str, Any]) -> Array:
         """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info.
 
@@ -104,7 +108,7 @@ class Copy:
 
     def __init__(self, task: CopyHooks) -> None:
         self._task = task
-        self.env = task.make_one()
+        self.env = foreign.by_agent(task.make_one())
         foreign.require_kind(self.env, foreign.PARALLEL, "make_one")
         self.agents = list(self.env.possible_agents)
         self.learners = [name for name in self.agents if str(name).startswith(task.learners)]
@@ -150,6 +154,7 @@ class Copy:
         task = self._task
         with self.naming("reset"):
             first, infos = self.start(0)
+        self._require_alike(first)
         for name in self.learners:
             with self.naming("reading"):
                 self.see(name, first[name])
@@ -170,6 +175,26 @@ class Copy:
         if task.state is not None and np.size(self.env.state()) != task.state.width:
             got = np.size(self.env.state())
             raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
+
+    def _require_alike(self, first: Mapping[Any, Any]) -> None:
+        """Refuse learning agents that see or do unlike things.
+
+        Raises:
+            UserError: names two of them.
+        """
+        with self.naming("reading"):
+            rows = ((name, self._task.reading(name, first[name])) for name in self.learners)
+            seen = {name: foreign.numbers(row, f"what {name} sees").size for name, row in rows}
+        one = self.learners[0]
+        for other in self.learners[1:]:
+            spaces = [foreign.space_of(self.env, name) for name in (one, other)]
+            does = [getattr(space, "n", None) or getattr(space, "shape", None) for space in spaces]
+            if seen[one] != seen[other] or does[0] != does[1]:
+                raise UserError(
+                    f"{one} sees {seen[one]} numbers and acts in {spaces[0]}, {other} sees {seen[other]} and acts in "
+                    f"{spaces[1]}, but all that learn must be alike; begin 'learners' with the name of one kind, and "
+                    "let the others act by 'opponent', or give all the same numbers by 'reading'"
+                )
 
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""

@@ -78,22 +78,23 @@ class Entities:
                 f"{len(goals)} landmarks are named '{own_goals}...' for {len(sim.agents)} agents; one belongs to each"
             )
         rest = [i for i in range(len(landmarks)) if i not in goals]
-        self._columns: list[tuple[Field, bool, list[int], str]] = []
-        agents = list(range(len(sim.agents)))
-        self._add("agents", sim.agents, True, agents, Items.AGENTS)
-        self._add("goals", landmarks, False, goals, Items.AGENTS)
+        self._columns: list[tuple[Field, int, list[int], str]] = []
+        self._add("agents", sim, _AGENTS, list(range(len(sim.agents))), Items.AGENTS)
+        self._add("goals", sim, _LANDMARKS, goals, Items.AGENTS)
         for i in rest:
-            self._add(landmarks[i].name.replace(" ", "_"), landmarks, False, [i], Items.FIXED)
+            self._add(landmarks[i].name.replace(" ", "_"), sim, _LANDMARKS, [i], Items.FIXED)
+        for i, agent in enumerate(_of(sim)[_SCRIPTED]):
+            self._add(agent.name.replace(" ", "_"), sim, _SCRIPTED, [i], Items.FIXED)
         for flag in flags:
             held = [i for i in rest if hasattr(landmarks[i], flag)]
-            self._columns.append((Field(flag, Kind.SCALAR, len(held), "0 or 1"), False, held, flag))
+            self._columns.append((Field(flag, Kind.SCALAR, len(held), "0 or 1"), _LANDMARKS, held, flag))
         self.layout = Layout(tuple(field for field, *_ in self._columns))
 
     def read(self, sim: Any) -> Tensor:
         """Return the global state [E, state width]."""
-        parts = []
-        for _, of_agents, index, what in self._columns:
-            entities = sim.agents if of_agents else sim.world.landmarks
+        parts, groups = [], _of(sim)
+        for _, group, index, what in self._columns:
+            entities = groups[group]
             for i in index:
                 part = getattr(entities[i].state if what in _STATE else entities[i], what).float()
                 parts.append(torch.cat([part.cos(), part.sin()], -1) if what == "rot" else part.reshape(len(part), -1))
@@ -101,9 +102,9 @@ class Entities:
 
     def write(self, sim: Any, state: Tensor) -> None:
         """Put the entities into a global state [E, state width]."""
-        start = 0
-        for field, of_agents, index, what in self._columns:
-            entities = sim.agents if of_agents else sim.world.landmarks
+        start, groups = 0, _of(sim)
+        for field, group, index, what in self._columns:
+            entities = groups[group]
             for i in index:
                 part = state[:, start : start + field.item_width].clone()
                 start += field.item_width
@@ -115,11 +116,11 @@ class Entities:
                     flag = getattr(entities[i], what)
                     setattr(entities[i], what, part.view_as(flag).to(flag.dtype))
 
-    def _add(self, name: str, entities: Sequence[Any], of_agents: bool, index: list[int], items: Items) -> None:
+    def _add(self, name: str, sim: Any, group: int, index: list[int], items: Items) -> None:
         """Add the columns of some entities that are alike."""
         if not index:
             return
-        first = entities[index[0]]
+        first = _of(sim)[group][index[0]]
         columns = [("pos", "position", Kind.VECTOR, "length")]
         if first.movable:
             columns.append(("vel", "velocity", Kind.VECTOR, "length/s"))
@@ -127,11 +128,19 @@ class Entities:
             columns.append(("rot", "heading", Kind.VECTOR, "direction"))
             columns.append(("ang_vel", "spin", Kind.PSEUDOSCALAR, "rad/s"))
         for what, word, kind, unit in columns:
-            self._columns.append((Field(f"{name}.{word}", kind, len(index), unit, items), of_agents, index, what))
+            self._columns.append((Field(f"{name}.{word}", kind, len(index), unit, items), group, index, what))
 
 
 _STATE = ("pos", "vel", "rot", "ang_vel")
 """What an entity's state holds; anything else is a flag of the entity itself."""
+
+
+_AGENTS, _LANDMARKS, _SCRIPTED = 0, 1, 2
+
+
+def _of(sim: Any) -> tuple[Sequence[Any], ...]:
+    """Return the agents of a simulator, its landmarks, and agents that follow a script."""
+    return sim.agents, sim.world.landmarks, [agent for agent in sim.world.agents if agent not in sim.agents]
 
 
 def _is_round(entity: Any) -> bool:

@@ -69,7 +69,9 @@ class CopyStepper:
 
     def _step(self, k: int, copy: Copy) -> None:
         task, board, seen, living = self._task, self.board, self._seen[k], self._living[k]
-        chosen = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name in living}
+        native = {name: copy.native(i, board.action[k, i]) for i, name in enumerate(copy.learners) if name in living}
+        with copy.naming("acting", k):
+            chosen = {name: task.acting(name, action) for name, action in native.items()}
         acting, others = list(chosen), [name for name in copy.rest if name in living]
         chosen |= {name: task.opponent(name, seen[name], self._opponents_draws[k]) for name in others}
         with copy.naming("step", k):

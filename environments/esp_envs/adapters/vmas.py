@@ -134,7 +134,7 @@ class VmasTask(Environment):
             ends.append(over)
             reached.append(here)
             following.append(self._renew(s, over | due[s], here))
-            rewards.append(torch.stack(reward, 1))
+            rewards.append(torch.stack([one.reshape(self.num_envs) for one in reward], 1))  # some give [E, 1]
             measured.append([done.float(), *(_mean(infos, name, done) for name in self.metrics)])
         terminated = torch.stack(ends)
         final = _joined(reached) if self.terminates or bool(due.any()) else None
@@ -160,6 +160,9 @@ class VmasTask(Environment):
         for s, sim in enumerate(self._sims):
             with self._numbers[s].drawn():
                 self._entities.write(sim, state[s])
+                for agent in sim.agents:
+                    if agent.action.u is None:  # some rewards look at forces before there are any
+                        agent.action.u = torch.zeros(self.num_envs, agent.action_size, device=self.device)
                 for agent in sim.agents:  # brings what rewards remember of the step before up to date
                     sim.scenario.reward(agent)
                 self._entities.write(sim, state[s])

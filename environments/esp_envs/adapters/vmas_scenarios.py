@@ -1,7 +1,8 @@
 """VMAS scenarios with a layout: which number is what, and under what the scenario is symmetric.
 
-Name one as `--task esp_envs.adapters.vmas_scenarios:Transport`. Sampling is left out: its rays begin at 0.05 rad, which
-no mirror leaves alone, and which cells are sampled stands in no state.
+Name one as `--task esp_envs.adapters.vmas_scenarios:Transport`. Those with settings of their own are classes, the
+others lines of a table. Left out are sampling, of which no state says what is sampled, and road_traffic, whose agents
+steer.
 """
 
 from __future__ import annotations
@@ -145,3 +146,72 @@ class Dispersion(VmasTask):
         """Return the layout of one agent's observation."""
         piece = (Field("offset", Kind.VECTOR, unit="length"), Field("eaten", Kind.SCALAR, unit="0 or 1"))
         return layout(*_OWN, Field("food", Kind.RECORD, self.settings.food, parts=piece, family="food"))
+
+
+def _vectors(*names: str) -> tuple[Field, ...]:
+    return tuple(Field(name, Kind.VECTOR, unit="length") for name in names)
+
+
+def _scenario(
+    name: str, symmetry: str, *seen: Field, agents: int, fixed: bool = False, **attributes: object
+) -> type[VmasTask]:
+    """Return the task of a scenario.
+
+    Args:
+        name: the scenario's.
+        symmetry: what holds of it.
+        seen: fields of an agent's observation.
+        agents: of the team.
+        fixed: whether the scenario takes no other number of them.
+        attributes: further ones of the class.
+    """
+    settings = type("Settings", (VmasSettings,), {"__annotations__": {"num_agents": int}, "num_agents": agents})
+    members: dict[str, object] = {"Settings": settings, "scenario": name, "symmetry": symmetry, "terminates": True}
+    members |= {"convention": f"vmas {name}", "seen": lambda _: layout(*seen), "__module__": __name__}
+    if fixed:
+        members["arguments"] = lambda _: {}
+    return type(name.title().replace("_", ""), (VmasTask,), members | attributes)
+
+
+def _line_direction(_: VmasTask, obs: Tensor) -> Tensor:
+    """Give the wheel's angle, which it shows modulo pi, as cosine and sine of its double."""
+    double = 2 * obs[..., 10:11]
+    return torch.cat([obs[..., :10], double.cos(), double.sin(), obs[..., 11:]], -1)
+
+
+_WHEEL = (
+    *_vectors("from_line", "end", "other_end"),
+    Field("level", Kind.SCALAR),
+    Field("slope", Kind.PSEUDOSCALAR),
+    Field("spin", Kind.SCALAR, 2),
+)
+BallPassage = _scenario(
+    "ball_passage", "c1", *_OWN, *_vectors("from_goal", "from_ball", "from_passage"), agents=2, fixed=True
+)
+BallTrajectory = _scenario("ball_trajectory", "c1", *_OWN, *_vectors("from_ball", "again"), agents=2, fixed=True)
+BuzzWire = _scenario("buzz_wire", "c1", *_OWN, *_vectors("from_goal"), agents=2, fixed=True)
+Discovery = _scenario("discovery", "c1", *_OWN, Field("lidar", Kind.RING, rays=15), agents=5)
+Dropout = _scenario("dropout", "c1", *_OWN, *_vectors("goal"), Field("done", Kind.SCALAR), agents=4, flags=("eaten",))
+Flocking = _scenario("flocking", "c1", *_OWN, *_vectors("from_target"), Field("lidar", Kind.RING, rays=12), agents=4)
+GiveWay = _scenario("give_way", "c1", *_OWN, agents=2, fixed=True, own_goals="goal")
+JointPassage = _scenario(
+    "joint_passage", "c1", *_OWN, *_vectors("from_goal", "from_passage", "goal_direction"), agents=2, fixed=True
+)
+JointPassageSize = _scenario(
+    "joint_passage_size",
+    "c1",
+    *_OWN,
+    *_vectors("from_goal", "from_big", "from_small", "goal_direction"),
+    agents=2,
+    fixed=True,
+)
+MultiGiveWay = _scenario(
+    "multi_give_way", "c1", *_OWN, *_vectors("from_goal"), Field("distance", Kind.SCALAR), agents=4, fixed=True,
+    own_goals="goal",
+)  # fmt: skip
+Passage = _scenario("passage", "c1", *_OWN, *_vectors("goal", "passage"), agents=5, fixed=True, own_goals="goal")
+ReverseTransport = _scenario(
+    "reverse_transport", "c1", *_OWN, *_vectors("package_velocity", "package", "package_from_goal"), agents=4
+)
+Wheel = _scenario("wheel", "c1", *_OWN, *_WHEEL, agents=4, reading=_line_direction)
+WindFlocking = _scenario("wind_flocking", "c1", *_OWN, agents=2, fixed=True)

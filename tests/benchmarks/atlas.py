@@ -1,0 +1,150 @@
+"""Check the symmetries of tasks that others wrote and of the built-in ones, and write docs/atlas.md from the findings.
+
+    python tests/benchmarks/atlas.py [--only PATTERN] [--json docs/measured/atlas.json]
+    python tests/benchmarks/atlas.py --page docs/atlas.md
+
+A script and no command: it needs the packages of all tasks, which no user needs together. It goes on in its file: a
+task that is there is not checked again. What cannot be imported is listed as not run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from esp_cli import machine
+
+if __name__ == "__main__":
+    machine.prepare()  # as `esp` does, before torch is imported
+
+from esp_cli.checking import check_symmetry
+from esp_envs import Environment, make, register
+from tests.benchmarks import atlas_tasks
+
+_VMAS = "esp_envs.adapters.vmas_scenarios"
+SCENARIOS = (
+    "Balance", "BallPassage", "BallTrajectory", "BuzzWire", "Discovery", "Dispersion", "Dropout", "Flocking", "GiveWay",
+    "JointPassage", "JointPassageSize", "MultiGiveWay", "Navigation", "Passage", "ReverseTransport", "Transport",
+    "Wheel", "WindFlocking",
+)  # fmt: skip
+BUILT_IN = {
+    "navigation": {}, "predator-prey": {}, "wildlife": {"width": 5, "height": 5, "horizon": 30},
+    "formation": {"horizon": 40, "num_agents": 4, "num_obstacles": 2},
+}  # fmt: skip
+COMMANDS = {"vmas": "pip install vmas", "mpe2": "pip install mpe2", "sisl": "pip install 'pettingzoo[sisl]'",
+            "mujoco": "pip install 'gymnasium[mujoco]'", "foraging": "pip install lbforaging"}  # fmt: skip
+NOT_CARRIED = {
+    "mpe2": "simple_reference, simple_crypto, simple_speaker_listener, simple_world_comm: agents speak, and see and do "
+            "unlike things; collect_treasure: agents sort what they see by distance",
+    "vmas": "sampling: no state says what is sampled; road_traffic: agents steer; football: 28 vectors without names; "
+            "its copies of MPE: see mpe2",
+    "sisl": "waterworld: not part of PettingZoo 1.27; multiwalker: walkers see neighbours and no plane turns",
+    "mujoco": "Ant, Humanoid, HumanoidStandup: see the mirrors of robots; HalfCheetah, Hopper, Pusher: nothing in them "
+              "that an element could move",
+}  # fmt: skip
+"""Why tasks of a package are left out."""
+
+
+def tasks() -> Iterator[tuple[str, str, Callable[[], tuple[str, dict[str, object]]], str | None]]:
+    """Return package, name, what gives the registered name and settings, and transforms, None for the default ones."""
+    for name, settings in BUILT_IN.items():
+        yield "esp", name, lambda name=name, settings=settings: (name, settings), None
+    for name in SCENARIOS:
+        yield "vmas", name, lambda name=name: (register(f"{_VMAS}:{name}"), {}), None
+    for package, found in (("mpe2", atlas_tasks.MPE), ("mujoco", atlas_tasks.MUJOCO)):
+        for name, task in found.items():
+            texts = f"{atlas_tasks.LEGS}" if name.startswith("Walker") else None
+            yield package, name, lambda task=task: (register(task), {"workers": 0}), texts
+    yield "sisl", "pursuit_v5", lambda: (register(atlas_tasks.PURSUIT), {"workers": 0}), "d4"
+    yield "foraging", "8x8-2p-3f", lambda: (register(atlas_tasks.Foraging), {"workers": 0}), "d4,agents"
+
+
+def looked_at(package: str, name: str, given: Callable[[], tuple[str, Any]], texts: str | None) -> dict[str, Any]:
+    """Return what a check says of a task, or why it was not run."""
+    begun = time.process_time()
+    row: dict[str, Any] = {"package": package, "task": name}
+    try:
+        task, settings = given()
+
+        def worlds(num_envs: int, seeds: Any) -> Environment:
+            return make(task, num_envs, seeds, settings)
+
+        report = check_symmetry(worlds, texts)
+    except (ImportError, ValueError) as error:
+        return row | {"not run": f"{error}", "command": COMMANDS.get(package, "")}
+    row |= {"found": report.found, "method": report.method, "elements": len(report.elements)}
+    for element in report.elements:
+        fields = [
+            {
+                "field": f.field,
+                "gap": round(f.gap, 4),
+                "error": round(f.error, 4),
+                "share": None if f.share != f.share else round(f.share, 4),
+            }
+            for f in element.fields
+            if f.outcome == element.outcome != "holds"
+        ]
+        row.setdefault(element.outcome, {})[element.element] = fields or element.reason
+    return row | {"seconds": round(time.process_time() - begun, 1)}
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """Return the page."""
+    text = Path(__file__).with_name("atlas_page.md").read_text()
+    lines = ["| task | found | what breaks the others | decided by |", "|---|---|---|---|"]
+    lines += [_line(row) for row in rows if "found" in row]
+    missing = [f"- {row['package']} {row['task']}: {row['not run']}" for row in rows if "not run" in row]
+    left = [f"- {package}: {why}" for package, why in NOT_CARRIED.items()]
+    return text.replace("TABLE", "\n".join(lines)).replace("LEFT", "\n".join(left + missing))
+
+
+def _line(row: dict[str, Any]) -> str:
+    worst: dict[str, tuple[float, str, str]] = {}
+    for element, fields in row.get("broken", {}).items():
+        found = max(fields, key=lambda field: field["gap"])
+        share = "" if found["share"] is None else f", in {found['share']:.2%} of the states"
+        worst.setdefault(found["field"], (found["gap"], element, share))
+        worst[found["field"]] = max(worst[found["field"]], (found["gap"], element, share))
+    told = [f"{field} by {gap:.3g} s.d. ({element}{share})" for field, (gap, element, share) in worst.items()]
+    if unseen := row.get("not covered"):
+        told.append("not covered: " + ", ".join(list(unseen)[:4]) + (" and more" if len(unseen) > 4 else ""))
+    return f"| {row['package']} {row['task']} | `{row['found']}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
+
+
+def main() -> None:
+    """Check the tasks that are asked for, or write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="*", help="pattern of 'package task'")
+    parser.add_argument("--json", type=Path, default=Path("docs/measured/atlas.json"))
+    parser.add_argument("--page", type=Path, help="write this page from the file")
+    args = parser.parse_args()
+    rows: list[dict[str, Any]] = json.loads(args.json.read_text()) if args.json.exists() else []
+    if args.page:
+        args.page.write_text(page(rows))
+        return
+    known = {(row["package"], row["task"]) for row in rows if "found" in row}
+    for package, name, given, texts in tasks():
+        if (package, name) in known or not fnmatch(f"{package} {name}", args.only):
+            continue
+        rows = [row for row in rows if (row["package"], row["task"]) != (package, name)]
+        rows.append(looked_at(package, name, given, texts))
+        print(
+            {
+                key: value
+                for key, value in rows[-1].items()
+                if key in ("package", "task", "found", "not run", "seconds")
+            },
+            flush=True,
+        )
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

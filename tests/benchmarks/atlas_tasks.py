@@ -1,0 +1,153 @@
+"""Layouts of tasks of others for the atlas, a few lines each: mpe2, SISL, Gymnasium's MuJoCo, level-based foraging."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from esp_envs import Continuous, Discrete, Field, Items, Kind, Layout, layout
+from esp_envs.adapters.gymnasium import SingleAgentTask
+from esp_envs.adapters.pettingzoo import ParallelTask
+from esp_envs.mpe.task import MOVES
+from esp_envs.spec import discrete_moves
+
+V, S, P, OTHERS = Kind.VECTOR, Kind.SCALAR, Kind.PSEUDOSCALAR, Items.OTHERS
+
+
+def zoo(module: str, *seen: Field, **attributes: Any) -> type[ParallelTask]:
+    """Return the task of a module of mpe2 or `pettingzoo.sisl` that has a `parallel_env`."""
+
+    def make_one(self: ParallelTask) -> Any:
+        env = __import__(module, fromlist=["parallel_env"])
+        return env.parallel_env(max_cycles=self.settings.horizon + 1)
+
+    members: dict[str, Any] = {"observation": Layout(seen), "action": MOVES, "symmetry": "c1", "make_one": make_one}
+    return type(module.rpartition(".")[2].title(), (ParallelTask,), members | {"convention": module} | attributes)
+
+
+def gym(name: str, *seen: Field, torques: int = 0, **attributes: Any) -> type[SingleAgentTask]:
+    """Return the task of a Gymnasium environment whose actions change sign in a mirror."""
+
+    def make_single(self: SingleAgentTask) -> Any:
+        import gymnasium
+
+        return gymnasium.make(name)
+
+    action = attributes.pop("action", None) or Continuous(layout(Field("torque", P, torques)))
+    members: dict[str, Any] = {"observation": Layout(seen), "action": action, "symmetry": "c1", "terminates": True}
+    members |= {"make_single": make_single, "convention": name}
+    return type(name.title().replace("-", ""), (SingleAgentTask,), members | attributes)
+
+
+def still(self: ParallelTask, agent: str, observation: Any, generator: np.random.Generator) -> int:
+    """Let an agent that does not learn do anything."""
+    return int(generator.integers(5))
+
+
+def first_vectors(task: ParallelTask, agent: str, observation: Any) -> Any:
+    """Put (cos, sin) of the arm and of the target side by side: [cos a, cos b, sin a, sin b, x, y, ...]."""
+    a = np.asarray(observation)
+    return np.concatenate([a[[0, 2]], a[[1]], a[[3]], a[4:]])
+
+
+ARM = (Field("arm", V), Field("bend", S), Field("side", P), Field("target", V), Field("spins", P, 2), Field("gap", V))
+MPE = {
+    "simple": zoo("mpe2.simple_v3", Field("velocity", V), Field("mark", V)),
+    "simple_formation": zoo(
+        "mpe2.simple_formation_v1", Field("velocity", V), Field("position", V), Field("landmarks", V)
+    ),
+    "simple_line": zoo("mpe2.simple_line_v1", Field("velocity", V), Field("position", V), Field("landmarks", V, 2)),
+    "simple_spread": zoo(
+        "mpe2.simple_spread_v3",
+        *(Field("velocity", V), Field("position", V), Field("landmarks", V, 3), Field("others", V, 2, items=OTHERS)),
+        Field("messages", S, 4),
+    ),
+    "simple_tag": zoo(
+        "mpe2.simple_tag_v3",
+        *(Field("velocity", V), Field("position", V), Field("landmarks", V, 2), Field("others", V, 2, items=OTHERS)),
+        *(Field("prey", V), Field("prey_velocity", V)),
+        learners="adversary",
+        opponent=still,
+    ),
+    "simple_adversary": zoo(
+        "mpe2.simple_adversary_v3",
+        *(Field("goal", V), Field("landmarks", V, 2), Field("adversary", V), Field("other", V, items=OTHERS)),
+        learners="agent",
+        opponent=still,
+    ),
+    "simple_push (agent)": zoo(
+        "mpe2.simple_push_v3",
+        *(Field("velocity", V), Field("goal", V), Field("color", S, 3), Field("landmarks", V, 2)),
+        *(Field("colors", S, 6), Field("other", V)),
+        learners="agent",
+        opponent=still,
+    ),
+    "simple_push (adversary)": zoo(
+        "mpe2.simple_push_v3",
+        *(Field("velocity", V), Field("landmarks", V, 2), Field("other", V)),
+        learners="adversary",
+        opponent=still,
+    ),
+}
+MUJOCO = {
+    "InvertedPendulum-v5": gym("InvertedPendulum-v5", *(Field(n, P) for n in ("x", "angle", "v", "spin")), torques=1),
+    "InvertedDoublePendulum-v5": gym(
+        "InvertedDoublePendulum-v5",
+        *(Field("x", P), Field("sin", P, 2), Field("cos", S, 2), Field("rates", P, 3), Field("force", P)),
+        torques=1,
+        simulated=layout(Field("q", P, 3), Field("v", P, 3)),
+    ),
+    "Swimmer-v5": gym(
+        "Swimmer-v5",
+        *(Field("angles", P, 3), Field("velocity", V), Field("spins", P, 3)),
+        torques=2,
+        simulated=layout(Field("place", V), Field("q", P, 3), Field("velocity", V), Field("v", P, 3)),
+    ),
+    "Walker2d-v5": gym(
+        "Walker2d-v5",
+        *(Field("z", S), Field("angle", S), Field("joints", S, 6), Field("vx", S, 3), Field("rates", S, 6)),
+        action=Continuous(layout(Field("torque", S, 6))),
+        simulated=layout(Field("root", S, 3), Field("joints", S, 6), Field("roots", S, 3), Field("rates", S, 6)),
+    ),
+    "Reacher-v5": gym("Reacher-v5", *ARM, torques=2, reading=first_vectors),
+}
+LEGS = "joints-3-4-5-0-1-2*rates-3-4-5-0-1-2*torque-3-4-5-0-1-2"
+"""The exchange of the walker's legs."""
+PURSUIT = zoo(
+    "pettingzoo.sisl.pursuit_v5",
+    Field("seen", Kind.PICTURE, 3, pixels=(7, 7)),
+    action=discrete_moves(("left", "right", "up", "down", "stay")),
+    reading=lambda self, agent, obs: np.asarray(obs).transpose(2, 1, 0)[:, ::-1],
+    terminates=True,
+)
+
+
+class Foraging(ParallelTask):
+    """Level-based foraging: foods, then players, the own one first, each (row, column, level); foods sorted by row."""
+
+    observation = layout(
+        Field("foods", Kind.RECORD, 3, parts=(Field("at", V), Field("level", S))),
+        Field("players", Kind.RECORD, 2, parts=(Field("at", V), Field("level", S))),
+    )
+    action = Discrete(
+        V, ((0, 0), (0, 1), (0, -1), (-1, 0), (1, 0), (0, 0)), ("stay", "up", "down", "left", "right", "load")
+    )
+    symmetry, convention, terminates = "c1", "Foraging-8x8-2p-3f-v3", True
+
+    def make_one(self) -> Any:
+        """Return the environment."""
+        from lbforaging.foraging import ForagingEnv
+
+        return (
+            ForagingEnv(
+                players=2, min_player_level=1, max_player_level=2, min_food_level=1, max_food_level=None,
+                field_size=(8, 8), max_num_food=3, sight=8, max_episode_steps=50, force_coop=False,
+            )
+        )  # fmt: skip
+
+    def reading(self, agent: str, observation: Any) -> Any:
+        """Turn (row, column) from the top into (x, y) about the middle; what is not there is (-1, -1, 0)."""
+        row, column, level = np.asarray(observation).reshape(-1, 3).T
+        there = row >= 0
+        return np.stack([np.where(there, column - 3.5, 0), np.where(there, 3.5 - row, 0), level], 1)
