@@ -23,7 +23,7 @@ def mirrored(rows: Any, element: str, group: str | None = None) -> Any:
 
 def with_copies(rows: Any, images: list[Any], axis: int = 0) -> Any:
     """Return rows with their copies behind them."""
-    if not hasattr(rows, "new_tensor") and isinstance(rows, np.ndarray):
+    if isinstance(rows, np.ndarray):
         return np.concatenate([rows, *images], axis)
     import torch  # noqa: PLC0415 - only where rows are tensors
 
