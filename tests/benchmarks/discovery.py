@@ -144,7 +144,8 @@ def main() -> None:
     if args.random:
         known = Path(args.json) if args.json else None
         tasks: list[dict[str, Any]] = json.loads(known.read_text())["tasks"] if known and known.exists() else []
-        for seed in range(args.first + len(tasks), args.first + args.random):
+        done = {task["seed"] for task in tasks}
+        for seed in sorted(set(range(args.first, args.first + args.random)) - done):
             tasks.append(of_random_task(seed))
             told = counted(tasks)
             print(*(f"{name}: {told[name]};" for name in ("tasks", "falsely accepted", "misses by reward")), flush=True)
