@@ -1,4 +1,4 @@
-"""Write docs/measurements/robot-models.md: the symmetries of every robot model that installed packages bring.
+"""Write docs/robot-models.md: the symmetries of every robot model that installed packages bring.
 
     python docs/make_robots.py mjlab gymnasium dm_control gymnasium_robotics
 
@@ -16,11 +16,11 @@ from pathlib import Path
 from esp_cli.bodies import Body, read_model
 from esp_envs.errors import UserError
 
-PAGE = Path(__file__).parent / "measurements" / "robot-models.md"
+PAGE = Path(__file__).parent / "robot-models.md"
 _HEAD = """# Robot models
 
 What `esp mirror` finds in the models that packages bring: {held} of {tried} models with joints have a mirror or turn.
-`python docs/make_robots.py PACKAGE...` writes this page; [Legged robots](../legged-robots.md) says how a mirror is
+`python docs/make_robots.py PACKAGE...` writes this page; [Legged robots](legged-robots.md) says how a mirror is
 derived and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. Files
 without a joint, and parts that are no model by themselves, are left out ({left}).
 
