@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from esp_cli.checking.candidates import is_declared
-from esp_cli.checking.controls import STILL, Controls, strength
+from esp_cli.checking.controls import STILL, Controls, Products, Sides, strength, trust_in
 from esp_cli.checking.predictor import Predictor
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, unwatched, watched
@@ -141,7 +141,7 @@ class _Half:
         self._predict = Predictor(spaces, fitted, self._targets(fitted), controls(fitted))
         self._planted = controls(held)
         self._here = self._sides(held, self._planted)
-        self._trust = _trust(self._here.said, self._here.true)
+        self._trust = trust_in(self._here.said, self._here.true)
         self._errors = (self._trust * self._here.said - self._here.true).square()
         self._spread = self._here.true.flatten(0, 2).var(0)
         self.fields = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
@@ -166,8 +166,8 @@ class _Half:
         carried = transform.per_agent(self._planted.movedim(-1, 0)).movedim(0, -1)
         there, (size, counts) = self._sides(image, carried), strength(carried, self._controls(image), weight)
         worse = weight * ((self._trust * there.said - there.true).square() - self._errors)
-        plain = _Products(self._here, torch.ones_like(weight))
-        sums = [_Products(side, weight) for side in (self._here, there)]
+        plain = Products(self._here, torch.ones_like(weight))
+        sums = [Products(side, weight) for side in (self._here, there)]
         fields = {}
         for name, where in self.fields.items():
             main = where.start + int(self._deviation[where].argmax())
@@ -183,10 +183,10 @@ class _Half:
             fields[name] = tuple(part.double() for part in parts)
         return _Compared(float(inside.mean()), counts, fields)
 
-    def _sides(self, data: Transitions, functions: Tensor) -> _Sides:
+    def _sides(self, data: Transitions, functions: Tensor) -> Sides:
         said, planted = self._predict(data)
         mean = torch.cat([self._mean, torch.ones_like(self._mean)])
-        return _Sides(said - mean, self._targets(data) - mean, planted, functions)
+        return Sides(said - mean, self._targets(data) - mean, planted, functions)
 
     def _targets(self, data: Transitions) -> Tensor:
         """Return what is predicted of each agent, and its square in standard deviations from the mean."""
@@ -207,60 +207,6 @@ class _Compared(NamedTuple):
     inside: float
     counts: Tensor
     fields: dict[str, tuple[Tensor, ...]]
-
-
-class _Sides(NamedTuple):
-    """Predictions of what follows and of the controls, and what they are, [M, T, N, numbers] each."""
-
-    said: Tensor
-    true: Tensor
-    planted_said: Tensor
-    planted_true: Tensor
-
-
-def _trust(said: Tensor, true: Tensor) -> Tensor:
-    """Return by how much to shrink predictions so that they err least, 0 to 1: a predictor takes some noise for law."""
-    return ((said * true).mean((0, 1, 2)) / said.square().mean((0, 1, 2)).clamp_min(1e-20)).clamp(0, 1)
-
-
-class _Products:
-    """Weighted means, over the steps and agents of each episode, of products of what is predicted and what is true.
-
-    They give the squared errors of a number s (true: t) with any amount a of each control p (true: q) added to it:
-    (r (s + a p) - (t + a q))^2, where r is the trust.
-    """
-
-    def __init__(self, side: _Sides, weight: Tensor) -> None:
-        self._pairs, self._weight = torch.stack([side.said, side.true], -1).flatten(1, 2), weight.flatten(1, 2)
-        self._planted = torch.cat([side.planted_said, side.planted_true], -1).flatten(1, 2)
-        p, q = (self._weight * self._planted).chunk(2, -1)
-        said, true = self._planted.chunk(2, -1)
-        self._squares = (p * said).mean(1), (p * true).mean(1), (q * true).mean(1)
-
-    def _of(self, number: int, amounts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the means of (s + a p)^2, (s + a p)(t + a q) and (t + a q)^2, [M, B] each."""
-        pair = self._pairs[..., number, :]
-        weighted = (self._weight * pair).mT / pair.shape[1]
-        own = weighted @ pair
-        ss, st, tt = own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]
-        crossed = weighted @ self._planted
-        (sp, sq), (tp, tq) = (row.chunk(2, -1) for row in crossed.unbind(1))
-        pp, pq, qq = self._squares
-        return (
-            ss.unsqueeze(-1) + amounts * (2 * sp + amounts * pp),
-            st.unsqueeze(-1) + amounts * (sq + tp + amounts * pq),
-            tt.unsqueeze(-1) + amounts * (2 * tq + amounts * qq),
-        )
-
-    def trust(self, number: int, amounts: Tensor) -> Tensor:
-        """Return by how much to shrink predictions with controls added, [B]; see `_trust`."""
-        squares, products, _ = self._of(number, amounts)
-        return (products.mean(0) / squares.mean(0).clamp_min(1e-20)).clamp(0, 1)
-
-    def errors(self, number: int, amounts: Tensor, trust: Tensor) -> Tensor:
-        """Return the squared errors with controls added, [M, B]."""
-        squares, products, true = self._of(number, amounts)
-        return trust * (trust * squares - 2 * products) + true
 
 
 def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:
