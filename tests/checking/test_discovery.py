@@ -71,10 +71,20 @@ def test_what_is_there_is_found_without_a_declaration(task, settings, group) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "settings", "group"), [*FOUND[:2], *FOUND[3:5]], ids=str)
+@pytest.mark.parametrize(("task", "settings", "group"), [FOUND[0], *FOUND[3:5]], ids=str)
 def test_logs_alone_show_the_same(task, settings, group) -> None:
     found = discovered(task, settings, logs_alone=True)
     assert (found.method, found.found) == ("transitions", group)
+
+
+@pytest.mark.slow
+def test_logs_alone_show_the_quarter_turns_of_all_and_cover_only_some_of_the_others() -> None:
+    found = discovered("navigation", FORCES, logs_alone=True)
+    outcomes = {one.element: one.outcome for one in found.elements}
+    assert (found.method, found.found) == ("transitions", "d4*agents*landmarks-3")
+    assert outcomes["rot45"] == "holds"
+    assert "not covered" in outcomes.values()
+    assert "broken" not in outcomes.values(), "all of o2 holds"
 
 
 @pytest.mark.slow
