@@ -96,13 +96,16 @@ def _of_the_symmetry(spec: TaskSpec) -> Finding:
 def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> int:
     from esp_cli.checking import check_policy, check_symmetry
 
-    with console.watching("elements") as watch:
-        report = check_symmetry(make_worlds, transforms, watch=watch)
-    measured: list[PolicyVerdict] = []
+    trained = None
     if policy is not None:
         from esp_cli.policies.loading import open_policy
 
-        measured = check_policy(open_policy(policy), make_worlds, transforms)
+        trained = open_policy(policy)
+    with console.watching("elements") as watch:
+        report = check_symmetry(make_worlds, transforms, watch=watch)
+    measured: list[PolicyVerdict] = []
+    if trained is not None:
+        measured = check_policy(trained, make_worlds, transforms)
     found = {"report": report, "holds": report.holds, "policy": measured}
     console.result(json, found, lambda: _print(report, measured))
     return 1 if report.broken else 2 if report.uncovered else 0

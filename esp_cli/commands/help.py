@@ -11,7 +11,7 @@ from esp_cli.files.formatting import format_count
 
 TASKS = ("navigation", "predator-prey", "formation", "wildlife")
 ALGORITHMS = ("mappo", "maddpg", "qmix")
-NETWORKS = ("mlp", "gru", "mpn", "empn", "set", "equivariant")
+NETWORKS = ("mlp", "gru", "mpn", "empn", "set", "set-equivariant", "equivariant")
 PRESETS = ("default", "fast", "paper")
 TRACKERS = ("tensorboard", "wandb", "mlflow")
 

@@ -347,7 +347,7 @@ NAMED = {
     "NaN that is shared": (task(put(REWARD, {"a": np.nan, "b": np.nan}), shared_reward=True), "is not finite"),
     "numpy's generator": (task(at(1, lambda s, o: o[REWARD].update(b=np.random.rand()))), "two runs of one seed"),  # noqa: NPY002
     "torch's generator": (task(at(1, lambda s, o: o[REWARD].update(b=float(torch.rand(()))))), "two runs of one seed"),
-    "the clock": (task(at(1, lambda s, o: o[REWARD].update(b=time.perf_counter()))), "two runs of one seed and the"),
+    "the clock": (task(at(1, lambda s, o: o[REWARD].update(b=time.perf_counter_ns() % 1e6))), "two runs of one seed"),
     "the seed is ignored": (task(of={"reset": lambda self, seed=None: Team.reset(self, 1)}), "another seed gives"),
     "deaf": (task(of={"step": lambda self, a: Team.step(self, dict.fromkeys(a, 0))}), "actions change nothing"),
 }  # fmt: skip

@@ -150,7 +150,7 @@ def test_a_task_carries_what_it_declares(legs) -> None:
     assert torch.equal(prior.copies(batch, []).rows.state[:, 3:], swapped)
     for text, sentence in (
         ("rot90", "rot90 is no symmetry of its dynamics and reward, which carry legs; use a group within legs"),
-        ("legs*marks-2", "it has no field 'marks', but speed, knees, others, torque"),
+        ("legs*marks-2", "the task has no field 'marks', but speed, knees, others, torque"),
     ):
         with pytest.raises(UserError, match=sentence):
             transform_set(text, declared)

@@ -43,7 +43,7 @@ def test_a_policy_does_what_its_manifest_says(entry: Entry) -> None:
     error = math.hypot(score.sem, entry.score.sem)
     assert abs(score.mean - entry.score.mean) < 4 * error
     assert entry.score.ci95[0] <= entry.score.mean <= entry.score.ci95[1]
-    assert set(played.metrics) == set(entry.metrics)
+    assert set(played.metrics) >= set(entry.metrics), "later versions may measure more"
 
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry.name)

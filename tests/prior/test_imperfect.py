@@ -146,7 +146,7 @@ def test_a_task_without_states_is_weighed_by_its_transitions(monkeypatch) -> Non
     assert 1.0 in weights(0.0).values()
     found = weights(0.31)
     assert found["flip-x"] in (0, 1)
-    assert 0 < found["rot180"] < found["rot90"] < 0.8
+    assert found["rot180"] == found["rot90"] == 0, "transitions show them broken"
 
 
 def test_a_prior_of_no_strength_makes_no_copies_and_draws_nothing() -> None:
