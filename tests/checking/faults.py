@@ -88,7 +88,7 @@ def declared(change: Callable[[Field], Field], *names: str) -> Fault:
 
 
 def as_scalars(field: Field) -> Field:
-    return replace(field, kind=Kind.SCALAR, count=field.count * 2, items=Items.FIXED)
+    return replace(field, kind=Kind.SCALAR, count=field.count * 2, items=Items.FIXED, is_point=False)
 
 
 def as_fixed(field: Field) -> Field:

@@ -216,11 +216,10 @@ def test_the_value_consistency_is_0_for_an_invariant_critic_alone(actions):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("prior", ["esp", "none"])
-def test_it_learns_navigation(tmp_path, prior):
+@pytest.mark.parametrize(("prior", "steps"), [("esp", "40k"), ("none", "20k")])
+def test_it_learns_navigation(tmp_path, prior, steps):
     """Random actions return -219."""
-    esp(
-        "train", *ALGO, "--prior", prior, "--steps", "20k", "--set", "evaluation.episodes=64", "--out", tmp_path / "run"
-    )
+    few = ["--steps", steps, "--set", "evaluation.episodes=64"]
+    esp("train", *ALGO, "--prior", prior, *few, "--out", tmp_path / "run")
     returns = column(read_metrics(tmp_path / "run" / "metrics.jsonl"), "eval/return_greedy")[1].ravel()
     assert returns[-1] > -195
