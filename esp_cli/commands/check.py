@@ -101,7 +101,7 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
         from esp_cli.policies.loading import open_policy
 
         trained = open_policy(policy)
-    with console.watching("elements") as watch:
+    with console.watching("check", "elements") as watch:
         report = check_symmetry(make_worlds, transforms, watch=watch)
     measured: list[PolicyVerdict] = []
     if trained is not None:

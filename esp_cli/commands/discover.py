@@ -91,7 +91,7 @@ def _discovery(
     def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
         return make(name, num_envs, seeds, settings)
 
-    with console.watching("elements") as watch:
+    with console.watching("check", "elements") as watch:
         return check_symmetry(worlds, transforms, logs, watch)
 
 

@@ -85,7 +85,7 @@ def render(
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
-    with console.watching("draw") as watch:
+    with console.watching("draw", "frames") as watch:
         drawing = draw(request, opened, [where.name for where in named], watch)
     film = f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)"
     picture = f"episode of {drawing.steps} steps -> {out}"

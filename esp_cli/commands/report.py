@@ -166,7 +166,7 @@ def _write_page(material: Material, out: Path | None, films: bool) -> None:
     from esp_cli.reporting.page import draw_films, write_report
 
     if films:
-        with console.TrainingProgress(len(material.runs), description="draw") as progress:
+        with console.TrainingProgress(len(material.runs), description="draw", unit="films") as progress:
             draw_films(material.runs, progress.update)
     if out is not None and material.curves:
         for file in write_report(material, out):

@@ -120,7 +120,7 @@ def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
 @contextmanager
 def measuring(total: int) -> Iterator[Callable[[int], object]]:
     """Yield a progress callback; say afterwards if the machine was too busy to measure."""
-    with console.TrainingProgress(total, description="measure") as progress:
+    with console.TrainingProgress(total, description="measure", unit="runs") as progress:
         busy = busy_with()  # before the measurement, which keeps a core busy itself
         yield progress.update
     if busy > BUSY:

@@ -60,7 +60,7 @@ class TrainingProgress:
             ...
             progress.update(step, {"return": -131.4})
 
-    Steps are counted per seed, as `--steps` is; the rate counts the steps of all seeds together.
+    Steps (or another `unit`) are counted per seed, as `--steps` is; the rate counts those of all seeds together.
     """
 
     def __init__(
@@ -70,11 +70,13 @@ class TrainingProgress:
         start: int = 0,
         description: str = "train",
         clock: Callable[[], float] = time.monotonic,
+        unit: str = "steps",
     ) -> None:
         """Prepare to show progress from `start` (where a resumed run goes on) to `total` steps per seed."""
         self.total = total
         self.num_seeds = num_seeds
         self.description = description
+        self.unit = unit
         self._clock = clock
         self._start = self._done = start
         self._metrics: dict[str, float] = {}
@@ -122,7 +124,7 @@ class TrainingProgress:
         rate = self.rate()
         left_s = (self.total - self._done) * self.num_seeds / rate if rate > 0 else math.inf
         return [
-            f"{format_count(self._done)}/{format_count(self.total)}  {format_rate(rate, self.num_seeds)}  "
+            f"{format_count(self._done)}/{format_count(self.total)}  {format_rate(rate, self.num_seeds, self.unit)}  "
             f"{format_duration(left_s)} left",
             *(f"{name} {value:.4g}" for name, value in self._metrics.items()),
         ]
@@ -134,14 +136,14 @@ class TrainingProgress:
 
 
 @contextmanager
-def watching(description: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows how many parts of how many are done, from the first one on."""
+def watching(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield what shows how many parts (of that unit) of how many are done, from the first one on."""
     with ExitStack() as stack:
         bars: list[TrainingProgress] = []
 
         def watch(done: int, total: int) -> None:
             if not bars:
-                bars.append(stack.enter_context(TrainingProgress(total, description=description)))
+                bars.append(stack.enter_context(TrainingProgress(total, description=description, unit=unit)))
             bars[0].update(done)
 
         yield watch

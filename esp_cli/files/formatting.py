@@ -39,9 +39,9 @@ def file_name(text: str) -> str:
     return "-".join(word.strip(".") for word in words if word.strip(".")) or "unnamed"
 
 
-def format_rate(rate: float, num_seeds: int) -> str:
-    """Return the environment steps a second of all seeds together: (9510, 1) -> "9.51k steps/s"."""
-    return f"{format_count(rate)} {'seed-' if num_seeds > 1 else ''}steps/s"
+def format_rate(rate: float, num_seeds: int, unit: str = "steps") -> str:
+    """Return the environment steps, or what else is counted, a second of all seeds: (9510, 1) -> "9.51k steps/s"."""
+    return f"{format_count(rate)} {'seed-' if num_seeds > 1 else ''}{unit}/s"
 
 
 def format_span(counts: Collection[int]) -> str:

@@ -200,6 +200,8 @@ def test_the_rate_forgets_what_is_half_a_minute_old() -> None:
 def test_progress_before_its_first_update_promises_nothing() -> None:
     with TrainingProgress(total=1000, clock=Clock()) as progress:
         assert progress.parts() == ["0/1k  0 steps/s  ? left"]
+    with TrainingProgress(total=8, clock=Clock(), unit="elements") as progress:
+        assert progress.parts() == ["0/8  0 elements/s  ? left"]
 
 
 def test_work_goes_on_where_nobody_reads_its_notes_any_more() -> None:
