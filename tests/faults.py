@@ -41,10 +41,13 @@ class Fault:
         def function(*args: Any, **kwargs: Any) -> Any:
             if self.place == "replaced":
                 real(*args, **kwargs)
-            elif self.place == "write" and self.left == 1:
-                real(args[0], args[1][: len(args[1]) // 2])
+                return self._count()
+            if self.place == "write" and self.left == 1 and len(args[1]) > 1:
+                written = real(args[0], args[1][: len(args[1]) // 2])
+                self._count()  # a signal may only be noted, and the call then says that it wrote a part
+                return written
             self._count()
-            return None if self.place == "replaced" else real(*args, **kwargs)
+            return real(*args, **kwargs)
 
         (monkeypatch or _planned).setattr(os, name, function)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import stat
 import threading
@@ -173,6 +174,18 @@ def test_a_process_killed_at_a_place_leaves_the_old_or_the_new_file(tmp_path):
     left = {entry.name for entry in tmp_path.iterdir()} - {"a"}
     assert len(left) == 3  # negative control: the kills came while a file was half-written
     assert all(name.startswith(TEMPORARY_PREFIX) for name in left)
+
+
+def test_a_signal_that_is_only_noted_in_the_middle_of_a_write_leaves_every_byte_once(tmp_path, monkeypatch):
+    noted = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: noted.append(number))
+    try:
+        Fault("write", 1, "TERM").plan(monkeypatch)
+        replace_file(tmp_path / "a", b"whole\n")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert noted == [signal.SIGTERM]
+    assert (tmp_path / "a").read_bytes() == b"whole\n"
 
 
 @pytest.mark.parametrize(
