@@ -33,10 +33,10 @@ class LockError(UserError):
 
 @dataclass(frozen=True)
 class HeldFolder:
-    """A folder that a process holds by the lock on a file in it."""
+    """A folder that a process holds by the lock on a file in it, or on itself."""
 
     path: str  # absolute, at which it was taken
-    lock: str  # name of the locked file
+    lock: str  # name of the locked file; empty where the folder itself is locked
     folder_fd: int  # descriptor of the folder
     lock_fd: int  # descriptor of the locked file
     process: int  # that holds it; a fork of that process does not
@@ -114,15 +114,19 @@ def is_held(file: Path) -> bool:
 
 @contextmanager
 def taking_turns(folder: Path) -> Iterator[None]:
-    """Wait until no other process is in this context with a folder, and let none enter; without locks wait for none."""
-    descriptor = os.open(folder, os.O_RDONLY)
+    """Hold a folder of the user's, with no lock file in it, after waiting for other processes that are in this context.
+
+    Where the file system cannot lock it waits for none. Writing goes into this very folder, as in `holding`.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         with suppress(OSError):
             fcntl.flock(descriptor, fcntl.LOCK_EX)
-        if not (folder.exists() and os.path.samestat(folder.stat(), os.fstat(descriptor))):
-            raise LockError(f"{folder} was moved, replaced or deleted meanwhile; run the command again")
+        _held[descriptor] = HeldFolder(_absolute(folder), "", descriptor, descriptor, os.getpid())
+        require_held(folder)
         yield
     finally:
+        _held.pop(descriptor, None)
         os.close(descriptor)
 
 
