@@ -17,16 +17,8 @@ PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope --max-worker-restart 0
 help: ## list what make can do
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(VENV)/.installed ## teach eight robots to change places, evaluate and draw them as a GIF (about 3 minutes)
-	@if [ -f $(DEMO)/config.json ]; then \
-	    echo "Going on with $(DEMO) (make clean starts anew)"; \
-	    $(BIN)/esp train --resume $(DEMO); \
-	else \
-	    $(BIN)/esp train --algo mappo --task formation --set task.convention=tight --steps 200k --out $(DEMO); \
-	fi
-	$(BIN)/esp eval $(DEMO) --episodes 64
-	$(BIN)/esp render $(DEMO) -o $(DEMO)/demo.gif
-	@echo "Look at $(DEMO)/demo.gif"
+demo: $(VENV)/.installed ## train one learner with symmetry and without it: curves and a film of both (2 minutes)
+	$(BIN)/esp demo --out $(DEMO)
 
 test: $(VENV)/.installed-test ## run the tests (5 minutes), but for those marked slow
 	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)

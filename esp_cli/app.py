@@ -148,7 +148,7 @@ app = typer.Typer(
     context_settings=_HELP_NAMES,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    epilog="Start with: esp train --algo mappo --task navigation",
+    epilog="Start with: esp demo (half a minute), or esp train --preset fast --steps 100k (half a minute)",
 )
 
 

@@ -46,18 +46,12 @@ def make(checkout: Path, *targets: str, user: int | None = None) -> str:
 def test_every_target_works_in_a_path_with_spaces_and_umlauts(checkout: Path) -> None:
     (checkout / "runs" / "demo").mkdir(parents=True)
     said = make(checkout, "demo", "test", "check", "docs", "site", "torture", "clean", "help")
-    assert "esp train --algo mappo --task formation" in said
+    assert "esp demo --out runs/demo" in said
     assert "python -m pytest" in said
     assert "ruff check ." in said
     assert "python -m mkdocs build" in said
     assert "python -m tests.torture --minutes 10 --seed" in said
     assert not (checkout / "runs" / "demo").exists()
-
-
-def test_a_demo_that_was_begun_is_gone_on_with(checkout: Path) -> None:
-    (checkout / "runs" / "demo").mkdir(parents=True)
-    (checkout / "runs" / "demo" / "config.json").write_text("{}")
-    assert make(checkout, "demo").startswith("esp train --resume runs/demo")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
@@ -67,4 +61,4 @@ def test_a_user_without_rights_can_do_the_same(checkout: Path) -> None:
             folder.chmod(0o777)
     for entry in (checkout, *checkout.rglob("*")):
         os.chown(entry, NOBODY, NOBODY)
-    assert "esp train" in make(checkout, "demo", user=NOBODY)
+    assert "esp demo" in make(checkout, "demo", user=NOBODY)

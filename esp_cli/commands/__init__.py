@@ -8,6 +8,7 @@ example.
 from __future__ import annotations
 
 COMMANDS: dict[str, str] = {
+    "demo": "esp_cli.commands.demo:demo",
     "train": "esp_cli.commands.train:train",
     "eval": "esp_cli.commands.eval:evaluate",
     "render": "esp_cli.commands.render:render",

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 
 from esp_cli import console
+from esp_cli.console.progress import LiveProgress
 from esp_cli.files.formatting import format_rate
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ class StudyProgress:
         self._clock, self._last_line_s = clock, -math.inf
         self._seen: dict[str, str] = {}
         self._bars: dict[str, TaskID] = {}
-        self._live: Progress | None = None
+        self._live: LiveProgress | None = None
 
     def __enter__(self) -> StudyProgress:
         if (live := console.live_progress()) is not None:
@@ -65,7 +66,7 @@ class StudyProgress:
                 elsewhere = ", which another process still trains" if run.status == "elsewhere" else ""
                 console.note(f"{_SAID[run.status]} {name}{spent}{elsewhere}")
 
-    def _draw(self, live: Progress, snapshot: Snapshot) -> None:
+    def _draw(self, live: LiveProgress, snapshot: Snapshot) -> None:
         for run in snapshot.runs:
             name = run.cell.name
             if run.is_active and name not in self._bars:

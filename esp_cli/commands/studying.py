@@ -159,7 +159,13 @@ def print_forecast(found: Forecast, json: str | None, what: str) -> None:
     console.result(json, found, show)
 
 
-def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests: Sequence[int]) -> list[str]:
+def run_cells(
+    folder: StudyFolder,
+    study: Study,
+    resources: Resources,
+    requests: Sequence[int],
+    progress: StudyProgress | None = None,
+) -> list[str]:
     """Run the cells of a study in its folder, which the caller's lock holds; return the names of those that failed.
 
     Of cells that train the same, the first is run, and the others take its run over. `requests` is not empty once the
@@ -171,23 +177,24 @@ def run_cells(folder: StudyFolder, study: Study, resources: Resources, requests:
     for cell, twin in folder.adopt_finished(cells, resources.reused):
         console.note(f"taking over {twin} as {cell.name}")
     runs = folder.unlike(cells)
-    failed = follow(Scheduler(folder, runs, min(resources.jobs, len(runs)), resources.engine), requests)
+    scheduler = Scheduler(folder, runs, min(resources.jobs, len(runs)), resources.engine)
+    failed = follow(scheduler, requests, progress)
     for cell, twin in folder.adopt_finished(cells, [folder]):
         console.note(f"taking over {twin} as {cell.name}, which trains the same")
     return failed
 
 
-def follow(scheduler: Scheduler, requests: Sequence[int]) -> list[str]:
-    """Run a scheduler with live progress until all runs have ended; return the names of those that failed."""
+def follow(scheduler: Scheduler, requests: Sequence[int], progress: StudyProgress | None = None) -> list[str]:
+    """Run a scheduler with live progress, by default a bar for each run, and return the names of runs that failed."""
     finished, folder = sum(run.status == "finished" for run in scheduler.runs), scheduler.folder
     console.note(
         f"{folder.title}: {len(scheduler.runs)} runs, {finished} of them finished, {scheduler.jobs} side by side -> "
         f"{folder.path}"
     )
-    with StudyProgress() as progress:
+    with progress or StudyProgress() as shown:
 
         def listen(snapshot: Snapshot) -> bool:
-            progress.update(snapshot)
+            shown.update(snapshot)
             return not requests
 
         scheduler.run(listen)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 
+from rich.console import RenderableType
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
 
@@ -48,9 +49,21 @@ class LineColumn(ProgressColumn):
         return Text(progress_line(task.description, share, task.fields["status"], width), no_wrap=True, overflow="crop")
 
 
-def live_progress() -> Progress | None:
-    """Return a live display with a line per task, or None where standard error is no terminal."""
-    return Progress(LineColumn(), console=err) if err.is_terminal else None
+class LiveProgress(Progress):
+    """A live display with a line per task."""
+
+    above: RenderableType = Text(end="")
+    """What is shown above the lines."""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Yield what is drawn."""
+        yield self.above
+        yield from super().get_renderables()
+
+
+def live_progress() -> LiveProgress | None:
+    """Return a live display, or None where standard error is no terminal."""
+    return LiveProgress(LineColumn(), console=err) if err.is_terminal else None
 
 
 class TrainingProgress:

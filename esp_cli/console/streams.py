@@ -21,7 +21,20 @@ from rich.text import Text
 
 from esp_cli.files.formatting import escaped
 
-_IN_ASCII = {"±": "+-", "━": "=", "╌": "-", "→": "->", "–": "-", "…": "...", "²": "2"}
+_IN_ASCII = {
+    "±": "+-",
+    "━": "=",
+    "╌": "-",
+    "→": "->",
+    "–": "-",
+    "…": "...",
+    "²": "2",
+    "●": "#",
+    "○": "o",
+    "│": "|",
+    "└": "+",
+    "─": "-",
+}
 """What is written for a character that a terminal cannot show; a question mark for any other."""
 
 

@@ -77,6 +77,7 @@ class Drawing:
     path: Path  # the file
     frames: int  # of a film; of a picture, 1
     steps: int  # of all episodes
+    returns: tuple[float, ...]  # of each policy, mean over its episodes
     note: str | None  # a sentence for the user about how it was drawn, or None
 
 
@@ -118,7 +119,8 @@ def draw(
         else:
             write_png(request.out, taken[-1].draw(painter))
     steps = sum(episode.steps for episode in recorded[0])
-    return Drawing(request.out, 1 if request.kind == PICTURE else len(taken), steps, painter.note)
+    returns = tuple(sum(episode.returns[-1] for episode in own) / len(own) for own in recorded)
+    return Drawing(request.out, 1 if request.kind == PICTURE else len(taken), steps, returns, painter.note)
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:

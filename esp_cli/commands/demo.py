@@ -1,0 +1,141 @@
+"""`esp demo`: one learner with the symmetry prior and without it, side by side."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from esp_cli import console
+from esp_cli.commands import options
+from esp_cli.commands.study_progress import StudyProgress
+from esp_cli.console.curves import draw_curves
+from esp_cli.files.formatting import format_exactly
+
+if TYPE_CHECKING:
+    from esp_cli.studies.run_set import Cell
+    from esp_cli.studies.scheduler import Snapshot
+    from esp_cli.studies.study import Study, StudyFolder
+
+EPILOG = """Examples:\n
+    esp demo\n
+    esp demo --task navigation --steps 100k --out runs/demo-navigation"""
+
+STEPS, SEEDS = 50_000, (0, 1, 2)
+LABELS = {"none": "MAPPO", "esp": "MAPPO with symmetry"}
+CURVES, FILM = "curves.png", "film.gif"
+_EVALUATIONS, _EPISODES, _FILM_EPISODES, _FILM_PIXELS = 10, 100, 3, 320
+
+
+def demo(
+    task: options.TaskOption = "predator-prey",
+    steps: options.StepsOption = STEPS,
+    seeds: options.SeedsOption = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of both runs, the picture and the film.")] = Path(
+        "runs/demo"
+    ),
+    settings: options.SetOption = None,
+) -> None:
+    """Train MAPPO with symmetry and without it, in half a minute: two curves, a picture, and a film of both.
+
+    Called again, it goes on where it was.
+    """
+    from esp_cli.commands import studying
+    from esp_cli.commands.stopping import stop_requests
+    from esp_cli.studies.catalogue import refuse_untrainable
+    from esp_cli.studies.engine import LocalEngine
+    from esp_cli.studies.study import StudyFolder
+
+    study = _plan(task, steps, seeds or SEEDS, out, settings or [])
+    refuse_untrainable(study)
+    with StudyFolder.held(out), stop_requests("stopping both runs after their iteration") as requests:
+        folder = StudyFolder.create(out, study)
+        resources = studying.Resources(LocalEngine(), 2, (), check=True)
+        failed = studying.run_cells(folder, study, resources, requests, LiveCurves(folder))
+    if requests:
+        console.note(f"stopped; go on with: {study.command}")
+        raise typer.Exit(130)
+    studying.refuse_failed(failed, out)
+    _show(folder)
+
+
+def _plan(task: str, steps: int, seeds: tuple[int, ...], out: Path, settings: list[str]) -> Study:
+    """Return the study of the prior of one task, its runs called by what they differ in."""
+    from esp_cli.studies.catalogue import Request, plan
+    from esp_cli.training.config import seed_words
+
+    options.register_named([task])
+    words = ["esp", "demo", "--task", task, "--steps", format_exactly(steps), *seed_words(seeds)]
+    words += [word for text in settings for word in ("--set", text)]
+    every = {"evaluation.every_steps": max(1, steps // _EVALUATIONS)}
+    request = Request(
+        tasks=(task,),
+        steps=((None, steps),),
+        seeds=seeds,
+        overrides=every | options.parse_assignments(settings),
+        episodes=_EPISODES,
+        command=shlex.join([*words, "--out", str(out)]),
+    )
+    study = plan("ablate-prior", request)
+    cells = tuple(cell.model_copy(update={"variant": LABELS[cell.config.prior.kind]}) for cell in study.cells)
+    return study.model_copy(update={"title": "One learner with symmetry and without it", "cells": cells})
+
+
+class LiveCurves(StudyProgress):
+    """Progress of a study of two runs with their learning curves: above the bars, or as lines in a pipe."""
+
+    def __init__(self, folder: StudyFolder) -> None:
+        super().__init__()
+        self._folder, self._told = folder, 0
+
+    def update(self, snapshot: Snapshot) -> None:
+        """Show where the runs are, and draw their curves."""
+        super().update(snapshot)
+        curves = {cell.variant: self._points(cell) for cell in self._folder.study.cells}
+        if self._live is not None:
+            steps = self._folder.study.cells[0].config.steps
+            self._live.above = draw_curves(curves, steps, console.err.width)
+            return
+        both = list(zip(*curves.values(), strict=False))
+        for points in both[self._told :]:
+            returns = (f"{label} {value:.1f}" for label, (_, value) in zip(curves, points, strict=True))
+            console.note(f"after {console.format_count(points[0][0])} steps: return {', '.join(returns)}")
+        self._told = len(both)
+
+    def _points(self, cell: Cell) -> list[tuple[float, float]]:
+        """Return step and mean greedy return over seeds of each evaluation so far."""
+        from esp_cli.training.folder_names import METRICS
+        from esp_cli.training.metrics import NoMetricError, column, read_metrics
+
+        path = self._folder.run_path(cell) / METRICS
+        try:
+            steps, values = column(read_metrics(path) if path.exists() else [], "eval/return_greedy")
+        except NoMetricError:
+            return []
+        return list(zip(steps.tolist(), values.mean(axis=1).tolist(), strict=True))
+
+
+def _show(folder: StudyFolder) -> None:
+    """Write the picture and the film, and print what was seen."""
+    from esp_cli.drawing.draw import Request, draw
+    from esp_cli.policies.loading import TrainedPolicy
+    from esp_cli.reporting import study_figures
+    from esp_cli.reporting.answer import answer
+    from esp_cli.reporting.collect import collect_study
+    from esp_cli.training.build import build_environment
+
+    material, out = collect_study(folder), folder.path
+    picture, _ = study_figures.draw_curves(material, out / CURVES)
+    console.note(f"curves -> {picture.png}")
+    trained = [TrainedPolicy.read(folder.run_path(cell)) for cell in folder.study.cells]
+    if build_environment(trained[0].config.of_one_seed(), 1, "film").has("scene"):
+        request = Request(out / FILM, episodes=_FILM_EPISODES, size=_FILM_PIXELS)
+        with console.watching("draw", "frames") as watch:
+            drawing = draw(request, trained, [*LABELS.values()], watch)
+        returns = (f"{label} {value:.1f}" for value, label in zip(drawing.returns, LABELS.values(), strict=True))
+        console.note(f"film of the same {_FILM_EPISODES} episodes, return {', '.join(returns)} -> {drawing.path}")
+    for text in answer(material):
+        console.text(text)
+    console.note(f"next: {shlex.join(['esp', 'report', str(out), '--films'])}    esp train --task formation")

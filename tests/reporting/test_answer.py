@@ -1,0 +1,56 @@
+"""The answer of a report: sentences that are made from the numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from esp_cli.reporting.answer import answer
+from esp_cli.reporting.collect import collect_study
+from esp_cli.studies.study import StudyFolder
+from tests.studies.small_studies import small_study, write_run
+
+
+def answered(path: Path, plain: list[list[float | None]], ours: list[list[float | None]]) -> list[str]:
+    """The answer on a study of two runs with these evaluations at 0 and 100 and the last as the final evaluation."""
+    folder = StudyFolder.create(path, small_study())
+    for cell, rows in zip(folder.study.cells, (plain, ours), strict=True):
+        write_run(folder, cell, rows, rows[-1])
+    return answer(collect_study(folder))
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"),
+    [
+        ([-121.0, -121.0, -118.0], "MAPPO-ESP is better than MAPPO: the difference is +40.00, 95 % interval [39"),
+        ([-161.0, -158.0, -164.0], "MAPPO-ESP is not told apart from MAPPO: the difference is -1.00"),
+        ([-182.0, -180.0, -178.0], "MAPPO-ESP is worse than MAPPO: the difference is -20.00"),
+    ],
+)
+def test_the_verdict_follows_the_interval_of_the_difference(tmp_path: Path, ours: list, verdict: str) -> None:
+    first, second, third = answered(tmp_path / "s", [[-200.0] * 3, [-161.0, -160.0, -159.0]], [[-150.0] * 3, ours])
+    assert first.endswith(", where 0 is the random policy and 1 the best hand-written one).")
+    assert "and MAPPO has -160.00 ± 0.58 (greedy return after 100 steps, 3 seeds; normalised" in first
+    assert second.startswith(verdict)
+    assert third == "The mean over seeds first has -160.00 after 0 steps of MAPPO-ESP, 100 of MAPPO."
+
+
+def test_a_learner_that_stays_below_is_compared_at_what_both_have(tmp_path: Path) -> None:
+    *_, third = answered(tmp_path / "s", [[-200.0] * 3, [-100.0] * 3], [[-190.0] * 3, [-150.0] * 3])
+    assert third == "The mean over seeds first has -150.00 after 100 steps of MAPPO-ESP, 100 of MAPPO."
+
+
+def test_a_stopped_seed_leaves_no_verdict(tmp_path: Path) -> None:
+    _, second, *_ = answered(tmp_path / "s", [[-200.0] * 3, [-160.0] * 3], [[-150.0] * 3, [-120.0, None, -119.0]])
+    assert second == "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
+
+
+def test_of_several_runs_the_better_and_the_worse_are_counted(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",)))
+    for k, (cell, end) in enumerate(zip(folder.study.cells, (-160.0, -150.0, -160.0, -170.0), strict=True)):
+        write_run(folder, cell, [[-200.0] * 3, [end, end, end]], [end, end - k, end + k])
+    (text,) = answer(collect_study(folder))
+    assert text == (
+        "Of 3 runs beside their reference: better 1, not told apart 1, worse 1 (95 % intervals of the difference)."
+    )
