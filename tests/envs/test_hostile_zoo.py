@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 import types
 
@@ -204,12 +205,18 @@ MADE = {
     "too wide": (task(reading=lambda *_: [1, 2, 3]), "a sees 3 numbers, but the layout has 2"),
     "a box": (task(observation=spaces.Box(0, 1, (2,))), r"the observation of Zoo is a Box; give a layout"),
     "a space": (task(action=spaces.Discrete(3)), r"the action of Zoo is a Discrete; give Discrete\(...\) or"),
+    "metrics as a text": (task(metrics=("hits")), r"the metrics of Zoo are a text; give a tuple: \('hits',\)"),
+    "twins": (task(of={"possible_agents": ("a", "a")}), "'possible_agents' names an agent twice"),
+    "agents by a method": (task(of={"possible_agents": lambda self: ["a"]}), "a Team, which has no 'possible_agents'"),
+    "state as an array": (task(of={"state": np.zeros(2)}, state=Task.observation), "has no 'state' method"),
+    "state raises": (task(of={"state": lambda self: 1 / 0}, state=Task.observation), "raises in 'state': ZeroDivision"),
     "no state": (task(state=Task.observation), "its environment has no 'state' method"),
     "unequal": (
         box([-1, -2], [1, 2], "d4*agents"),
         "by 'push', a vector, between .*, which 'd4.agents' does not leave alone",
     ),
     "off centre": (box([0, 0], [1, 1], "c2"), "by 'push', a vector, between .*, which 'c2' does not leave alone"),
+    "boundless": (box([-3e38, -3e38], [3e38, 3e38], "c1"), "acts in Box.*, but the task says 2 bounded real numbers"),
     "any turn": (box([-1, -2], [1, 2], "o2"), "'o2' does not leave alone; declare a smaller symmetry"),
     "one-sided": (box([0], [1], "flip-x", TURN), "by 'turn', a pseudoscalar, between .*, which 'flip-x' does"),
 }
@@ -246,6 +253,7 @@ STEPPED = {
     "no action": (task(masks=True, allowed=lambda *_: np.zeros(3)), "the mask of a allows nothing; leave it one"),
     "state shrinks": (task(of={"state": lambda self: [*self.x.values()][: 2 - self.time]}, state=Task.observation),
                       "the state has 1 numbers, expected 2"),
+    "exits": (task(at(2, lambda self, out: sys.exit(0))), "copy 0 of Zoo raises in 'step': SystemExit: 0"),
     "raises": (task(lambda self, out: {}["x\ny"]), "copy 0 of Zoo raises in 'step': KeyError"),
 }  # fmt: skip
 
@@ -295,6 +303,7 @@ RIGHT = {
     "action_spaces": (task(of={"action_space": None, "action_spaces": SPACES}), "...c...c."),
     "a list is read": (task(reading=lambda self, name, seen: seen.tolist()), "...c...c."),
     "a tensor is read": (task(reading=lambda self, name, seen: torch.tensor(seen).requires_grad_()), "...c...c."),
+    "a half tensor is read": (task(reading=lambda self, name, seen: torch.tensor(seen).bfloat16()), "...c...c."),
     "a column is read": (task(reading=lambda self, name, seen: seen.reshape(2, 1)), "...c...c."),
     "rewards as arrays": (task(put(REWARD, {"a": np.ones(1), "b": torch.ones(())})), "...c...c."),
     "names are numbers": (task(of={"possible_agents": (0, 1)}), "...c...c."),

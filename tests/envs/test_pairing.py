@@ -194,13 +194,13 @@ class Listed:
 
     def step(self, actions):
         self.sums = self.sums + np.array(actions, np.float32)
-        return tuple(self.sums[:, None]), list(self.sums), False, False, {}
+        return tuple(self.sums[:, None]), list(self.sums), False, False, {"highest": self.sums.max()}
 
 
 class Adding(ParallelTask):
     observation = layout(Field("sum", Kind.SCALAR))
     action = Discrete(Kind.SCALAR, ((0.0,), (1.0,), (2.0,)), ("none", "one", "two"))
-    symmetry, convention = "agents", "sum"
+    symmetry, convention, metrics = "agents", "sum", ("highest",)
 
     def make_one(self):
         return Listed()
@@ -214,6 +214,7 @@ def test_agents_in_tuple_spaces_act_as_the_task_says() -> None:
     env.reset()
     step = env.step(torch.tensor([[[2, 2], [1, 0]]]))
     assert step.reward.tolist() == [[[2.0, 0.0], [1.0, 2.0]]]
+    assert step.metrics["highest"].tolist() == [[2.0, 2.0]]
 
 
 def test_unlike_agents_are_refused_with_what_to_do() -> None:

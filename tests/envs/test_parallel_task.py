@@ -298,6 +298,8 @@ class Failing(Walking):
                     return seen, reward, never, over, infos
                 if how == "raise":
                     raise KeyError("lost")
+                if how == "garble":
+                    raise ValueError("not \udc80 text")
                 if how == "die":
                     os.kill(os.getpid(), signal.SIGKILL)
                 if how == "apart":
@@ -316,6 +318,7 @@ class Failing(Walking):
     ("how", "sentence"),
     [
         ("raise", "of Raise raises in 'step': KeyError: 'lost'"),
+        ("garble", "of Garble raises in 'step': ValueError: not "),
         ("apart", "walker_1 of Apart ends before the others; set 'agents_end = True' in the class"),
         ("early", "an episode of Early ends before its horizon; set 'terminates = True' in the class"),
         ("cut", "an episode of Cut ends before its horizon; give both the same number of steps"),

@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from esp_cli.symmetry import build_transform, environment_errors, parse_elements
-from esp_envs import Environment, Field, Kind, generators_for, layout, make, register
+from esp_envs import Environment, Field, Kind, UserError, generators_for, layout, make, register
 from esp_envs.adapters import seed_of
 from esp_envs.conformance import Subject, check
 from tests.own_tasks import save_page_files
 
 vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
 from esp_envs.adapters import vmas_scenarios  # noqa: E402
+from esp_envs.adapters.vmas import VmasTask  # noqa: E402
 
 CASES = [
     ("Navigation", {}),
@@ -169,3 +170,71 @@ def test_a_scenario_of_ones_own_layout_keeps_every_promise(tmp_path, monkeypatch
 def test_a_gpu_runs_the_same_task(name: str, settings) -> None:
     findings = list(check(Subject(lambda n, seeds: worlds(name, {**settings, "horizon": 8}, n, seeds, "cuda"), 1e-3)))
     assert [finding for finding in findings if finding.broken] == []
+
+
+class Drift(vmas.simulator.scenario.BaseScenario):
+    """Two agents that a member of a subclass gives something odd."""
+
+    of_agent = {}  # noqa: RUF012
+
+    def make_world(self, batch_dim, device, **_):
+        world = vmas.simulator.core.World(batch_dim, device)
+        for k in range(2):
+            world.add_agent(vmas.simulator.core.Agent(name=f"agent_{k}", **self.of_agent))
+        return world
+
+    def reset_world_at(self, env_index=None):
+        for agent in self.world.agents:
+            agent.set_pos(torch.zeros(2), batch_index=env_index)
+
+    def observation(self, agent):
+        return torch.cat([agent.state.pos, agent.state.vel], -1)
+
+    def reward(self, agent):
+        return -agent.state.pos.norm(dim=-1)
+
+
+def drifting(**members):
+    scenario = type("Odd", (Drift,), members)()
+
+    class Drifting(VmasTask):
+        symmetry, convention, terminates = "agents", "none", True
+
+        def seen(self):
+            return layout(Field("position", Kind.VECTOR), Field("velocity", Kind.VECTOR))
+
+    Drifting.scenario = scenario
+    env = Drifting(Drifting.Settings(), 3, generators_for((0,)))
+    env.reset()
+    return env.step(env.random_action())
+
+
+@pytest.mark.parametrize(
+    ("members", "sentence"),
+    [
+        (
+            {"observation": lambda _, agent: {"x": agent.state.pos}},
+            r"observation 0 is a dict; give each",
+        ),
+        (
+            {"observation": lambda _, agent: torch.zeros(3, 4 if agent.name == "agent_0" else 5)},
+            r"observation 1 is \[3, 5\]; give each agent a tensor \[3, 4\]",
+        ),
+        ({"reward": lambda *_: torch.ones(())}, r"reward 0 is \[\]; give each agent a tensor \[3, 1\]"),
+        ({"reward": lambda *_: torch.ones(3, 2)}, r"reward 0 is \[3, 2\]"),
+        ({"done": lambda _: torch.tensor(False)}, r"done 0 is \[\]; give"),
+        ({"of_agent": {"action_size": 3}}, "agent_0 acts by other numbers than a force in the plane"),
+        ({"of_agent": {"u_range": [1.0, 0.5]}}, "agent_0 acts by other numbers than a force in the plane"),
+    ],
+)
+def test_what_a_scenario_gives_in_another_form_is_refused(members, sentence) -> None:
+    with pytest.raises(UserError, match=sentence):
+        drifting(**members)
+
+
+def test_columns_and_other_types_of_numbers_are_read() -> None:
+    step = drifting(
+        reward=lambda *_: torch.ones(3, 1, dtype=torch.int64), done=lambda scenario: torch.tensor([[0], [1], [0]])
+    )
+    assert step.reward.dtype == torch.float32
+    assert step.terminated.tolist() == [[False, True, False]]

@@ -24,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
+from esp_envs.installed import last_line
 
 _RESET, _STEP, _PLACE, _LEAVE = b"reset", b"step", b"place", b"leave"
 TERMINATED, TRUNCATED = 1, 2
@@ -208,22 +209,22 @@ def _work(
         nonlocal stepper
         stepper = make_stepper(board, share)
 
-    failure = _failure_of(begin)
-    pipe.send_bytes(failure.encode())
+    pipe.send_bytes(_failure_of(begin))
     if stepper is None:
         return
     commands = {_RESET: stepper.reset, _STEP: stepper.step, _PLACE: stepper.place}
     with contextlib.suppress(EOFError, ConnectionError):
         while (word := pipe.recv_bytes()) != _LEAVE:
-            pipe.send_bytes(_failure_of(commands[word]).encode())
+            pipe.send_bytes(_failure_of(commands[word]))
 
 
-def _failure_of(command: Callable[[], None]) -> str:
+def _failure_of(command: Callable[[], None]) -> bytes:
     try:
         command()
     except Exception as failure:
-        return str(failure) if isinstance(failure, UserError) else f"{type(failure).__name__}: {failure}"
-    return ""
+        said = str(failure) if isinstance(failure, UserError) else last_line(failure)
+        return said.encode(errors="backslashreplace")
+    return b""
 
 
 def _stop(workers: Sequence[tuple[Connection, ForkProcess]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
+from esp_envs.installed import last_line
 
 PARALLEL, SINGLE = "a PettingZoo ParallelEnv", "a Gymnasium environment"
 _AEC, _VECTOR = "a PettingZoo AEC environment, whose agents act in turn", "a vector of environments"
@@ -38,9 +39,11 @@ def require_kind(env: Any, wanted: str, maker: str) -> None:
 def _kind(env: Any, wanted: str) -> str:
     if env is None or isinstance(env, type):
         return "nothing" if env is None else f"the class {env.__name__} instead of an object of it"
-    for kind, sign in ((_VECTOR, "single_action_space"), (_AEC, "agent_iter"), (PARALLEL, "possible_agents")):
+    for kind, sign in ((_VECTOR, "single_action_space"), (_AEC, "agent_iter")):
         if hasattr(env, sign):
             return kind
+    if isinstance(getattr(env, "possible_agents", None), Iterable):
+        return PARALLEL
     methods = all(callable(getattr(env, name, None)) for name in ("reset", "step"))
     space = getattr(env, "action_space", None)
     if methods and not (space is None or callable(space) or (wanted == PARALLEL and isinstance(space, Mapping))):
@@ -64,19 +67,19 @@ class _Listed:
         self.action_spaces = dict(zip(self.possible_agents, spaces, strict=True))
 
     def reset(self, seed: int) -> tuple[Mapping[Any, Any], ...]:
-        seen, _ = self._env.reset(seed=seed)
-        return self._named(seen), {}
+        seen, infos = self._env.reset(seed=seed)
+        return self._named(seen), self._named(infos)
 
     def step(self, actions: Mapping[Any, Any]) -> tuple[Mapping[Any, Any], ...]:
-        seen, *parts, _ = self._env.step([actions[name] for name in self.possible_agents])
-        return self._named(seen), *map(self._named, parts), {}
+        return tuple(map(self._named, self._env.step([actions[name] for name in self.possible_agents])))
 
     def close(self) -> None:
         self._env.close()
 
     def _named(self, part: Any) -> dict[str, Any]:
-        """Return what each agent gets; one number or flag is for all."""
-        each = [part] * len(self.possible_agents) if np.ndim(part) == 0 and not isinstance(part, tuple) else part
+        """Return what each agent gets; one number, flag or info is for all."""
+        is_one = isinstance(part, Mapping) or (not isinstance(part, tuple | list) and np.ndim(part) == 0)
+        each = [part] * len(self.possible_agents) if is_one else part
         return dict(zip(self.possible_agents, each, strict=True))
 
 
@@ -137,6 +140,7 @@ def numbers(given: Any, what: str, width: int | None = None) -> NDArray[np.float
     """
     if isinstance(given, torch.Tensor):
         given = given.detach().cpu()
+        given = given.float() if given.dtype == torch.bfloat16 else given  # which numpy does not have
     try:
         row = np.asarray(given)
     except (TypeError, ValueError):  # rows of unequal length
@@ -185,6 +189,5 @@ def naming(place: str, what: str) -> Iterator[None]:
         yield
     except UserError:
         raise
-    except Exception as error:
-        line = (str(error).strip().splitlines() or [""])[-1]
-        raise UserError(f"{place} raises in '{what}': {type(error).__name__}: {line}") from error
+    except (Exception, SystemExit) as error:  # an environment that calls sys.exit ends no run with code 0
+        raise UserError(f"{place} raises in '{what}': {last_line(error)}") from error

@@ -115,6 +115,8 @@ class Copy:
         if not self.learners:
             listed = ", ".join(map(str, self.agents)) or "none"
             raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {listed}")
+        if len(set(self.agents)) < len(self.agents):
+            raise UserError("'possible_agents' names an agent twice; give each a name of its own")
         self.rest = [name for name in self.agents if name not in self.learners]
         self.simulator = Simulator(self.env, self.learners)
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
@@ -170,10 +172,9 @@ class Copy:
                 raise UserError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
             else:
                 _require_round(task, name, box)
-        if task.state is not None and not hasattr(self.env, "state"):
+        if task.state is not None and not callable(getattr(self.env, "state", None)):
             raise UserError("the task says what the state is, but its environment has no 'state' method")
-        if task.state is not None and np.size(self.env.state()) != task.state.width:
-            got = np.size(self.env.state())
+        if task.state is not None and (got := self.state().size) != task.state.width:
             raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
 
     def _require_alike(self, first: Mapping[Any, Any]) -> None:
@@ -203,6 +204,11 @@ class Copy:
         low, high = box
         action = np.nan_to_num(action)  # of a seed that is about to stop: its environment should not stop the others
         return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)
+
+    def state(self, k: int = 0) -> Array:
+        """Return the global state that the environment of copy k keeps."""
+        with self.naming("state", k):
+            return foreign.numbers(self.env.state(), "the state")
 
     def take(self) -> Array:
         """Return the state of the simulator."""
@@ -251,6 +257,8 @@ def _has(place: Any, name: str) -> bool:
 
 def _bounds(space: Any) -> tuple[Array, Array] | None:
     """Return the bounds of a finite Box of real numbers, None for any other space."""
-    if not hasattr(space, "low") or space.dtype.kind != "f" or not np.isfinite([space.low, space.high]).all():
+    if not hasattr(space, "low") or space.dtype.kind != "f":
         return None
-    return np.asarray(space.low), np.asarray(space.high)
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_finite = np.isfinite(space.high - space.low).all()  # bounds of the largest numbers are none
+    return (np.asarray(space.low), np.asarray(space.high)) if is_finite else None

@@ -42,6 +42,33 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
     return make
 
 
+def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = None) -> Tensor:
+    """Return what a scenario gives each agent as [E, N, width].
+
+    Raises:
+        UserError: an agent gets something else than that many numbers in each world, or other numbers than the first.
+    """
+    for k, one in enumerate(given):
+        is_tensor = isinstance(one, Tensor) and one.ndim > 0
+        wanted = [num_envs, one.shape[-1] if width is None and is_tensor and k == 0 else width or 0]
+        if not is_tensor or one.numel() != wanted[0] * wanted[1]:
+            shown = list(one.shape) if isinstance(one, Tensor) else f"a {type(one).__name__}"
+            raise UserError(f"the scenario's {what} {k} is {shown}; give each agent a tensor {wanted}")
+        width = wanted[1]
+    return torch.stack([one.reshape(num_envs, -1) for one in given], 1).float()
+
+
+def force_of(agent: Any) -> float:
+    """Return the full force of an agent.
+
+    Raises:
+        UserError: it acts by something else than a force in the plane that has one range.
+    """
+    if agent.action_size != 2 or torch.as_tensor(agent.u_range).numel() != 1 or not agent.silent:
+        raise UserError(f"agent {agent.name} acts by other numbers than a force in the plane with one u_range")
+    return float(agent.u_range)
+
+
 class RandomNumbers:
     """The random numbers of one simulator. VMAS has one state for all simulators; this exchanges it around a call."""
 

@@ -161,5 +161,5 @@ class CopyStepper:
         if self._simulated:
             state = copy.take()
         else:
-            state = board.obs[when, k].reshape(-1) if task.state is None else copy.env.state()
+            state = board.obs[when, k].reshape(-1) if task.state is None else copy.state(k)
         board.state[when, k] = foreign.numbers(state, "the state", board.state.shape[-1])

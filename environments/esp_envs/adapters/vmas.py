@@ -97,11 +97,11 @@ class VmasTask(Environment):
             totals=("done",) if self.terminates else (),
             settings=settings.model_dump(),
         )
-        self._range = torch.tensor([float(agent.u_range) for agent in self._sims[0].agents], device=self.device)
+        self._range = torch.tensor([simulation.force_of(agent) for agent in self._sims[0].agents], device=self.device)
         self._base = torch.zeros(self.num_seeds, dtype=torch.int64)
         lead = (self.num_seeds, num_envs)
         self._begun, self._time = torch.zeros(2, *lead, dtype=torch.int64).unbind()  # on the CPU: clocks are asked
-        width = self.reading(torch.stack(self._sims[0].reset(), 1)).shape[-1]
+        width = self.reading(simulation.rows(self._sims[0].reset(), "observation", num_envs)).shape[-1]
         if width != self.spec.observation.width:
             raise UserError(
                 f"the scenario shows {width} numbers to an agent, but the layout has {self.spec.observation.width}"
@@ -130,18 +130,19 @@ class VmasTask(Environment):
             with self._numbers[s].drawn():
                 obs, reward, done, infos = sim.step(list(force[s].unbind(1)))
             here = self._look(sim, obs)
+            done = simulation.rows([done], "done", self.num_envs, 1)[:, 0, 0].bool()
             over = done.cpu() if self.terminates else torch.zeros(self.num_envs, dtype=torch.bool)
             ends.append(over)
             reached.append(here)
             following.append(self._renew(s, over | due[s], here))
-            rewards.append(torch.stack([one.reshape(self.num_envs) for one in reward], 1))  # some give [E, 1]
+            rewards.append(simulation.rows(reward, "reward", self.num_envs, 1).squeeze(-1))
             measured.append([done.float(), *(_mean(infos, name, done) for name in self.metrics)])
         terminated = torch.stack(ends)
         final = _joined(reached) if self.terminates or bool(due.any()) else None
         columns = (torch.stack(column) for column in zip(*measured, strict=True))
         return Step(
             next=_joined(following),
-            reward=torch.stack(rewards).float(),
+            reward=torch.stack(rewards),
             terminated=terminated.to(self.device),
             truncated=(due & ~terminated).to(self.device),
             final=final,
@@ -204,7 +205,7 @@ class VmasTask(Environment):
         return Observation(obs, torch.where(which[None, :, None], new.state, here.state))
 
     def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:
-        seen = self.reading(torch.stack(list(obs), 1).float())
+        seen = self.reading(simulation.rows(obs, "observation", self.num_envs))
         return Observation(seen.unsqueeze(0), self._entities.read(sim).unsqueeze(0))
 
 
