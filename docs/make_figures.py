@@ -33,9 +33,8 @@ RESULTS = {
 }
 """Results in docs/measured -> their figures, of which each learner has one."""
 BREAKING = {
-    "breaking-navigation": ("", "-others", "-wind", "-relaxed"),
+    "breaking-navigation-1m": ("", "-wind", "-others"),
     "breaking-predator-prey": ("", "-others"),
-    "breaking-formation": ("", "-others", "-measured", "-relaxed"),
     "breaking-formation-1m": ("", "-others"),
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
@@ -69,7 +68,6 @@ class Panel:
 
 
 FIGURES: dict[str, tuple[Panel, ...]] = {
-    "choices": (Panel("choices", "run", ["run"], "return at 500k", "greedy return at 500k steps"),),
     "wildlife-learners": (
         Panel("wildlife", "learner", ["learner"], "drawn actions", "return with drawn actions"),
         Panel("wildlife", "learner", ["learner"], "greedy", "greedy return"),
@@ -77,19 +75,6 @@ FIGURES: dict[str, tuple[Panel, ...]] = {
     "replay": (
         Panel("replay", "learner and copies", ["learner and copies"], "greedy return", "copies, 500k steps"),
         Panel("replay", "", [""], "150k", "the horizon, 150k steps"),
-    ),
-    "maddpg-settings": (
-        Panel("maddpg-settings", "learning rates", ["learning rates", "others"], "100k steps", "return at 100k steps"),
-    ),
-    "qmix-settings": (
-        Panel(
-            "qmix-settings",
-            "learning rate",
-            ["learning rate", "mixer sees", "`td_lambda`", "`target_every`"],
-            "100k steps",
-            "navigation, with the prior, 100k steps",
-        ),
-        Panel("qmix-settings", "", [""], "greedy return at 200k", "predator-prey, plain, 200k steps"),
     ),
     "speed": (Panel("speed", "layout", ["layout", "seeds"], "seed-steps/s", "seed-steps per second"),),
 }

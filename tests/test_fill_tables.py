@@ -88,7 +88,7 @@ def test_a_table_of_final_returns_takes_those_of_drawn_actions(page):
     assert "Returns are those of drawn actions." in drawn
     page.write_text(page.read_text().replace("comparison stochastic", "steps stochastic"))
     with pytest.raises(
-        ValueError, match=r"asks for the table 'steps stochastic'; .*; returns, paper, comparison take a mode"
+        ValueError, match=r"asks for the table 'steps stochastic'; .*; returns, paper, comparison, pairs take a mode"
     ):
         filled(page)
 
@@ -102,6 +102,22 @@ def longer(page, seeds=(0, 1), **change):
     )
     (page.parent / "measured" / "b.json").write_text(json.dumps(found))
     page.write_text("<!-- results: measured/a.json measured/b.json returns -->\n<!-- end of results -->\n")
+
+
+def test_a_row_of_pairs_says_who_is_ahead_of_what_and_the_steps_of_both(page):
+    file = page.parent / "measured" / "a.json"
+    found = json.loads(file.read_text())
+    for cell, steps in zip(found["cells"], ([200, 400, 400], [100, 100, 100]), strict=True):
+        cell["anchors"] = {"random": -200.0, "greedy": -100.0}
+        cell["steps_to"] = [{"threshold": -150.0, "per_seed": steps, "of_mean": None}]
+    file.write_text(json.dumps(found))
+    page.write_text(BLOCK.format("pairs"))
+    text = filled(page)
+    assert "| navigation, 200: MAPPO-ESP | " in text
+    assert " | -130.00 ± 5.77 | -150.00 ± 5.77 | +20.00 [" in text
+    assert "] | 0.50, 0.70 | 400, 100 | 0.25 |" in text
+    page.write_text(BLOCK.format("references"))
+    assert "| navigation, 200 | -200.0 | greedy -100.0 |" in filled(page)
 
 
 def test_studies_of_one_kind_stand_in_one_table_and_fewer_seeds_are_told(page):

@@ -42,13 +42,13 @@ def test_a_file_is_small_and_says_what_made_it(file: Path) -> None:
 
 
 def test_a_number_changed_by_hand_is_noticed(tmp_path: Path) -> None:
-    page = DOCS / "measurements" / "coefficient.md"
+    page = DOCS / "measurements" / "parts.md"
     text = page.read_text(encoding="utf-8")
     results = read_results(DOCS / "measured" / "ablate-coefficient.json")
     number = next(cell for row in returns_table(summarised(results)).rows for cell in row if "±" in cell)
     assert number in text
     (tmp_path / "pages").mkdir()
-    copy = tmp_path / "pages" / "coefficient.md"
+    copy = tmp_path / "pages" / "parts.md"
     copy.write_text(text.replace(number, "-99.99 ± 0.01"), encoding="utf-8")
     (tmp_path / "measured").symlink_to(DOCS / "measured")
     assert filled(copy) == text
@@ -150,11 +150,10 @@ def test_every_figure_of_broken_symmetry_can_be_drawn_again_and_is_on_its_page()
 def test_a_table_that_is_gone_is_noticed() -> None:
     drawing = runpy.run_path(str(DOCS / "make_figures.py"))
     with pytest.raises(ValueError, match="no table with the column 'gone'"):
-        drawing["table"](drawing["Panel"]("choices", "run", ["run"], "gone", ""))
+        drawing["table"](drawing["Panel"]("replay", "run", ["run"], "gone", ""))
 
 
-def test_the_figure_of_the_steps_is_on_its_page_and_in_the_readme() -> None:
-    page = (DOCS / "measurements" / "steps-saved.md").read_text(encoding="utf-8")
+def test_the_figure_of_the_steps_is_on_its_page() -> None:
+    page = (DOCS / "measurements" / "learners.md").read_text(encoding="utf-8")
     assert "(../measured/steps-saved.png)" in page
-    assert "(docs/measured/steps-saved.png)" in (DOCS.parent / "README.md").read_text(encoding="utf-8")
     assert (DOCS / "measured" / "steps-saved.png").is_file()
