@@ -197,7 +197,8 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
         ways = observation[:, begin : begin + 2 * others].unflatten(1, (others, 2))
         near = (ways.square().sum(2, keepdim=True) < reach_squared).float()
         share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
-        messages = x.unflatten(0, (-1, team))[:, torch.tensor(index)].flatten(0, 1)
+        own = torch.arange(x.shape[0])  # rows and not worlds: an archive with a number of worlds takes no single one
+        messages = x[(own - own % team).unsqueeze(1) + torch.tensor(index)[own % team]]
         return torch.cat([x, (share * (ways / reach)).sum(1), (share * messages).sum(1)], 1)
 
     return Layer(

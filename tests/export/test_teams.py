@@ -13,11 +13,11 @@ import torch
 from esp_cli.export import c_file, check
 from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.export import export
-from esp_cli.export.layers import aggregate, convolution, cut, global_max_pool
+from esp_cli.export.layers import activation, affine, aggregate, convolution, cut, global_max_pool
 from esp_cli.export.onnx_file import onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.runtime.numpy_policy import NumpyPolicy
-from esp_cli.export.torch_file import TorchProgram
+from esp_cli.export.torch_file import TorchProgram, torch_archive, torch_runner
 from esp_cli.policies.loaded import LoadedPolicy
 from tests.export.policies import drawn_policy
 
@@ -58,6 +58,35 @@ def test_what_is_heard_by_hand() -> None:
     for outputs in both(program, rows):
         assert np.allclose(outputs, expected)
     assert hear.flops == 2 * (9 + 2) + 4
+
+
+def test_an_archive_and_the_python_file_take_one_world_and_no_world(tmp_path: Path) -> None:
+    weight = np.arange(8, dtype=np.float32)[:, None]
+    seen = (cut(1, 17), convolution(weight, np.ones(1, np.float32), (2, 2, 4), side=2, stride=2), global_max_pool(1, 2))
+    program = Program(
+        17, (*seen, aggregate(begin=1, team=3, width=1, reach_squared=4.0)), 4, 0, 0, "choose", (), team=3
+    )
+    (tmp_path / "policy.pt2").write_bytes(torch_archive(program, "{}"))
+    archive, written = torch_runner(tmp_path / "policy.pt2"), numpy_policy(program)
+    for worlds in (1, 4):
+        rows = np.random.default_rng(worlds).standard_normal((3 * worlds, 17)).astype(np.float32)
+        outputs = archive(rows, np.zeros((3 * worlds, 0)))[1]
+        expected = written.outputs(rows.reshape(worlds, 3, 17), np.zeros((worlds, 3, 0)))[0]
+        assert np.allclose(outputs, expected.reshape(-1, 4), atol=1e-5)
+    assert written.act(np.zeros((0, 3, 17))).shape == (0, 3)
+
+
+@pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
+def test_what_is_not_a_number_stays_so_in_c(tmp_path: Path) -> None:
+    weight = np.ones((1, 2), np.float32)
+    layers = (affine(weight, np.zeros(2, np.float32)), activation("relu", 2), global_max_pool(1, 2))
+    program = Program(1, layers, 1, 0, 0, "choose", ())
+    for name, source in c_source(program, "").items():
+        (tmp_path / name).write_bytes(source)
+    for value, expected in ((np.nan, np.nan), (-1.0, 0.0), (2.0, 2.0)):
+        rows = np.array([[value]], np.float32)
+        outputs = c_runner(tmp_path / "policy.c", program)(rows, rows[:, :0])[1]
+        assert np.array_equal(outputs, [[expected]], equal_nan=True)
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ static void affine(const float *weight, const float *bias, int inputs, int outpu
 static void apply_relu(float *x, int width)
 {
     int k;
-    for (k = 0; k < width; k++) x[k] = x[k] > 0.0f ? x[k] : 0.0f;
+    for (k = 0; k < width; k++) x[k] = x[k] < 0.0f ? 0.0f : x[k]; /* NaN stays */
 }
 
 static void apply_tanh(float *x, int width)
@@ -59,7 +59,8 @@ static void global_max_pool(int channels, int places, const float *x, float *y)
     for (channel = 0; channel < channels; channel++) {
         y[channel] = x[channel * places];
         for (place = 1; place < places; place++) {
-            if (x[channel * places + place] > y[channel]) y[channel] = x[channel * places + place];
+            const float next = x[channel * places + place];
+            if (next > y[channel] || next != next) y[channel] = next; /* NaN stays */
         }
     }
 }

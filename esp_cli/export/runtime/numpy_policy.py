@@ -112,8 +112,9 @@ def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any], _: Any) -> Any:
     side, stride = layer["side"], layer["stride"]
     pictures = x.reshape(*x.shape[:-1], layer["channels"], layer["rows"], layer["columns"])
     windows = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
-    patches = np.moveaxis(windows, -5, -3).reshape(*x.shape[:-1], windows.shape[-4] * windows.shape[-3], -1)
-    return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], -1)
+    places = windows.shape[-4] * windows.shape[-3]
+    patches = np.moveaxis(windows, -5, -3).reshape(*x.shape[:-1], places, len(arrays[0]))
+    return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], places * len(arrays[1]))
 
 
 def _aggregate(x: Any, layer: dict[str, Any], _: list[Any], obs: Any) -> Any:
