@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pprint
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -54,9 +53,9 @@ def emitted(body: Body, numbers: Numbers, model: str) -> str:
     return "\n".join("\n".join(lines) if line.endswith("# DATA") else line for line in template) + "\n"
 
 
-def _move(matrix: Floats) -> dict[str, Any]:
-    """Return where new numbers come from and with which signs; a matrix where numbers are mixed."""
-    sign = np.rint(matrix.sum(1)).astype(int)
-    if np.count_nonzero(matrix) > len(matrix) or not np.array_equal(np.abs(matrix).max(1), np.abs(sign)):
-        return {"matrix": np.round(matrix, 12).tolist(), "sign": [1] * len(matrix)}
-    return {"source": np.abs(matrix).argmax(1).tolist(), "sign": sign.tolist()}
+def _move(matrix: Floats) -> tuple[list[list[int]], list[list[float]]]:
+    """Return where new numbers come from and times what, in as many terms as the widest sum has: mostly one."""
+    matrix = np.round(matrix, 12)
+    order = np.argsort(matrix == 0, axis=1, kind="stable")[:, : np.count_nonzero(matrix, axis=1).max()]
+    factor = np.take_along_axis(matrix, order, 1).T.tolist()
+    return order.T.tolist(), [[int(x) if x == int(x) else x for x in times] for times in factor]

@@ -14,11 +14,17 @@ ELEMENTS, OBSERVATIONS, ACTIONS = tuple[str, ...](), dict[str, Any](), dict[str,
 
 def mirrored(rows: Any, element: str, group: str | None = None) -> Any:
     """Return rows [..., D] of a group of observations, or of actions (None), under one of ELEMENTS."""
-    move = (ACTIONS if group is None else OBSERVATIONS[group])[element]
-    if rows.shape[-1] != len(move["sign"]):
-        raise ValueError(f"rows of {group or 'actions'} have {rows.shape[-1]} numbers, the mirror {len(move['sign'])}")
+    if group is not None and group not in OBSERVATIONS:
+        raise ValueError(f"no mirror was written of the observations {group!r}; name their terms")
+    source, factor = (ACTIONS if group is None else OBSERVATIONS[group])[element]
+    if rows.shape[-1] != len(source[0]):
+        raise ValueError(f"rows of {group or 'actions'} have {rows.shape[-1]} numbers, the mirror {len(source[0])}")
+    if "float" not in str(rows.dtype):
+        raise ValueError(f"rows of {group or 'actions'} are {rows.dtype}; give floats")
     make = rows.new_tensor if hasattr(rows, "new_tensor") else lambda x: np.asarray(x, rows.dtype)
-    return rows @ make(move["matrix"]).T if "matrix" in move else rows[..., move["source"]] * make(move["sign"])
+    # term by term, since the product of a matrix would be rounded under autocast and TF32
+    terms = [rows[..., index] * make(times) for index, times in zip(source, factor, strict=True)]
+    return sum(terms[1:], terms[0])
 
 
 def with_copies(rows: Any, images: list[Any], axis: int = 0) -> Any:
@@ -45,15 +51,13 @@ def compute_symmetric_states(
         obs_type: the group of rows; by default the first.
     """
     if obs is not None and hasattr(obs, "batch_size"):
-        if unknown := [group for group in obs.keys() if group not in OBSERVATIONS]:  # noqa: SIM118 - a TensorDict
-            raise ValueError(f"no mirror was written of the observations {unknown[0]!r}; name their terms")
         copies = [obs.clone() for _ in ELEMENTS]
         for copy, element in zip(copies, ELEMENTS, strict=True):
-            for group in obs.keys():  # noqa: SIM118
+            for group in obs.keys():  # noqa: SIM118 - a TensorDict
                 copy[group] = mirrored(obs[group], element, group)
         obs = with_copies(obs, copies)
     elif obs is not None:
-        group = obs_type or next(iter(OBSERVATIONS))
+        group = obs_type or next(iter(OBSERVATIONS), "policy")
         obs = with_copies(obs, [mirrored(obs, element, group) for element in ELEMENTS])
     if actions is not None:
         actions = with_copies(actions, [mirrored(actions, element) for element in ELEMENTS])
@@ -65,7 +69,7 @@ def augment(obs: Any, actions: Any, *numbers: Any, group: str | None = None, axi
 
     Histories [T, B, D] of a recurrent policy are rows with axis=1: mirror them whole, from their first step.
     """
-    group = group or next(iter(OBSERVATIONS))
+    group = group or next(iter(OBSERVATIONS), "policy")
     obs = with_copies(obs, [mirrored(obs, element, group) for element in ELEMENTS], axis)
     actions = with_copies(actions, [mirrored(actions, element) for element in ELEMENTS], axis)
     return obs, actions, *(with_copies(x, [x] * len(ELEMENTS), axis) for x in numbers)

@@ -67,11 +67,18 @@ def test_the_file_does_what_the_layouts_say(body, tmp_path):
         np.ones((7, 5, numbers["policy"].width)), np.ones((7, 5, 9)), np.ones((7, 5)), axis=1
     )
     assert (obs.shape[1], actions.shape[1], reward.shape[1]) == (10, 10, 10)
-    with pytest.raises(ValueError, match="rows of actions have 8 numbers, the mirror 9"):
-        module.mirrored(np.ones((2, 8)), "flip-x")
+    assert module.mirrored(np.ones((0, 9), "f2")[:, ::-1], "flip-x").dtype == np.float16
+    for rows, group, sentence in (
+        (np.ones((2, 8)), None, "rows of actions have 8 numbers, the mirror 9"),
+        (np.ones((2, 9), int), None, "rows of actions are int64; give floats"),
+        (torch.ones(2, 9).bool(), None, "rows of actions are torch.bool; give floats"),
+        (np.ones((2, 9)), "image", "no mirror was written of the observations 'image'; name their terms"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            module.mirrored(rows, "flip-x", group)
 
 
-def test_a_turn_that_mixes_numbers_is_written_as_a_matrix(tmp_path):
+def test_a_turn_that_mixes_numbers_is_written_as_sums_that_nothing_rounds(tmp_path):
     third = Body(["a", "b", "c"], {"rot120": {"a": "b", "b": "c", "c": "a"}})
     module = imported(emitted(third, numbers_of(third, None), "three"), tmp_path)
     rows = np.random.default_rng(0).normal(size=(4, 21))
@@ -79,6 +86,10 @@ def test_a_turn_that_mixes_numbers_is_written_as_a_matrix(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(turned[:, :3], axis=1), np.linalg.norm(rows[:, :3], axis=1))
     np.testing.assert_allclose(module.mirrored(turned, "rot240", "policy"), rows, atol=1e-9)
     np.testing.assert_allclose(turned[:, 12:15], rows[:, [14, 12, 13]])
+    short = torch.tensor(rows, dtype=torch.float32)
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(module.mirrored(short, "rot120", "policy"), torch.tensor(turned).float())
+    assert module.mirrored(rows[:0], "rot120", "policy").shape == (0, 21)
 
 
 def test_names_of_strangers_stay_text(tmp_path):
