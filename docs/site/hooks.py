@@ -18,6 +18,7 @@ DOCS = ROOT / "docs"
 AT_THE_ROOT = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
 _CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?\)")
+_WIDE = 7  # columns of a table from which a page has no side bars
 _UNSEARCHED = "---\nsearch:\n  exclude: true\nhide: [navigation]\n---\n"
 
 
@@ -40,7 +41,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Lead links that leave docs/ to the pages that stand for their files."""
+    """Lead links that leave docs/ to the pages that stand for their files; give wide tables the whole width."""
+    if re.search(rf"^\|(?:[^|\n]*(?<!\\)\|){{{_WIDE},}}$", markdown, re.MULTILINE):
+        page.meta["hide"] = ["navigation", "toc"]
     folder = posixpath.dirname(page.file.src_uri)
     return inside(markdown, folder, DOCS / folder) if page.file.abs_src_path else markdown
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-DESKTOP, PHONE = 1300, 390
+DESKTOP, PHONE = 1280, 390
 AT_ONCE = 12
 
 # One page with a frame for each page of the site: frames have a width of their own, below what a window may have.
@@ -31,6 +31,10 @@ window.onload = () => {{
       const box = table.parentElement.closest(".md-typeset__scrollwrap, .highlighttable, .highlight") || page.body;
       const cut = table.getBoundingClientRect().right > root.clientWidth + 1;
       if (cut && !["auto", "scroll"].includes(frame.contentWindow.getComputedStyle(box).overflowX)) say("cuts a table");
+      if (cut && root.clientWidth > 1000) say("hides the last column of the table of " + table.rows[0].innerText);
+      for (const head of table.querySelectorAll("th"))
+        if (/^(ahead|verdict)\b(?! or)/.test(head.innerText) && head.getBoundingClientRect().right > root.clientWidth)
+          say("hides who is ahead");
     }}
   }}
   document.body.innerHTML = "<pre id=found></pre>";
