@@ -20,8 +20,8 @@ _HEAD = """# Robot models
 
 What `esp mirror` finds in the models that packages bring: {held} of {tried} models with joints have a mirror or turn.
 `python docs/make_robots.py PACKAGE...` writes this page; [Legged robots](legged-robots.md) says how a mirror is
-derived and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. The last
-column is the gap of the least mistake that was planted. Files without a joint, and parts that are no model by
+derived and proven. A gap is that of the worst joint's accelerations, as a share of them, for the first element. Last
+stands the gap of the least mistake that was planted. Files without a joint, and parts that are no model by
 themselves, are left out ({left}).
 
 | model | symmetry | verdict | joints | gap | of a planted mistake |
