@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.policies.statistics import mean_and_sem
 from esp_cli.reporting.results import read_results, summarised
 from esp_cli.reporting.study_figures import series_of
 from esp_cli.reporting.tables import returns_table
@@ -52,35 +51,6 @@ def test_a_number_changed_by_hand_is_noticed(tmp_path: Path) -> None:
     copy.write_text(text.replace(number, "-99.99 ± 0.01"), encoding="utf-8")
     (tmp_path / "measured").symlink_to(DOCS / "measured")
     assert filled(copy) == text
-
-
-def readme_rows(text: str) -> dict[tuple[str, str], str]:
-    """Return the returns of the table in the README by learner and task."""
-    header, _, *rows = re.findall(r"^\|(.*)\|$", text[text.index("| | navigation") :], re.MULTILINE)
-    tasks = [cell.strip() for cell in header.split("|")[1:]]
-    found = {}
-    for row in rows[:8]:
-        name, *cells = (cell.strip() for cell in row.split("|"))
-        found |= {(name, task): cell for task, cell in zip(tasks, cells, strict=True)}
-    return found
-
-
-def measured_rows() -> dict[tuple[str, str], str]:
-    """Return the same from the results file."""
-    found = {}
-    for cell in read_results(DOCS / "measured" / "table1.json").cells:
-        task = cell.panel.split(",")[0]
-        mean, sem = mean_and_sem(cell.returns["greedy"])
-        found[cell.variant.replace("-ESP", " with the prior"), task] = f"{mean:.2f} ± {sem:.2f}"
-        if cell.variant == "MAPPO":
-            by_hand = max(value for policy, value in cell.anchors.items() if policy != "random")
-            found["random policy", task] = f"{cell.anchors['random']:.0f}"
-            found["best hand-written policy", task] = f"{by_hand:.0f}"
-    return found
-
-
-def test_the_table_of_the_readme_says_what_the_file_says() -> None:
-    assert readme_rows((DOCS.parent / "README.md").read_text(encoding="utf-8")) == measured_rows()
 
 
 def beginning(text: str) -> tuple[str, str, str]:

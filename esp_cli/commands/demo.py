@@ -119,10 +119,10 @@ class LiveCurves(StudyProgress):
 
 def _show(folder: StudyFolder) -> None:
     """Write the picture and the film, and print what was seen."""
+    from esp_cli.commands.report import print_answer
     from esp_cli.drawing.draw import Request, draw
     from esp_cli.policies.loading import TrainedPolicy
     from esp_cli.reporting import study_figures
-    from esp_cli.reporting.answer import answer
     from esp_cli.reporting.collect import collect_study
     from esp_cli.training.build import build_environment
 
@@ -136,6 +136,5 @@ def _show(folder: StudyFolder) -> None:
             drawing = draw(request, trained, [*LABELS.values()], watch)
         returns = (f"{label} {value:.1f}" for value, label in zip(drawing.returns, LABELS.values(), strict=True))
         console.note(f"film of the same {_FILM_EPISODES} episodes, return {', '.join(returns)} -> {drawing.path}")
-    for text in answer(material):
-        console.text(text)
+    print_answer(material, full=False)
     console.note(f"next: {shlex.join(['esp', 'report', str(out), '--films'])}    esp train --task formation")

@@ -18,7 +18,6 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.reporting.collect import Material
-    from esp_cli.reporting.results import Results
 
 EPILOG = """Examples:\n
     esp report runs/table1\n
@@ -71,12 +70,13 @@ def report(
             "--csv", help="Write every logged number of every seed as a table.", callback=options.not_over_a_run
         ),
     ] = None,
+    full: Annotated[bool, typer.Option("--full", help="Print every table, not only the answer.")] = False,
     task: options.OwnTaskOption = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,
     json: options.JsonOption = None,
 ) -> None:
-    """Tabulate a study or compare runs of one task: intervals, differences, steps to thresholds; curves and a page."""
+    """Compare a study or runs of one task: write page, curves and numbers, then say in short what came out."""
     from esp_cli.reporting.collect import collect_study
     from esp_cli.studies.study import StudyFolder
 
@@ -102,11 +102,6 @@ def report(
             raise UserError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
         material = _side_by_side(runs, at or [], limits, mode, out)
 
-    def show() -> None:
-        with console.paged():
-            print_tables(material.results)
-
-    console.result(json, material.results.document(statistics=True), show)
     if csv is not None:
         from esp_cli.reporting.page import write_csv
 
@@ -121,14 +116,21 @@ def report(
         picture, _ = draw_curves(material, plot, lines, y_limits)
         for file in (picture.png, picture.svg):
             console.note(f"curves -> {file}")
+    console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full))
+    if not full and json != "-":
+        console.note("every table: add --full")
 
 
-def print_tables(results: Results) -> None:
-    """Print every table of results."""
+def print_answer(material: Material, full: bool) -> None:
+    """Print what came out, on request below every table."""
+    from esp_cli.reporting.answer import answer
     from esp_cli.reporting.tables import all_tables
 
-    for table in all_tables(results):
-        console.table(table.headings, table.rows, title=table.title, caption=table.caption)
+    with console.paged():
+        for table in all_tables(material.results) if full else ():
+            console.table(table.headings, table.rows, title=table.title, caption=table.caption)
+    for text in answer(material):
+        console.text(text)
 
 
 def _side_by_side(

@@ -220,12 +220,12 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
 
 
 def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
-    """Print the table of a study and say what to do next."""
-    from esp_cli.commands.report import print_tables, threshold_words
+    """Print the tables of a study and what came out, and say what to do next."""
+    from esp_cli.commands.report import print_answer, threshold_words
     from esp_cli.reporting.collect import collect_study
 
-    results = collect_study(folder, mode, thresholds).results
-    console.result(json, results.document(statistics=True), lambda: print_tables(results))
+    material = collect_study(folder, mode, thresholds)
+    console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full=True))
     first, *others = (cell.config for cell in folder.study.cells)
     words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]
     console.note(f"next: {shlex.join(words)}")

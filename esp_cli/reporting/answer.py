@@ -25,7 +25,7 @@ def answer(material: Material) -> list[str]:
     if len(pairs) == 1:
         both = pairs[0]
         return [_returns(results, *both), _verdict(*both), *_steps(material, *both)]
-    texts = [_count(pairs)] if pairs else [_returns(results, cell) for cell in finished[:2]]
+    texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
     if means := [f"{name} {one.mean.value:.2f}" for name, one in results.aggregates.items()]:
         texts.append(f"Mean normalised return over all panels, {_SCALE}: {', '.join(means)}.")
     return texts or ["No run has a return yet."]
@@ -38,10 +38,9 @@ def _returns(results: Results, *cells: CellResult) -> str:
     ours = [f"{cell.variant} has {mean}" for cell, mean in zip(cells, means, strict=True)]
     scores = [f"{one.normalised.mean:.2f}" for one in summaries if one.normalised is not None]
     normalised = f"; normalised {' and '.join(scores)}, {_SCALE}" if scores else ""
-    steps, seeds = format_count(cells[0].at or cells[0].step), len(cells[0].seeds)
-    return (
-        f"{' and '.join(ours)} ({results.mode} return after {steps} steps, {seeds} seed{'s'[: seeds - 1]}{normalised})."
-    )
+    seeds = len(cells[0].seeds)
+    what = f"{results.mode} return, {seeds} seed{'s'[: seeds - 1]}{normalised}"
+    return f"{cells[0].panel}: {' and '.join(ours)} ({what})."
 
 
 def _verdict(cell: CellResult, other: CellResult) -> str:
@@ -55,6 +54,7 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
 def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]:
     """State when both mean curves first have the highest return that both of them have."""
     curves = [material.curves[one.name] for one in (cell, other) if one.name in material.curves]
+    curves = [curve for whole in curves if (curve := whole.until(cell.at or whole.last_step)) is not None]
     highest = [float(np.nanmax(curve.values.mean(axis=1), initial=-math.inf)) for curve in curves]
     if len(curves) < 2 or not math.isfinite(limit := min(highest)):
         return []
@@ -65,7 +65,17 @@ def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]
     ]
 
 
-def _count(pairs: list[tuple[CellResult, CellResult]]) -> str:
-    sides = Counter(cell.summary.gap.ahead for cell, _ in pairs if cell.summary is not None and cell.summary.gap)
+def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
+    """Count who is ahead, and name the largest and the smallest difference."""
+    gaps = [(cell, cell.summary.gap) for cell, _ in pairs if cell.summary is not None and cell.summary.gap is not None]
+    sides = Counter(gap.ahead for _, gap in gaps)
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
-    return f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."
+    texts = [f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."]
+    if gaps:
+        ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
+        largest, smallest = (
+            f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)} ({cell.variant}; {cell.panel})"
+            for cell, gap in (ordered[-1], ordered[0])
+        )
+        texts.append(f"The largest difference is {largest}, the smallest {smallest}.")
+    return texts

@@ -25,6 +25,7 @@ from esp_cli.files.formatting import escaped, format_count
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file, write_file
 from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.reporting.answer import answer
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.results import RESULTS_FORMAT
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
@@ -80,6 +81,7 @@ def write_report(material: Material, out: Path) -> list[Path]:
         "title": study.title,
         "version": __version__,
         "command": study.command,
+        "answer": answer(material),
         "tables": tables,
         "size": curves.size,
         "hovers": [asdict(hover) for hover in hovers],

@@ -25,9 +25,9 @@ def test_both_learners_are_trained_drawn_and_compared_and_a_second_call_trains_n
     assert (out / CURVES).read_bytes().startswith(b"\x89PNG")
     assert (out / FILM).read_bytes().startswith(b"GIF8")
     first, verdict, steps = told.stdout.splitlines()
-    assert first.startswith("MAPPO with symmetry has ")
+    assert first.startswith("predator-prey, 100: MAPPO with symmetry has ")
     assert " and MAPPO has " in first
-    assert "greedy return after 100 steps, 3 seeds; normalised" in first
+    assert "greedy return, 3 seeds; normalised" in first
     assert verdict.startswith("MAPPO with symmetry is ")
     assert steps.startswith("The mean over seeds first has ")
     assert "film of the same 3 episodes, return MAPPO " in told.stderr

@@ -47,7 +47,19 @@ def cells(line: str) -> list[str]:
 
 def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_path: Path) -> None:
     file, picture = tmp_path / "report.json", tmp_path / "curves.png"
-    options = ["--at", "100", "--at", "150", "--threshold", "-1000", "--threshold", "-0.5", "--reference", "paper=-110"]
+    options = [
+        "--full",
+        "--at",
+        "100",
+        "--at",
+        "150",
+        "--threshold",
+        "-1000",
+        "--threshold",
+        "-0.5",
+        "--reference",
+        "paper=-110",
+    ]
     told = esp("report", plain, f"ESP={finished}", *options, "--json", file, "--plot", picture)
     result = json.loads(file.read_text())
     assert (result["format"], result["kind"], result["config"]["task"]) == ("esp-results", "runs", "navigation")
@@ -130,7 +142,7 @@ def test_two_runs_of_one_label_are_refused(finished: Path, tmp_path: Path) -> No
 
 def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Path) -> None:
     one = train_tiny(tmp_path / "one", "--seed-list", "3", steps=50)
-    told = esp("report", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
+    told = esp("report", "--full", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
     rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│ navigation, ")]
     assert rows[0][:3] == ["navigation, 50", "one", "50"]
     assert "±" not in rows[0][3]

@@ -31,7 +31,8 @@ def answered(path: Path, plain: list[list[float | None]], ours: list[list[float 
 def test_the_verdict_follows_the_interval_of_the_difference(tmp_path: Path, ours: list, verdict: str) -> None:
     first, second, third = answered(tmp_path / "s", [[-200.0] * 3, [-161.0, -160.0, -159.0]], [[-150.0] * 3, ours])
     assert first.endswith(", where 0 is the random policy and 1 the best hand-written one).")
-    assert "and MAPPO has -160.00 ± 0.58 (greedy return after 100 steps, 3 seeds; normalised" in first
+    assert first.startswith("navigation, 200: MAPPO-ESP has ")
+    assert "and MAPPO has -160.00 ± 0.58 (greedy return, 3 seeds; normalised" in first
     assert second.startswith(verdict)
     assert third == "The mean over seeds first has -160.00 after 0 steps of MAPPO-ESP, 100 of MAPPO."
 
@@ -50,7 +51,10 @@ def test_of_several_runs_the_better_and_the_worse_are_counted(tmp_path: Path) ->
     folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",)))
     for k, (cell, end) in enumerate(zip(folder.study.cells, (-160.0, -150.0, -160.0, -170.0), strict=True)):
         write_run(folder, cell, [[-200.0] * 3, [end, end, end]], [end, end - k, end + k])
-    (text,) = answer(collect_study(folder))
-    assert text == (
+    first, second = answer(collect_study(folder))
+    assert first == (
         "Of 3 runs beside their reference: better 1, not told apart 1, worse 1 (95 % intervals of the difference)."
     )
+    assert second.startswith("The largest difference is +10.00 [")
+    assert second.endswith("(both; navigation, MAPPO, 200).")
+    assert "] (loss; navigation, MAPPO, 200), the smallest -10.00 [" in second
