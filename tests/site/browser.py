@@ -33,7 +33,7 @@ window.onload = () => {{
       if (cut && !["auto", "scroll"].includes(frame.contentWindow.getComputedStyle(box).overflowX)) say("cuts a table");
       if (cut && root.clientWidth > 1000) say("hides the last column of the table of " + table.rows[0].innerText);
       for (const head of table.querySelectorAll("th"))
-        if (/^(ahead|verdict)\b(?! or)/.test(head.innerText) && head.getBoundingClientRect().right > root.clientWidth)
+        if (head.innerText.trim() == "ahead" && head.getBoundingClientRect().right > root.clientWidth)
           say("hides who is ahead");
     }}
   }}
