@@ -380,6 +380,13 @@ def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
     driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0]])))
     assert driver.goals == [(-0.9, 0.5), (-0.1, -0.2)]
     assert driver.poses[1] == pytest.approx((0.1, 0.2, -3.0))
+    odd = ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0]]))
+    odd.poses[0].orientation.w *= 0.9  # of a tracker that rounds
+    odd.poses[0].orientation.z *= 0.9
+    odd.poses[1].orientation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
+    driver.see(odd)
+    assert driver.poses[0] == pytest.approx((0.9, -0.5, 1.0))
+    assert math.isnan(driver.poses[1][2]), "an orientation of zeros is none, and the team stands still"
     monkeypatch.setattr(RosNode, "parameters", {"goals": [1.0, 2.0, 3.0]})
     with pytest.raises(ValueError, match="the parameter goals lists x and y in turn, but has 3 numbers"):
         module.Driver()

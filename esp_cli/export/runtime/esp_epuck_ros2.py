@@ -32,10 +32,11 @@ from std_msgs.msg import Float32MultiArray
 
 
 def pose_of(message: Any) -> tuple[float, float, float]:
-    """Return x, y and heading of a geometry_msgs/Pose."""
+    """Return x, y and heading of a geometry_msgs/Pose; NaN where a tracker fills in no orientation."""
     q = message.orientation
-    heading = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
-    return message.position.x, message.position.y, heading
+    heading = math.atan2(2 * (q.w * q.z + q.x * q.y), q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z)
+    is_known = any((q.w, q.x, q.y, q.z))
+    return message.position.x, message.position.y, heading if is_known else math.nan
 
 
 class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
