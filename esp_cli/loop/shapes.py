@@ -6,6 +6,7 @@ Whatever does not fit is refused by a `UserError` of one sentence.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -27,6 +28,32 @@ _ARGUMENTS = {
     "state": (Layout | None, "layout(Field(...), ...)"),
     "seed": (int, "a number"),
 }
+
+
+class Augmented(tuple[Any, ...]):
+    """Data with its copies: obs, action, state where one was given, and per_agent, in this order or by name."""
+
+    __slots__ = ()
+
+    @property
+    def obs(self) -> Tensor:
+        """[..., N, D]."""
+        return cast("Tensor", self[0])
+
+    @property
+    def action(self) -> Tensor:
+        """In the shape that was given."""
+        return cast("Tensor", self[1])
+
+    @property
+    def state(self) -> Tensor | None:
+        """[..., Ds]; None where none was given."""
+        return self[2] if len(self) > 3 else None
+
+    @property
+    def per_agent(self) -> tuple[Tensor, ...]:
+        """The numbers that went along."""
+        return cast("tuple[Tensor, ...]", self[-1])
 
 
 def check_arguments(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -13,7 +13,18 @@ from torch import Tensor
 
 from esp_cli.loop import shapes
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import act, carry, carry_along, check_alike, check_mask, check_state, lead_of, mean_counted
+from esp_cli.loop.draws import Draws
+from esp_cli.loop.shapes import (
+    Augmented,
+    act,
+    carry,
+    carry_along,
+    check_alike,
+    check_mask,
+    check_state,
+    lead_of,
+    mean_counted,
+)
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet
@@ -26,7 +37,7 @@ if TYPE_CHECKING:
     from esp_envs.base import Environment
 
 
-class Symmetry:
+class Symmetry(Draws):
     """A known symmetry of a task, as copies of data (Eq. 7) and as losses (Eq. 8, 9) in any training loop.
 
     symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
@@ -54,7 +65,7 @@ class Symmetry:
     Attributes:
         spaces: what the transforms act on.
         copies: as given.
-        generator: draws the elements; its state belongs into a checkpoint.
+        generator: draws the elements. Its state is all that `state_dict` holds; a file without it loads too.
 
     Raises:
         UserError: the actions or layouts cannot carry the group, all elements of an infinite group are asked for, or
@@ -73,11 +84,11 @@ class Symmetry:
         seed: int = 0,
     ) -> None:
         shapes.check_arguments(observation, action, group, num_agents, state, copies, seed)
+        super().__init__(f"group={group!r}, num_agents={num_agents}, copies={copies!r}", observation, action, seed)
         state = state or joint_layout(observation, num_agents)
         spaces = Spaces(num_agents=num_agents, observation=observation, state=state, action=action, symmetry="c1")
         self.spaces = unrestricted(spaces)
         self.group, self.copies = group, copies
-        self.generator = torch.Generator().manual_seed(seed)
         self._sets: dict[tuple[torch.device, torch.dtype], TransformSet] = {}
         if not self._set(torch.device("cpu"), torch.float32).is_finite and copies == "all":
             raise UserError(f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'")
@@ -87,16 +98,6 @@ class Symmetry:
         chosen = self._set(like.device, torch.float64 if like.dtype == torch.float64 else torch.float32)
         return chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
 
-    @overload
-    def augment(
-        self, obs: Tensor, action: Tensor, *, per_agent: Sequence[Tensor] = (), dim: int = 0
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]]: ...
-
-    @overload
-    def augment(
-        self, obs: Tensor, action: Tensor, *, state: Tensor, per_agent: Sequence[Tensor] = (), dim: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]: ...
-
     def augment(
         self,
         obs: Tensor,
@@ -105,7 +106,7 @@ class Symmetry:
         state: Tensor | None = None,
         per_agent: Sequence[Tensor] = (),
         dim: int = 0,
-    ) -> tuple[Tensor, Tensor, tuple[Tensor, ...]] | tuple[Tensor, Tensor, Tensor, tuple[Tensor, ...]]:
+    ) -> Augmented:
         """Return the data with its copies (L_g s, K_g a) behind it; a copy keeps the numbers of its original (Eq. 7).
 
         Args:
@@ -118,7 +119,7 @@ class Symmetry:
             dim: the leading axis along which copies are added: 0, or that of the batch where time comes first.
 
         Returns:
-            obs, action, (state where it is given,) and the tuple of numbers, with 1 + copies times the rows.
+            obs, action, (state where it is given,) and per_agent, in turn or by name, with 1 + copies times the rows.
 
         Raises:
             UserError: a shape that does not fit the layouts, or an action outside.
@@ -135,16 +136,16 @@ class Symmetry:
         def joined(x: Tensor, images: list[Tensor]) -> Tensor:
             return torch.cat([x, *images], dim)
 
-        moved_obs = joined(obs, [g.obs(obs) for g in transforms])
-        moved_action = joined(action, [act(self.spaces, g, action, lead) for g in transforms])
-        numbers = tuple(
+        moved_action = [act(self.spaces, g, action, lead) for g in transforms]
+        parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, moved_action)]
+        if state is not None:
+            check_state(self.spaces, state, lead)
+            parts.append(joined(state, [g.state(state) for g in transforms]))
+        numbers = (
             joined(x, [carry_along(self.spaces, g, x, lead, f"per_agent[{i}]") for g in transforms])
             for i, x in enumerate(per_agent)
         )
-        if state is None:
-            return moved_obs, moved_action, numbers
-        check_state(self.spaces, state, lead)
-        return moved_obs, moved_action, joined(state, [g.state(state) for g in transforms]), numbers
+        return Augmented((*parts, tuple(numbers)))
 
     def augment_tensordict(self, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
         """Return a TensorDict [B, ...] with its copies behind it, along the first axis that is not named "time".

@@ -56,6 +56,37 @@ def test_a_state_is_all_observations_end_to_end_unless_it_says_otherwise() -> No
     assert other.augment(obs, action, state=torch.tensor([[1.0, 0.0]] * 4))[2][4:].tolist() == [[0, 1]] * 4
 
 
+def test_copies_come_in_turn_and_by_name() -> None:
+    obs, action = random(4, 2, 3), torch.zeros(4, 2, dtype=torch.int64)
+    plain, full = quarter(2).augment(obs, action), quarter(2).augment(obs, action, state=obs.flatten(1))
+    assert type(plain) is type(full)
+    assert (len(plain), plain.state, plain.per_agent) == (3, None, ())
+    assert [full.obs is full[0], full.action is full[1], full.state is full[2], full.per_agent is full[3]] == [True] * 4
+
+
+def test_it_is_a_module_that_holds_its_draws_alone() -> None:
+    class Loop(nn.Module):
+        def __init__(self, seed: int) -> None:
+            super().__init__()
+            self.actor, self.symmetry = nn.Linear(3, 4), Symmetry(observation=SEEN, action=MOVES, group="d4", seed=seed)
+
+    def drawn(loop: Loop) -> list[str]:
+        return [loop.symmetry.transforms(random(1, 3))[0].elements[0].name for _ in range(9)]
+
+    one, other, older = Loop(1), Loop(2), Loop(2)
+    assert list(one.state_dict()) == ["actor.weight", "actor.bias", "symmetry._extra_state"]
+    before = {name: value for name, value in one.state_dict().items() if "symmetry" not in name}
+    other.load_state_dict(one.state_dict())
+    older.load_state_dict(before)
+    assert drawn(one) == drawn(other) != drawn(older) == drawn(Loop(2))
+    with pytest.raises(RuntimeError, match=r"Missing key\(s\) in state_dict: \"actor.bias\""):
+        older.load_state_dict({"actor.weight": before["actor.weight"]})
+    assert one.to(torch.float64).symmetry.augment(random(2, 3), torch.zeros(2, dtype=torch.int64)).obs.shape == (4, 3)
+    shown = "group='d4', num_agents=1, copies='draw'\n  observation: velocity 2, load 1\n  action: 4 choices"
+    assert repr(one.symmetry) == f"Symmetry(\n  {shown}\n)"
+    assert "action: force 2" in repr(Symmetry(observation=SEEN, action=FORCE))
+
+
 def test_like_items_change_places_in_observation_and_state() -> None:
     marks = layout(Field("marks", Kind.SCALAR, 2))
     row, action = torch.tensor([[3.0, 4.0]]), torch.tensor([0])
