@@ -6,6 +6,7 @@ A table stands between two comments, each at the beginning of its line:
     ... written by this script, never by hand ...
     <!-- end of results -->
 
+A table of evaluations or of learning curves stands between `<!-- scores: FILE... -->` and the same end.
 The file is found from the page's own folder; the word behind it is a name of TABLES. Several files of one kind of
 study, with spaces between, give one table. A last word, `greedy` or `stochastic`, says which final returns it takes.
 """
@@ -13,6 +14,7 @@ study, with spaces between, give one table. A last word, `greedy` or `stochastic
 from __future__ import annotations
 
 import re
+import runpy
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -43,6 +45,10 @@ _BLOCK = re.compile(
     r".*?^(?P<end><!-- end of results -->)",
     re.DOTALL | re.MULTILINE,
 )
+_SCORES = re.compile(
+    r"^(<!-- scores: (?P<files>\S+(?: \S+)*) -->\n).*?^(?P<end><!-- end of results -->)", re.DOTALL | re.MULTILINE
+)
+scores_table = runpy.run_path(str(DOCS / "score_tables.py"))["scores_table"]
 
 
 def filled(page: Path) -> str:
@@ -69,8 +75,13 @@ def filled(page: Path) -> str:
         table = TABLES[name](summarised_results(match["files"], mode))
         return f"{match[1]}\n{table.markdown() if table.rows else 'Nothing yet.'}\n\n{match['end']}"
 
+    def score(match: re.Match[str]) -> str:
+        table = scores_table([page.parent / file for file in match["files"].split()])
+        return f"{match[1]}\n{table.markdown()}\n\n{match['end']}"
+
     page_text, count = _BLOCK.subn(compute, text)
-    if not count:
+    page_text, scores = _SCORES.subn(score, page_text)
+    if not count + scores:
         raise UserError(f"{page} has no table to compute; write '<!-- results: FILE TABLE -->' and its end")
     return page_text
 
@@ -322,7 +333,9 @@ TABLES = {
 def main() -> None:
     """Fill the named pages, or all."""
     named = [Path(name) for name in sys.argv[1:]]
-    for page in named or [page for page in sorted(DOCS.rglob("*.md")) if files_of(page)]:
+    for page in named or [
+        page for page in sorted(DOCS.rglob("*.md")) if "<!-- end of results -->" in page.read_text(encoding="utf-8")
+    ]:
         write_file(page, filled(page).encode())
         print(f"tables -> {page}")
 

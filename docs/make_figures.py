@@ -69,8 +69,8 @@ class Panel:
 
 FIGURES: dict[str, tuple[Panel, ...]] = {
     "wildlife-learners": (
-        Panel("wildlife", "learner", ["learner"], "drawn actions", "return with drawn actions"),
-        Panel("wildlife", "learner", ["learner"], "greedy", "greedy return"),
+        Panel("wildlife", "policy", ["policy"], "drawn actions", "return with drawn actions"),
+        Panel("wildlife", "policy", ["policy"], "greedy return", "greedy return"),
     ),
     "replay": (
         Panel("replay", "learner and copies", ["learner and copies"], "greedy return", "copies, 500k steps"),

@@ -252,3 +252,30 @@ def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
     assert whole.rows[place][2:] == ("not run",) * 4 + ("-150.00 ± 5.77", "-130.00 ± 5.77")
     number = reported(("table1", "navigation", "500000", "qmix", "esp"))
     assert whole.rows[place + 1][5] == f"{number.mean:.2f} ± {number.sem:.2f}"
+
+
+def test_evaluations_and_curves_are_tables_too(tmp_path):
+    score = {"mean": -120.0, "sem": 1.5}
+    run = {"greedy": score, "stochastic": None, "heuristics": ["greedy", "cover"], "metrics": {"arrival_rate": 0.5}}
+    run |= {
+        "anchors": {"random": -220.0, "heuristic": -112.6, "cover": -109.1},
+        "metrics_per_seed": {"arrival_rate": [0.25, 0.75]},
+    }
+    run["metrics"] |= {"risky_rate": 0.1, "collisions": 0.0}
+    (tmp_path / "a.json").write_text(json.dumps({"plain, calm": run, "ESP, calm": run}))
+    curve = {
+        "label": "plain",
+        "seeds": [0, 1],
+        "seconds": 90.0,
+        "returns": {"100000": score},
+        "area_under_curve": score,
+    }
+    (tmp_path / "b.json").write_text(json.dumps({"runs": [curve]}))
+    page = tmp_path / "page.md"
+    page.write_text("".join(f"<!-- scores: {name}.json -->\n<!-- end of results -->\n" for name in "ab"))
+    text = filled(page)
+    assert (
+        "| ESP, calm | -120.00 ± 1.50 | - | 0.500 ± 0.250 | 0.100 | 0.000 |\n| cover, calm | -109.10 |  | - | - | - |"
+        in text
+    )
+    assert "| plain | 2 | -120.00 ± 1.50 | -120.00 ± 1.50 | 1.5 |" in text
