@@ -30,6 +30,9 @@ class Frame(Protocol):
     def push_outputs(self, outputs: Tensor) -> Tensor:
         """Undo `pull_outputs`."""
 
+    def pull_items(self, item: Tensor, outputs: Tensor) -> Tensor | None:
+        """Return the items [W] of numbers beside outputs in the frame, or None where all parts have the same."""
+
 
 class Policies(ABC):
     """What a network outputs for originals and copies, as policies.
@@ -126,9 +129,10 @@ def _beside(weights: Weights) -> Weights:
 
 
 class GaussianPolicies(Policies):
-    """Gaussians whose means are the outputs, with one log deviation for all rows.
+    """Gaussians whose means are the outputs, with one log deviation of each item for all rows.
 
-    A slope is that by the means [S, P, R, W] and that by the log deviation [S, W].
+    An item that changes places in a copy has the deviation of its place there. A slope is that by the means
+    [S, P, R, W] and that by the log deviations [S, items].
 
     Args:
         outputs: [S, P B, T, N, W] means, under autograd.
@@ -138,23 +142,28 @@ class GaussianPolicies(Policies):
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame, log_std: Tensor, item: Tensor) -> None:
-        self._outputs, self._frame, self._parameter, self._item = outputs, frame, log_std, item
+        self._outputs, self._frame = outputs, frame
         self._deviation = WithVJP(log_std, lambda slope: [slope], [log_std])
-        means = frame.pull_outputs(outputs.tensor)
+        means, items = frame.pull_outputs(outputs.tensor), frame.pull_items(item, outputs.tensor)
         self._shape, self._means = means.shape, means.flatten(2, -2)
-        self._log_std = log_std.detach()[:, item].view(-1, 1, 1, len(item))
+        # [S, P, R, W], or [S, 1, 1, W] where all parts have their items in the same places
+        self._item = item.expand(len(log_std), 1, 1, -1) if items is None else items.flatten(2, -2)
+        self._log_std = log_std.detach().gather(1, self._item.flatten(1)).view(self._item.shape)
         self._precision = (-self._log_std).exp()
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         square = self._standardised(action, learned).square()
-        return -(0.5 * square + self._log_std + _HALF_LOG_TAU).sum(-1)
+        return -(0.5 * square + self._log_std[:, :learned] + _HALF_LOG_TAU).sum(-1)
 
     def entropy(self, learned: int) -> Tensor:
-        return (self._log_std + (0.5 + _HALF_LOG_TAU)).sum(-1).expand(self._means[:, :learned].shape[:-1])
+        entropy = (self._log_std[:, :learned] + (0.5 + _HALF_LOG_TAU)).sum(-1)
+        return entropy.expand(self._means[:, :learned].shape[:-1])
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
-        self._gap = (self._means[:, copies] - self._means[:, originals]) * self._precision
-        return 0.5 * self._gap.square().sum(-1)
+        self._gap = (self._means[:, copies] - self._means[:, originals]) * self._of(self._precision, originals)
+        log_ratio = 2 * (self._of(self._log_std, copies) - self._of(self._log_std, originals))
+        self._excess = log_ratio.exp() - 1
+        return 0.5 * (self._gap.square() + (self._excess - log_ratio)).sum(-1)
 
     def add_slope(
         self, slope: tuple[Tensor, Tensor] | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights
@@ -162,18 +171,21 @@ class GaussianPolicies(Policies):
         by_means, by_log_std = slope or self._no_slope()
         learned, above = by_log_prob.shape[1], by_log_prob.unsqueeze(-1)
         z = self._standardised(action, learned)
-        entropies = (torch.zeros_like(by_log_prob) + by_entropy).flatten(1).sum(1, keepdim=True)
-        by_log_std += (z.square() - 1).mul_(above).flatten(1, -2).sum(1) + entropies
-        by_means[:, :learned].add_(z.mul_(self._precision).mul_(above))
+        entropies = (torch.zeros_like(by_log_prob) + by_entropy).unsqueeze(-1)
+        self._add_by_items(by_log_std, (z.square() - 1).mul_(above).add_(entropies), slice(learned))
+        by_means[:, :learned].add_(z.mul_(self._precision[:, :learned]).mul_(above))
         return by_means, by_log_std
 
     def add_divergence_slope(
         self, slope: tuple[Tensor, Tensor] | None, weights: Weights, stop_gradient: str
     ) -> tuple[Tensor, Tensor]:
         by_means, by_log_std = slope or self._no_slope()
-        weighted = self._gap * (weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights)
-        by_log_std -= (weighted * self._gap).flatten(1, -2).sum(1)
-        weighted.mul_(self._precision)
+        weights = weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights
+        weighted, excess = self._gap * weights, self._excess * weights
+        self._add_by_items(by_log_std, -(weighted * self._gap) - excess, slice(1))
+        if len(self._item[0]) > 1:
+            self._add_by_items(by_log_std, excess, slice(1, None))
+        weighted.mul_(self._of(self._precision, slice(1)))
         if stop_gradient != "transformed":
             by_means[:, 1:].add_(weighted)
         if stop_gradient != "original":
@@ -182,12 +194,21 @@ class GaussianPolicies(Policies):
 
     def back(self, slope: tuple[Tensor, Tensor]) -> list[tuple[WithVJP, Tensor]]:
         by_means, by_log_std = slope
-        by_parameter = torch.zeros_like(self._parameter).index_add_(1, self._item, by_log_std)
         by_outputs = self._frame.push_outputs(by_means.unflatten(2, self._shape[2:-1]))
-        return [(self._outputs, by_outputs), (self._deviation, by_parameter)]
+        return [(self._outputs, by_outputs), (self._deviation, by_log_std)]
 
     def _standardised(self, action: Tensor, learned: int) -> Tensor:
-        return (action.flatten(1, -2).unsqueeze(1) - self._means[:, :learned]) * self._precision
+        return (action.flatten(1, -2).unsqueeze(1) - self._means[:, :learned]) * self._precision[:, :learned]
 
     def _no_slope(self) -> tuple[Tensor, Tensor]:
-        return torch.zeros_like(self._means), torch.zeros_like(self._precision[:, 0, 0])
+        return torch.zeros_like(self._means), torch.zeros_like(self._deviation.tensor)
+
+    def _of(self, x: Tensor, parts: slice) -> Tensor:
+        """Return deviations or items of some parts."""
+        return x if len(x[0]) == 1 else x[:, parts]
+
+    def _add_by_items(self, total: Tensor, slopes: Tensor, parts: slice) -> None:
+        """Add slopes by the deviations of some parts [S, P, R, W] to those by the items [S, items]."""
+        item = self._of(self._item, parts)
+        slopes = slopes.sum((1, 2), keepdim=True) if item.shape[2] == 1 else slopes
+        total.scatter_add_(1, item.expand_as(slopes).flatten(1), slopes.flatten(1))

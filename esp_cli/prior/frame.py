@@ -33,6 +33,16 @@ class Frame:
         """Undo `pull_outputs`; a slope goes the same way, since the maps are orthogonal."""
         return self._each(outputs, lambda g: g.push_outputs).flatten(1, 2)
 
+    def pull_items(self, item: Tensor, outputs: Tensor) -> Tensor | None:
+        """Return where the items of outputs stand: for each number of `pull_outputs` the item that it is at its copy.
+
+        `item` [W] is that of each number of an action. None where no element exchanges items.
+        """
+        if not any(element.items for g in self._transforms for element in g.elements):
+            return None
+        parts = self._parts(item.to(outputs.dtype).expand_as(outputs))
+        return self._each(parts, lambda g: g.pull_back_variance).round().long()
+
     def pull_values(self, values: Tensor) -> Tensor:
         """Return values [S, (1 + K) B, ..., C] in the frame: [S, 1 + K, B, ..., C]."""
         parts = self._parts(values)

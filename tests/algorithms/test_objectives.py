@@ -8,15 +8,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.distributions import Normal, kl_divergence
 
 from esp_cli.algorithms import maddpg, mappo, off_policy, qmix
+from esp_cli.algorithms.adam import SeedParameters
 from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_error, value_loss
 from esp_cli.networks.heads import Categorical
+from esp_cli.networks.plain import MlpConfig
+from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, losses, mean_per_seed
 from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Layout
 from tests.algorithms import off_policy as learners
 from tests.algorithms.test_mappo import learner
 from tests.networks.kernels.compiler import needs_compiler
@@ -218,6 +222,42 @@ def test_the_copies_of_a_policy_that_turns_with_the_world_are_left_alone_and_oth
         assert divergence.item() == pytest.approx(0.0 if there is ahead else 0.625 * math.log(2), abs=1e-6)
         assert penalty.value.item() == pytest.approx(divergence.item(), abs=1e-6)
         assert (ours.abs().max() > 0.1) == (there is here)
+
+
+LEGS = Layout((Field("hips", Kind.PSEUDOSCALAR, 2), Field("tail", Kind.SCALAR)))
+
+
+@pytest.mark.parametrize("exchanged", [True, False])
+def test_items_that_change_places_take_the_deviations_of_their_new_places(exchanged):
+    """Eq. 7 and 8 in the words of the paper, pi(K_g a | L_g s), for a mirror that exchanges two hips."""
+    torch.manual_seed(0)
+    element = "flip-x*hips-1-0" if exchanged else "flip-x"
+    spaces = Spaces(num_agents=1, observation=LEGS, state=LEGS, action=Continuous(LEGS), symmetry=element)
+    policy = StochasticPolicy(spaces, MlpConfig(hidden=(8,)), [torch.Generator().manual_seed(0)])
+    policy.head.log_std.data.copy_(torch.tensor([[-0.5, 0.5, 0.0]]))
+    list(policy.actor.parameters())[-2].data.mul_(50)
+    batch = SeedBatch(torch.randn(1, 4, 1, 1, 3), torch.randn(1, 4, 1, 3), torch.randn(1, 4, 1, 1, 3))
+    batch.log_prob, batch.advantage = torch.randn(1, 4, 1, 1) - 3, torch.randn(1, 4, 1, 1)
+    made = SymmetryPrior(PriorConfig(transforms=element, consistency_coef=0.5), spaces).copies(batch, [])
+    outputs = policy.unroll_with_vjp(made.obs)
+    ours = ppo_loss(policy.head, outputs, made, 0.2, 0.01) + made.penalty(policy=(policy.head, outputs))
+
+    (g,) = made.transforms
+    here, there = policy.unroll(batch.obs), policy.unroll(g.obs(batch.obs))
+    actions, advantage = torch.stack([batch.action, g.action(batch.action)]), batch.advantage
+    log_prob = policy.head.log_prob(torch.cat([here, there]), actions.flatten(0, 1))
+    objective, _ = clipped_surrogate(log_prob - batch.log_prob, advantage, 0.2)
+    deviation = policy.head.log_deviation(here).exp().expand_as(here)
+    p, q = (Normal(g.pull_back(there), g.pull_back_variance(deviation**2).sqrt()), Normal(here, deviation))
+    loss = -objective.mean() - 0.01 * policy.head.entropy(here).mean() + 0.5 * kl_divergence(p, q).sum(-1).mean()
+    torch.testing.assert_close(ours.value, loss.detach().view(1))
+    parameters = [*policy.parameters()]
+    found, expected = (
+        SeedParameters(parameters).sum(x.gradients(parameters)) for x in (ours, Loss.of(loss.unsqueeze(0)))
+    )
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+    in_place = kl_divergence(Normal(g.pull_back(there), deviation), q).sum(-1).mean()
+    assert (kl_divergence(p, q).sum(-1).mean() - in_place > 0.5) == exchanged, "the control"
 
 
 def test_the_slopes_of_the_critics_losses_by_hand():
