@@ -185,7 +185,8 @@ def values_along(
     cut = (rollout.ended & ~rollout.terminated).flatten(0, 1).any(0).tolist() if terminates else None
     for t, final in rollout.finals.items():
         if cut is None or cut[t]:
-            next_value[:, :, t] = _value_of(critic, final)
+            ended = rollout.ended[:, :, t].unsqueeze(2)  # other worlds' last bits shall not depend on these
+            next_value[:, :, t] = torch.where(ended, _value_of(critic, final), next_value[:, :, t])
     return value, next_value
 
 

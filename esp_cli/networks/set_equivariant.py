@@ -87,9 +87,9 @@ class InvariantRows(Rows):
     one: [S, B, .] to [S, B A, .].
     """
 
-    points: Tensor | None = None  # directions [A, 2]
-
-    def __init__(self, layout: Layout, shifts: bool, near: int, compiled: bool) -> None:
+    def __init__(
+        self, layout: Layout, shifts: bool, near: int, compiled: bool, points: Sequence[Sequence[float]] = ()
+    ) -> None:
         super().__init__(layout, shifts, near, compiled)
         self.own_columns = _columns([part.field for part in layout.own if part.where in self._own])
         one = [[_one(part.field) for part in family.parts] for family in self.families]
@@ -102,12 +102,10 @@ class InvariantRows(Rows):
             len(scalars) + further + len(vectors) * (len(vectors) + 3) // 2 + len(vectors) * count
             for (vectors, scalars), further in zip(self.columns, far, strict=True)
         ]
-
-    def along(self, points: Sequence[Sequence[float]]) -> None:
-        """Look along directions too."""
-        self.points = torch.tensor(points)
-        self.num_own += len(self.own_columns[0]) + 1
-        self.widths = [width + len(of) for width, (of, _) in zip(self.widths, self.columns, strict=True)]
+        self.points = torch.tensor(points) if points else None  # directions [A, 2]
+        if points:
+            self.num_own += count + 1
+            self.widths = [width + len(of) for width, (of, _) in zip(self.widths, self.columns, strict=True)]
 
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
         """Return own invariants [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
@@ -166,7 +164,9 @@ class DirectionActor(Memoryless):
         super().__init__()
         action = io.spaces.action
         assert isinstance(action, Discrete)
-        self.network = SetNetwork(generators, io, 1, config, output_gain, action.points)
+        compiled = config.compiled is True
+        rows = InvariantRows(io.layout, io.spaces.shifts, config.near, compiled, action.points)
+        self.network = SetNetwork(generators, io, 1, config, output_gain, rows)
 
     def forward(self, x: Tensor) -> Tensor:
         """Map [S, B, in] to [S, B, A]."""

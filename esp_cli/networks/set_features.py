@@ -51,7 +51,8 @@ class Rows:
     Args:
         layout: of a row.
         shifts: whether the task does not change when it is shifted.
-        near: of each family the things that are nearest to the reader; 0 for all.
+        near: of each family the things that are nearest to the reader, to its own place where they are points; 0 for
+            all.
         compiled: whether distances are computed by the kernel.
 
     Attributes:
@@ -69,13 +70,11 @@ class Rows:
         self.num_own = sum(where.stop - where.start for where in self._own)
         self.families, self._near, self.compiled = layout.families, near, compiled
         self._offsets = [_place(family) for family in layout.families]
+        own = [part.where.start for part in layout.own if part.field.is_point]
+        self._readers = [own[0] if own and _has_points(family) else None for family in layout.families]
         located = sum(at is not None for at in self._offsets)
         each = zip(self.families, self._offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
-
-    def along(self, points: Sequence[Sequence[float]]) -> None:
-        """Look at rows along directions too, where they are split so."""
-        raise NotImplementedError
 
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
         """Return the own numbers [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
@@ -87,10 +86,13 @@ class Rows:
         x = self._from_the_middle(x) if self._places else x
         own = torch.cat([x[..., where] for where in self._own], -1) if self._own else x[..., :0]
         things = []
-        for family, at in zip(self.families, self._offsets, strict=True):
+        for family, at, reader in zip(self.families, self._offsets, self._readers, strict=True):
             parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
             joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-            things.append(joined if at is None else _nearest(joined, at, self._near))
+            if at is not None and 0 < self._near < family.count:
+                ways = joined[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
+                joined = _nearest(joined, ways, self._near)
+            things.append(joined)
         return own, things
 
     def distances(self, things: Sequence[Tensor]) -> list[list[Tensor]]:
@@ -120,12 +122,14 @@ def _place(family: Family) -> int | None:
     return min(columns)[1] if columns else None
 
 
-def _nearest(things: Tensor, at: int, count: int) -> Tensor:
-    """Return the nearest of the things [S, B, K, W], whose places begin at a column; all of them for 0."""
-    if not 0 < count < things.shape[2]:
-        return things
-    square = things[..., at : at + 2].square().sum(-1)
-    which = square.topk(count, -1, largest=False, sorted=False).indices
+def _has_points(family: Family) -> bool:
+    """Return whether its things have places in the scene, and not ways to them."""
+    return any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
+
+
+def _nearest(things: Tensor, ways: Tensor, count: int) -> Tensor:
+    """Return the things [S, B, K, W] with the shortest ways [S, B, K, 2] to them."""
+    which = ways.square().sum(-1).topk(count, -1, largest=False, sorted=False).indices
     return things.gather(2, which.unsqueeze(-1).expand(-1, -1, -1, things.shape[-1]))
 
 
@@ -210,7 +214,7 @@ class TeamFeatures(nn.Module):
         io: of the network.
         config: shape.
         beside: numbers that come along with each agent, such as its action.
-        points: directions along which rows are looked at too; see `Rows.along`.
+        rows: split the rows, instead of those that the settings choose.
 
     Attributes:
         width: features of a row.
@@ -222,16 +226,14 @@ class TeamFeatures(nn.Module):
         io: IoSpec,
         config: SetShape,
         beside: int = 0,
-        points: Sequence[Sequence[float]] = (),
+        rows: Rows | None = None,
     ) -> None:
         super().__init__()
         spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"
         if compiled:
             begin("sets")
         layout = io.layout if io.reads == "state" else spaces.observation
-        rows = config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
-        if points:
-            rows.along(points)
+        rows = rows or config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
         self.encoder = SetEncoder(generators, rows, config)
         self.num_agents = spaces.num_agents if joint else 0
         found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []

@@ -21,7 +21,7 @@ from esp_cli.networks.contract import Memoryless, Network
 from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.mixer import HYPER_GAIN
-from esp_cli.networks.set_features import SetShape, TeamFeatures, along
+from esp_cli.networks.set_features import Rows, SetShape, TeamFeatures, along
 from esp_envs.errors import UserError
 
 
@@ -79,10 +79,10 @@ class SetNetwork(Memoryless):
         outputs: int,
         config: SetConfig,
         output_gain: float,
-        points: Sequence[Sequence[float]] = (),
+        rows: Rows | None = None,
     ) -> None:
         super().__init__()
-        self.features = TeamFeatures(generators, io, config, points=points)
+        self.features = TeamFeatures(generators, io, config, rows=rows)
         width, self.values_each = self.features.width, io.num_values is not None and outputs > 1
         if self.values_each:
             self.features.each_or_refuse(io)

@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from esp_cli.algorithms.rollout import Batch, values_along
+from esp_cli.algorithms.rollout import Batch, Rollout, values_along
 from esp_cli.networks.contract import WithVJP
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
+from esp_envs.base import Observation
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_epochs": 2, "mappo.num_minibatches": 2, "network.hidden": [16, 16]}
 
@@ -362,3 +363,21 @@ def test_the_next_value_along_whole_episodes_is_that_of_the_step_after():
     value, following = values_along(trained.critic, rollout, 25)
     assert torch.equal(value, steps[:25].repeat(2, 1).expand(2, 4, 50, 1))
     assert torch.equal(following - value, torch.ones(2, 4, 50, 1))
+
+
+def test_the_value_of_what_followed_is_looked_up_anew_in_worlds_that_ended_alone():
+    """Where another world's end would have it computed anew, its last bits would depend on that world."""
+
+    class Counting:
+        calls = 0
+
+        def unroll(self, obs, state):
+            self.calls += 1
+            return torch.full((*obs.shape[:3], 1), float(self.calls))
+
+    obs, state, flags = torch.zeros(1, 2, 3, 1, 1), torch.zeros(1, 2, 3, 1), torch.zeros(1, 2, 3, dtype=torch.bool)
+    ended, seen = flags.clone(), Observation(obs[:, :, 0], state[:, :, 0])
+    ended[0, 1, 1] = True
+    rollout = Rollout(obs, state, obs, obs, obs, flags, ended, seen, {1: seen})
+    _, following = values_along(Counting(), rollout, None)
+    assert following[0, :, :, 0].tolist() == [[1, 1, 2], [1, 3, 2]]

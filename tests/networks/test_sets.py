@@ -177,6 +177,19 @@ def test_one_looks_at_the_nearest_alone():
     torch.testing.assert_close(network(spec, config=SetConfig(near=5))(rows), all_of_them(rows), **CLOSE)
 
 
+@pytest.mark.parametrize("shifts", [False, True])
+def test_the_nearest_of_things_that_are_points_are_nearest_to_the_reader(shifts):
+    """It stands at (5, 0): the wall at (6, 0) is near, that at (1, 0) is far, though it is nearer to the origin."""
+    walls = Field("walls", Kind.VECTOR, 2, family="walls", is_point=True)
+    rows = Rows(layout(Field("place", Kind.VECTOR, is_point=True), walls), shifts, 1, False)
+    x = torch.tensor([5.0, 0.0, 1.0, 0.0, 6.0, 0.0]).view(1, 1, -1)
+    own, (near,) = rows.numbers(x)
+    assert (near - own.unsqueeze(2)).flatten().tolist() == [1.0, 0.0]
+    ways = Field("walls", Kind.VECTOR, 2, family="walls")
+    _, (near,) = Rows(layout(Field("place", Kind.VECTOR, is_point=True), ways), False, 1, False).numbers(x)
+    assert near.flatten().tolist() == [1.0, 0.0], "the control: a way is as long as it is"
+
+
 def test_an_observation_without_like_things_is_refused():
     spec = scene()[0]
     own = layout(*(f for f in spec.observation.fields if not f.family_name))
