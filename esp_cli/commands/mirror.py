@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from esp_cli.bodies import Body
     from esp_cli.bodies.asymmetry import Difference
     from esp_cli.bodies.auditing import Copy
+    from esp_cli.bodies.turning import Turning
 
 EPILOG = """Examples:\n
     esp mirror robot.xml\n
     esp mirror robot.urdf --json mirror.json\n
     esp mirror robot.xml --numbers my_robot:numbers --emit rsl_rl -o mirror.py\n
-    esp mirror robot.xml --check symmetry:compute_symmetric_states"""
+    esp mirror robot.xml --check symmetry:compute_symmetric_states\n
+    esp mirror robot.xml --numbers my_robot:numbers --policy policy.onnx"""
 
 _SHOWN = 4
 """Elements that have a column in the table; the others are in the JSON."""
@@ -46,6 +48,15 @@ def mirror(
     check: Annotated[
         str | None, typer.Option("--check", help="Audit a mirror that you wrote.", metavar="MODULE:NAME")
     ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            "--policy", help="Measure how far a policy is from turning with its body.", metavar="FILE|MODULE:NAME"
+        ),
+    ] = None,
+    rows: Annotated[
+        Path | None, typer.Option("--rows", help="Observations that it meets, for --policy.", metavar="FILE.npy")
+    ] = None,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -61,21 +72,25 @@ def mirror(
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
     if out is not None and out.exists() and not force:
         raise UserError(f"{out} exists; choose another path, or add --force")
+    if rows is not None and policy is None:
+        raise UserError("--rows are observations for --policy; name the policy too")
     body = Body.from_mjcf(model, root)
-    failed = not body.found
-    audited: list[Copy] = []
     if emit is not None and out is not None:
         _write(body, model, numbers, emit, out)
-    if check is not None:
-        from esp_cli.bodies.auditing import audit
-        from esp_cli.bodies.numbers import named_function, numbers_of
+    audited = [] if check is None else _audited(check, body, numbers)
+    measured = [] if policy is None else _measured(policy, rows, body, numbers)
 
-        audited = audit(named_function(check), body, numbers_of(body, numbers))
-        failed = any(copy.wrong for copy in audited)
-    found = {**described(body, model), "check": audited}
+    def show() -> None:
+        if check:
+            _print_audit(check, audited)
+        if policy:
+            _print_turning(policy, measured)
+        if not check and not policy:
+            _print(body, model)
+
     if emit is None or json:
-        console.result(json, found, lambda: _print_audit(check, audited) if check else _print(body, model))
-    if failed:
+        console.result(json, {**described(body, model), "check": audited, "policy": measured}, show)
+    if not body.found or any(copy.wrong for copy in audited):
         raise typer.Exit(1)
 
 
@@ -112,6 +127,20 @@ def _write(body: Body, model: Path, numbers: str | None, host: str, out: Path) -
         console.note("the numbers are those of Isaac Lab's velocity tasks; --numbers names a function with yours")
 
 
+def _audited(check: str, body: Body, numbers: str | None) -> list[Copy]:
+    from esp_cli.bodies.auditing import audit
+    from esp_cli.bodies.numbers import named_function, numbers_of
+
+    return audit(named_function(check), body, numbers_of(body, numbers))
+
+
+def _measured(policy: str, rows: Path | None, body: Body, numbers: str | None) -> list[Turning]:
+    from esp_cli.bodies.numbers import numbers_of
+    from esp_cli.bodies.turning import policy_of, rows_of, turning
+
+    return turning(policy_of(policy), body, numbers_of(body, numbers), None if rows is None else rows_of(rows))
+
+
 def _print_audit(name: str, copies: Sequence[Copy]) -> None:
     wrong = [(copy.element, *row) for copy in copies for row in copy.wrong]
     if not wrong:
@@ -122,6 +151,12 @@ def _print_audit(name: str, copies: Sequence[Copy]) -> None:
         if copy.wrong and not copy.is_involution:
             console.say(f"copy {k} ({copy.element}) does not undo itself")
     console.table(("element", "number", "takes", "right is"), wrong)
+
+
+def _print_turning(name: str, measured: Sequence[Turning]) -> None:
+    rows = [(one.element, f"{one.distance:.3g}", one.action, f"{one.worst:.3g}") for one in measured]
+    caption = "0: the policy turns with the body; 1: as far apart as actions of unrelated states"
+    console.table(("element", "distance>", "worst action", "its distance>"), rows, title=name, caption=caption)
 
 
 def _print(body: Body, model: Path) -> None:

@@ -257,7 +257,7 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert esp("mirror", "biped.xml", "--check", "my_mirror:compute_symmetric_states").stdout == (
         "my_mirror:compute_symmetric_states is right: its copies are identity, flip-x\n"
     )
-    text = Path("my_mirror.py").read_text().replace("'sign': [-1,", "'sign': [1,")
+    text = Path("my_mirror.py").read_text().replace("[[-1,", "[[1,")
     Path("my_wrong.py").write_text(text)
     result = esp("mirror", "biped.xml", "--check", "my_wrong:compute_symmetric_states", "--json", "-", code=1)
     assert json.loads(result.stdout)["check"][1]["wrong"] == [["actions.waist", "actions.waist", "-actions.waist"]]

@@ -1,0 +1,150 @@
+"""How far a trained policy is from turning with its body, in states that are mirrored by the proven map."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from esp_cli.bodies.body import Body
+from esp_cli.bodies.kinds import QUATERNION, QUATERNION_XYZW
+from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of, named_function
+from esp_cli.files.opening import read_regular
+from esp_cli.symmetry.elements import Floats
+from esp_envs.errors import UserError
+from esp_envs.installed import install, last_line
+from esp_envs.spec import Layout
+
+_ROWS, _MOST_BYTES = 2048, 1 << 30
+_OF_LENGTH_ONE = {QUATERNION, QUATERNION_XYZW}
+Actor = Callable[[Floats], Any]
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How far a policy is from turning with one element.
+
+    Attributes:
+        element: its name.
+        distance: between pi(L s) and K pi(s), as a share of that between actions of unrelated states: 0 where the
+            policy turns with the body, about 1 where it knows nothing of the element.
+        action: the number of the action that is farthest off, as a share of its own distance.
+        worst: that share.
+    """
+
+    element: str
+    distance: float
+    action: str
+    worst: float
+
+
+def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = None) -> list[Turning]:
+    """Compare what a policy does in states and in their images.
+
+    Args:
+        actor: rows [M, D] of the first group of observations to actions [M, A].
+        body: of the robot.
+        numbers: what its observations and actions are.
+        rows: observations [M, D] that the policy meets; by default normal ones, quaternions and gravity of length 1.
+
+    Raises:
+        UserError: the policy fails or returns something else, or the rows do not fit.
+    """
+    seen = numbers[next((name for name in numbers if name != ACTION), ACTION)]
+    rows = _drawn(seen) if rows is None else rows
+    if rows.ndim != 2 or rows.shape[1] != seen.width or len(rows) < 2 or not np.isfinite(rows).all():
+        raise UserError(f"the rows have shape {list(rows.shape)}; give finite numbers [M, {seen.width}] of states")
+    labels, shifted = labels_of(numbers[ACTION]), np.roll(np.arange(len(rows)), 1)
+    here, found = _acted(actor, rows, len(labels)), []
+    for element in body.elements:
+        there = _acted(actor, rows @ map_of(seen, element).T, len(labels))
+        image = here @ map_of(numbers[ACTION], element).T
+        gap, unrelated = ((there - x) ** 2 for x in (image, image[shifted]))
+        shares = np.sqrt(gap.mean(0) / np.maximum(unrelated.mean(0), 1e-30))
+        worst = int(shares.argmax())
+        distance = float(np.sqrt(gap.mean() / max(unrelated.mean(), 1e-30)))
+        found.append(Turning(element.name, distance, labels[worst], float(shares[worst])))
+    return found
+
+
+def policy_of(name: str) -> Actor:
+    """Return the policy of an ONNX file, of TorchScript, or a function "module:function" of tensors [M, D].
+
+    Raises:
+        UserError: it cannot be read, or has more inputs than observations.
+    """
+    path = Path(name)
+    if ":" in name and not path.exists():
+        return _of_tensors(named_function(name))
+    content = read_regular(path, _MOST_BYTES)
+    if content is None:
+        raise UserError(f"{path} has more than {_MOST_BYTES} bytes; give a policy")
+    if path.suffix != ".onnx":
+        try:
+            return _of_tensors(torch.jit.load(BytesIO(content), map_location="cpu").eval())
+        except RuntimeError as error:
+            raise UserError(f"{path} is neither ONNX nor TorchScript: {last_line(error)}") from None
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    try:
+        runtime = import_module("onnxruntime")
+    except ImportError:
+        raise UserError(f"an ONNX policy needs the package onnxruntime: {install('export')}") from None
+    try:
+        session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    except Exception as error:
+        raise UserError(f"{path} is no ONNX model: {last_line(error)}") from None
+    inputs = [given.name for given in session.get_inputs()]
+    if len(inputs) != 1:
+        raise UserError(f"{path} takes {', '.join(inputs)}; give a policy of observations alone, without memory")
+    return lambda rows: session.run(None, {inputs[0]: rows.astype(np.float32)})[0]
+
+
+def rows_of(path: Path) -> Floats:
+    """Read observations [M, D] of a .npy file.
+
+    Raises:
+        UserError: it is none.
+    """
+    try:
+        content = BytesIO(read_regular(path, _MOST_BYTES) or b"")
+        return np.asarray(np.lib.format.read_array(content, allow_pickle=False), np.float64)
+    except (ValueError, TypeError, MemoryError) as error:
+        raise UserError(f"{path} is no .npy file of numbers: {last_line(error)}") from None
+
+
+def _of_tensors(module: Callable[..., Any]) -> Actor:
+    def act(rows: Floats) -> Any:
+        with torch.no_grad():
+            given = module(torch.from_numpy(rows).float())
+        given = given[0] if isinstance(given, tuple | list) else given
+        return given.detach().cpu().numpy() if isinstance(given, torch.Tensor) else given
+
+    return act
+
+
+def _acted(actor: Actor, rows: Floats, width: int) -> Floats:
+    """Return the actions [M, A] of a policy."""
+    try:
+        actions = np.asarray(actor(rows), np.float64)
+    except (Exception, SystemExit) as error:
+        raise UserError(f"the policy raises {last_line(error)}; it was given rows {list(rows.shape)}") from error
+    if actions.shape != (len(rows), width) or not np.isfinite(actions).all():
+        raise UserError(f"the policy returns {list(actions.shape)}; give finite actions {[len(rows), width]}")
+    return actions
+
+
+def _drawn(seen: Layout) -> Floats:
+    """Return normal rows, in which what has length 1 has it."""
+    rows = np.random.default_rng(0).standard_normal((_ROWS, seen.width))
+    for field, where in zip(seen.fields, seen.slices().values(), strict=True):
+        if field.kind in _OF_LENGTH_ONE or field.name == "gravity":
+            items = rows[:, where].reshape(_ROWS, field.count, -1)
+            rows[:, where] = (items / np.linalg.norm(items, axis=-1, keepdims=True)).reshape(_ROWS, -1)
+    return rows
