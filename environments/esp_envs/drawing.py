@@ -39,6 +39,10 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
     x_min, x_max, y_min, y_max = scene.window
     if size < 16 or x_max <= x_min or y_max <= y_min:
         raise UserError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
+    if scene.picture is not None:
+        whole = Image.fromarray(scene.picture)
+        share = size / max(whole.size)
+        return np.asarray(whole.resize((max(1, round(whole.width * share)), max(1, round(whole.height * share)))))
     canvas = _Canvas(scene.window, size)
     canvas.grid(*scene.grid)
     for body, path in trails(scene, trail):

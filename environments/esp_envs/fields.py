@@ -32,6 +32,7 @@ class Kind:
     WHEELS        (left, right) wheel pair: unchanged by rotation, swapped by reflection.
     PICTURE       one channel of a picture of the plane, of as many pixels as its field says, row after row from the
                   top, in each from the left. A transform moves pixels about the picture's middle, and changes none.
+                  With `parts` each pixel holds several numbers, pixel after pixel, which transform too (directions).
     RING          one number for each of n rays around a body, counter-clockwise from the x-axis (a lidar). A turn by
                   360 / n shifts them, a mirror in the x-axis reverses them; other turns are refused.
     RECORD        several numbers of several kinds, as the field's `parts` say (another agent's position and its speed).
@@ -82,14 +83,16 @@ def others_of(num_agents: int) -> list[list[int]]:
 class Field:
     """A run of numbers of one kind: `count` items of `item_width` numbers each, item after item.
 
-    Only a picture has `pixels`, its rows and columns; its items are its channels. Only a ring has `rays`, and only a
-    record has `parts`, the fields of one item in their order.
+    Only a picture has `pixels`, its rows and columns; its items are its channels. Only a ring has `rays`. A record has
+    `parts`, the fields of one item in their order; a picture may have them, those of one pixel.
 
     Attributes:
         family: what its items are, as "landmarks": a set of like things, in whose order nothing lies. Fields of one
             family are joined item by item. Items that count over agents are the family "others" or "agents".
         is_point: whether its vectors are places in the scene, which move when the scene is shifted, and not ways
             between places, velocities or directions.
+        sorted_by: numbers of an item by which the environment sorts items, the first one first: 1 is an item's first
+            number, -1 the same with the largest first. Transformed items are sorted anew.
     """
 
     name: str
@@ -102,6 +105,7 @@ class Field:
     parts: tuple[Field, ...] = ()
     family: str = ""
     is_point: bool = False
+    sorted_by: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind, example in _FIELD_TYPES:
@@ -115,14 +119,20 @@ class Field:
             raise UserError(f"field '{self.name}': pixels are {self.pixels}; give at least one row and one column")
         if (self.kind == Kind.RING) != (self.rays > 0) or self.rays < 0:
             raise UserError(f"field '{self.name}': a ring, and nothing else, says how many rays it has")
-        if (self.kind == Kind.RECORD) != bool(self.parts):
-            raise UserError(f"field '{self.name}': a record, and nothing else, says what parts it has")
+        if (self.kind not in (Kind.RECORD, Kind.PICTURE)) if self.parts else self.kind == Kind.RECORD:
+            raise UserError(f"field '{self.name}': a record, and nothing else but a picture, says what parts it has")
         if any(part.items is not Items.FIXED or part.pixels is not None for part in self.parts):
             raise UserError(f"field '{self.name}': a record's parts hold no pictures and count over no agents")
         if self.family and self.kind == Kind.PICTURE:
             raise UserError(f"field '{self.name}': the channels of a picture are no like things; leave family out")
         if self.is_point and self.kind != Kind.VECTOR:
             raise UserError(f"field '{self.name}': a {self.kind.name} is no place; leave is_point out")
+        known = range(1, self.item_width + 1) if self.items is Items.FIXED else ()
+        if any(abs(number) not in known for number in self.sorted_by):
+            raise UserError(
+                f"field '{self.name}': sorted_by is {self.sorted_by}; give which numbers of an item decide, counted "
+                "from 1, negative ones for the largest first, of items that are no agents"
+            )
 
     @property
     def family_name(self) -> str:
@@ -132,9 +142,8 @@ class Field:
     @property
     def item_width(self) -> int:
         """Numbers per item."""
-        if self.parts:
-            return sum(part.width for part in self.parts)
-        return self.kind.width * (self.rays or math.prod(self.pixels or (1,)))
+        each = sum(part.width for part in self.parts) or self.kind.width
+        return each * (self.rays or math.prod(self.pixels or (1,)))
 
     @property
     def width(self) -> int:
@@ -148,7 +157,7 @@ class Field:
         if self.rays:
             size = f" of {self.rays} rays"
         if self.parts:
-            size = f" of {', '.join(f'{part.name} ({part.described})' for part in self.parts)}"
+            size += f" of {', '.join(f'{part.name} ({part.described})' for part in self.parts)}"
         return f"{self.kind.name}{size} x {self.count}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -48,13 +48,14 @@ class Scene:
     """A drawable snapshot of one world: bodies in the window (x_min, x_max, y_min, y_max), drawn in order.
 
     `grid` is the distance of the lines behind them and where one of them lies, along either axis; `unit` is that of
-    positions.
+    positions. An environment of others that draws itself gives its own `picture` [H, W, 3] instead.
     """
 
     bodies: tuple[Body, ...]
     window: tuple[float, float, float, float]
     grid: tuple[float, float] = (GRID_SPACING, 0.0)
     unit: str = ""
+    picture: NDArray[np.uint8] | None = field(default=None, compare=False)
 
 
 class Painter(Protocol):

@@ -12,8 +12,10 @@ that differs by more than rounding is a proof.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -29,7 +31,7 @@ from esp_cli.checking.verdicts import (
     chance,
     concluded,
     unwatched,
-    watched,
+    verdicts_of,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
@@ -48,35 +50,88 @@ _BOUND = 0.05
 _NUDGE, _ROUNDINGS, _UNCLEAR = 1e-6, 10.0, 0.05
 """How far a state is moved to see what rounding does, how often that may be exceeded without being a mismatch, and the
 share of the states that differ by no more than that, from which nothing is said."""
+_SOME = 8
+"""Of more elements than these, each is first tried in one of so many states."""
+_FURTHER = "holds where play went, but further out {} would differ"
 Outcomes = dict[str, Tensor]
 """What a step gives, by field: [M, numbers]."""
 
 
 def check_paired(
-    make: MakeWorlds, elements: Sequence[Element], most: int | None = None, watch: Watch = unwatched
+    make: MakeWorlds,
+    elements: Sequence[Element],
+    most: int | None = None,
+    watch: Watch = unwatched,
+    until: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state.
+
+    Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
+    states that were visited is tried further out, too, where random play does not go: an element that is broken there
+    is not covered.
 
     Args:
         make: makes E worlds for some seeds.
         elements: to try.
         most: worlds in which outcomes are compared, at most.
         watch: told of how many elements of how many are judged.
+        until: when to stop, see `verdicts_of`.
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
     visited = _visit(make(worlds, [0]))
     if most is None:  # one step of many worlds takes less time than many steps
-        states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
-        visited, worlds = [(states, actions)], states.shape[1]
-    twins = [make(worlds, [seed]) for seed in (101, 102)]
-    spec = twins[0].spec
-    here = [_outcomes(env, visited, None) for env in twins]
-    one, other = (_fields(steps, spec, None) for steps in here)
-    if all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one):
-        twins = twins[:1]  # nothing is left to chance, so one run from each image will do
-        here.append(_outcomes(twins[0], [(_nudged(state), action) for state, action in visited], None))
-    return [_judge(element, spec, visited, twins, here) for element in watched(elements, watch)]
+        visited = [tuple(torch.cat(part, 1) for part in zip(*visited, strict=True))]
+    some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in visited]
+    everywhere, few = (cache(lambda states=states: _Pairs(make, states)) for states in (visited, some))
+    further = cache(lambda: _Pairs(make, [(_stretched(state, shown.state), action) for state, action in visited]))
+
+    def judge(element: Element) -> ElementVerdict:
+        if len(elements) > _SOME and (found := few().judge(element)).outcome == "broken":
+            return found
+        found = everywhere().judge(element)
+        if found.outcome == "holds" and (beyond := further().judge(element)).outcome == "broken":
+            fields = tuple(replace(f, outcome="not covered") for f in beyond.fields if f.outcome == "broken")
+            return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
+        return found
+
+    return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until)
+
+
+class _Pairs:
+    """Steps from some states, to be compared with steps from their images.
+
+    Args:
+        make: makes E worlds for some seeds.
+        visited: states [1, E, state width] and joint actions, for each moment.
+    """
+
+    def __init__(self, make: MakeWorlds, visited: Sequence[tuple[Tensor, Tensor]]) -> None:
+        self._visited, worlds = visited, visited[0][0].shape[1]
+        self._twins = [make(worlds, [seed]) for seed in (101, 102)]
+        self._spec = spec = self._twins[0].spec
+        self._here = [_outcomes(env, visited, None) for env in self._twins]
+        one, other = (_fields(steps, spec, None) for steps in self._here)
+        if all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one):
+            self._twins = self._twins[:1]  # nothing is left to chance, so one run from each image will do
+            near = [(_nudged(state), action) for state, action in visited]
+            self._here.append(_outcomes(self._twins[0], near, None))
+
+    def judge(self, element: Element) -> ElementVerdict:
+        """Compare the steps from the images with the images of the steps."""
+        declared, transform = is_declared(element, self._spec), build_transform([element], self._spec)
+        try:
+            there = [_outcomes(env, self._visited, transform) for env in self._twins]
+        except Exception as error:
+            reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
+            return ElementVerdict(element.name, declared, (), reason)
+        first, second, *nudged = (_fields(steps, self._spec, transform) for steps in self._here)
+        third, fourth = _fields(there[0], self._spec, None), _fields(there[-1], self._spec, None)
+        verdicts = [
+            _verdict(name, first[name], second[name], third[name], fourth[name], *(near[name] for near in nudged))
+            for name in first
+        ]
+        return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
 
 
 def _visit(env: Environment) -> list[tuple[Tensor, Tensor]]:
@@ -103,27 +158,14 @@ def _outcomes(env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned
     return steps
 
 
-def _judge(
-    element: Element,
-    spec: TaskSpec,
-    visited: Sequence[tuple[Tensor, Tensor]],
-    twins: Sequence[Environment],
-    here: Sequence[list[Step]],
-) -> ElementVerdict:
-    declared = is_declared(element, spec)
-    transform = build_transform([element], spec)
-    try:
-        there = [_outcomes(env, visited, transform) for env in twins]
-    except Exception as error:
-        reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
-        return ElementVerdict(element.name, declared, (), reason)
-    first, second, *nudged = (_fields(steps, spec, transform) for steps in here)
-    third, fourth = _fields(there[0], spec, None), _fields(there[-1], spec, None)
-    verdicts = [
-        _verdict(name, first[name], second[name], third[name], fourth[name], *(near[name] for near in nudged))
-        for name in first
-    ]
-    return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
+def _stretched(state: Tensor, layout: Layout) -> Tensor:
+    """Return states [1, E, state width] whose vectors are up to ten times as long, the same factor for all of one."""
+    factor = 10 ** torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
+    out = state.clone()
+    for field, where in zip(layout.fields, layout.slices().values(), strict=True):
+        if field.kind.is_vector and not bool((state[..., where] == state[..., where].round()).all()):  # no cells
+            out[..., where] *= factor
+    return out
 
 
 def _nudged(state: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass
 
 import torch
@@ -40,13 +42,15 @@ class Transitions:
         return Transitions(*(part[where] for part in vars(self).values() if part is not None))
 
 
-def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS) -> Transitions:
+def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS, until: float = math.inf) -> Transitions:
     """Return the first steps of episodes of the random policy.
 
-    An episode that ends earlier repeats its last transition.
+    An episode that ends earlier repeats its last transition. After `until`, by `time.monotonic`, no more are begun.
     """
     found: list[list[tuple[Tensor, ...]]] = []
     for _ in range(-(-episodes // (env.num_envs * env.num_seeds))):
+        if found and time.monotonic() > until:
+            break
         observation = env.reset()
         over = torch.zeros(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
         rows: list[tuple[Tensor, ...]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -67,7 +69,11 @@ class SymmetryReport:
 
 
 def check_symmetry(
-    make: MakeWorlds, transforms: str | None = None, from_transitions: bool = False, watch: Watch = unwatched
+    make: MakeWorlds,
+    transforms: str | None = None,
+    from_transitions: bool = False,
+    watch: Watch = unwatched,
+    seconds: float = math.inf,
 ) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
@@ -76,13 +82,15 @@ def check_symmetry(
         transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
         from_transitions: use transitions of the random policy even where the task can be set to states.
         watch: told of how many elements of how many are judged.
+        seconds: after which elements that are left are not tried; declared ones are tried first.
 
     Raises:
         UserError: the transforms mean nothing, or the task can carry none of them.
     """
+    until = time.monotonic() + seconds
     spec = make(1, [0]).spec
     elements = candidates(spec, transforms)
-    method, verdicts = judged(make, elements, from_transitions, watch)
+    method, verdicts = judged(make, elements, from_transitions, watch, until)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
@@ -94,14 +102,19 @@ def check_recorded(source: str, spaces: Spaces, data: Transitions, transforms: s
 
 
 def judged(
-    make: MakeWorlds, elements: Sequence[Element], from_transitions: bool = False, watch: Watch = unwatched
+    make: MakeWorlds,
+    elements: Sequence[Element],
+    from_transitions: bool = False,
+    watch: Watch = unwatched,
+    until: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
-    """Return the method that a task allows, and what it says of some elements."""
+    """Return the method that a task allows, and what it says of some elements until the time is over."""
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
     if from_transitions or not probe.settable():
         worlds = make(min(_COPIES, max(32, 8192 // seen.horizon)), [0])
-        return TRANSITIONS, transitions.check_transitions(seen, collect(worlds, _EPISODES), elements, watch)
+        data = collect(worlds, _EPISODES, until=(until + time.monotonic()) / 2)
+        return TRANSITIONS, transitions.check_transitions(seen, data, elements, watch, until)
 
     def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
         env = make(num_envs, seeds)
@@ -109,10 +122,10 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch)
+    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until)
     verdicts = dict(zip(carried, found, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        verdicts |= dict(zip(rest, judged(make, rest, from_transitions=True)[1], strict=True))
+        verdicts |= dict(zip(rest, judged(make, rest, from_transitions=True, until=until)[1], strict=True))
     return PAIRED, [verdicts[element] for element in elements]
 
 

@@ -14,6 +14,7 @@ them would have raised the gap so far that one as small as what is found has a p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -26,7 +27,15 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, Products, Sides, strength, trust_in
 from esp_cli.checking.predictor import Predictor
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, unwatched, watched
+from esp_cli.checking.verdicts import (
+    SIGNIFICANT,
+    ElementVerdict,
+    FieldVerdict,
+    Watch,
+    concluded,
+    unwatched,
+    verdicts_of,
+)
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
@@ -49,7 +58,11 @@ from the second on, of starts, images lie where no transition does."""
 
 
 def check_transitions(
-    spaces: Spaces, data: Transitions, elements: Sequence[Element], watch: Watch = unwatched
+    spaces: Spaces,
+    data: Transitions,
+    elements: Sequence[Element],
+    watch: Watch = unwatched,
+    until: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements from transitions.
 
@@ -58,6 +71,7 @@ def check_transitions(
         data: anybody's transitions, of a policy that prefers no direction; each episode counts once.
         elements: to try.
         watch: told of how many elements of how many are judged.
+        until: when to stop, see `verdicts_of`.
 
     Raises:
         UserError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
@@ -72,7 +86,11 @@ def check_transitions(
     controls = Controls(spaces.observation, thinned)
     halves = [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
     first = Transitions(*(part[:, :1] for part in vars(data).values() if part is not None))
-    return [_judge(element, spaces, halves, first) for element in watched(elements, watch)]
+
+    def judge(element: Element) -> ElementVerdict:
+        return _judge(element, spaces, halves, first)
+
+    return verdicts_of(elements, judge, lambda element: is_declared(element, spaces), watch, until)
 
 
 def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions) -> ElementVerdict:

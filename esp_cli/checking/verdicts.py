@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +21,7 @@ SIGNIFICANT = 6.0
 """Standard errors that a gap must exceed to be a breaking: with thousands of comparisons, chance alone reaches 4."""
 NEGLIGIBLE = 1e-3
 """Gap against the field's spread below which a difference is rounding."""
+LATE = "not tried, as the time was over"
 LEVEL = 0.05
 """Probability with which an element that is off by the tolerance may be said to hold, at most."""
 
@@ -96,8 +98,25 @@ def unwatched(done: int, total: int) -> None:
     """Take what nobody shows."""
 
 
-def watched(elements: Sequence[Element], watch: Watch) -> Iterator[Element]:
-    """Yield elements, and tell how many are done."""
-    for done, element in enumerate(elements, 1):
-        yield element
+def verdicts_of(
+    elements: Sequence[Element],
+    judge: Callable[[Element], ElementVerdict],
+    is_declared: Callable[[Element], bool],
+    watch: Watch = unwatched,
+    until: float = math.inf,
+) -> list[ElementVerdict]:
+    """Judge elements, declared ones first, and tell how many are done.
+
+    Args:
+        elements: to judge.
+        judge: what judges one.
+        is_declared: whether the task declares one.
+        watch: told of how many elements of how many are judged.
+        until: reading of `time.monotonic` from which on an element is not covered, as it is not tried.
+    """
+    found = dict[Element, ElementVerdict]()
+    for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
+        late = done > 1 and time.monotonic() > until
+        found[element] = ElementVerdict(element.name, is_declared(element), (), LATE) if late else judge(element)
         watch(done, len(elements))
+    return [found[element] for element in elements]

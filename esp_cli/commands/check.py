@@ -40,6 +40,7 @@ def check(
     ] = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,
+    seconds: options.SecondsOption = 50.0,
     json: options.JsonOption = None,
 ) -> None:
     """Check what every task promises, or a task's declared symmetry.
@@ -64,7 +65,7 @@ def check(
     code = (
         _check_task(task, spec, make_worlds, json)
         if what == "task"
-        else _check_symmetry(make_worlds, transforms, policy, json)
+        else _check_symmetry(make_worlds, transforms, policy, seconds, json)
     )
     if code:
         raise typer.Exit(code)
@@ -93,7 +94,9 @@ def _of_the_symmetry(spec: TaskSpec) -> Finding:
     return Finding(_SYMMETRY, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
 
 
-def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, json: str | None) -> int:
+def _check_symmetry(
+    make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, seconds: float, json: str | None
+) -> int:
     from esp_cli.checking import check_policy, check_symmetry
 
     trained = None
@@ -102,7 +105,7 @@ def _check_symmetry(make_worlds: MakeWorlds, transforms: str | None, policy: Pat
 
         trained = open_policy(policy)
     with console.watching("check", "elements") as watch:
-        report = check_symmetry(make_worlds, transforms, watch=watch)
+        report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)
     measured: list[PolicyVerdict] = []
     if trained is not None:
         measured = check_policy(trained, make_worlds, transforms)
@@ -129,6 +132,7 @@ def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
 def print_elements(report: SymmetryReport, found: str) -> None:
     """Print what was found of each element."""
     from esp_cli.checking.task import TOLERATED
+    from esp_cli.checking.verdicts import LATE
 
     rows: list[tuple[str, ...]] = [
         (e.element, "yes" if e.declared else "no", e.outcome, f"{e.p_value:.1g}", _where(e)) for e in report.elements
@@ -138,6 +142,8 @@ def print_elements(report: SymmetryReport, found: str) -> None:
         "gaps and standard errors in standard deviations of the field; p: how likely so small a gap is where a field "
         f"is off by {TOLERATED[report.method]} or more"
     )
+    if late := sum(element.reason == LATE for element in report.elements):
+        console.note(f"{late} of {len(rows)} elements were not tried, as the time was over; give more by --seconds")
     title = f"{report.task} by {report.method}: {found}"
     console.table(("element", "declared", "result", "p>", "where"), rows, title=title, caption=caption)
 

@@ -10,7 +10,7 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.check import print_elements
-from esp_cli.commands.options import JsonOption, TaskSetOption, parse_task_settings, register_named
+from esp_cli.commands.options import JsonOption, SecondsOption, TaskSetOption, parse_task_settings, register_named
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def discover(
     logs: Annotated[
         bool, typer.Option("--logs", help="Judge from transitions alone, also where states can be set.")
     ] = False,
+    seconds: SecondsOption = 50.0,
     json: JsonOption = None,
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
@@ -48,7 +49,7 @@ def discover(
     An element is accepted where a breaking of a tolerance's size would have been seen: of elements that are off by that
     or more, one of a hundred is accepted. What the data could not have shown is "not covered".
     """
-    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs)
+    found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, seconds)
     tried = [
         {"element": e.element, "outcome": e.outcome, "accepted": e.outcome == "holds", "p_value": e.p_value}
         | ({"field": e.worst.field, "gap": e.worst.gap, "error": e.worst.error} if e.worst else {"field": e.reason})
@@ -59,7 +60,7 @@ def discover(
 
 
 def _discovery(
-    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool
+    what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, seconds: float
 ) -> SymmetryReport:
     from esp_cli.checking import check_recorded, check_symmetry
     from esp_cli.checking.logs import read_transitions
@@ -92,7 +93,7 @@ def _discovery(
         return make(name, num_envs, seeds, settings)
 
     with console.watching("check", "elements") as watch:
-        return check_symmetry(worlds, transforms, logs, watch)
+        return check_symmetry(worlds, transforms, logs, watch, seconds)
 
 
 def _print(report: SymmetryReport) -> None:

@@ -228,6 +228,12 @@ JsonOption = Annotated[
         callback=not_over_a_run,
     ),
 ]
+SecondsOption = Annotated[
+    float,
+    typer.Option(
+        "--seconds", min=1, help="Time for it; elements that do not fit in are not covered. Declared ones come first."
+    ),
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
 EpisodesOption = Annotated[
     int, typer.Option("--episodes", "-e", min=1, max=1_000_000, help="Episodes per seed.", metavar="COUNT")

@@ -102,8 +102,8 @@ def draw(
     titles = names if len(policies) > 1 else [None]
     env = build_environment(acting[0].config, 1, "film")
     with open_painter(env, request.view, request.size) as painter:
-        flat = isinstance(painter, TopPainter)
         recorded = record(acting, 1 if request.kind == PICTURE else request.episodes, request.greedy)
+        flat = isinstance(painter, TopPainter) and recorded[0][0].scenes[0].picture is None
         recorded = framed(recorded) if flat else recorded
         # steps from one frame to the next: the fewest that keep to the frame rate
         every = max(1, math.ceil(request.speed / (spec.control_period_s * request.rate) - 1e-9))

@@ -63,6 +63,7 @@ def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float)
     if width < LEAST_WIDTH:
         return beside(pictures, 0)
     size, flat = max(_LEAST_FONT, round(width * _FONT_SHARE)), isinstance(painter, TopPainter)
+    flat = flat and moments[0].scene.picture is None
     if flat:
         pictures = [_with_axes(picture, moment.scene, size) for picture, moment in zip(pictures, moments, strict=True)]
     time = f"{time_s:.1f} s"

@@ -280,8 +280,10 @@ class Symmetry(Draws):
         """Return (name, L_g, K_g) of each element for other libraries: `obs.reshape(-1, N * D) @ L_g.T`.
 
         L_g [N D, N D] and K_g [N A, N A] act on the rows of all agents end to end, K_g on one number per discrete
-        action or on continuous actions. An infinite or large group is refused.
+        action or on continuous actions. An infinite or large group is refused, and so are items that are sorted.
         """
+        if field := next((field for field in self.spaces.observation.fields if field.sorted_by), None):
+            raise UserError(f"'{field.name}' is sorted anew, which no matrix does; use obs and push_outputs")
 
         def matrix(move: Callable[[Tensor], Tensor], width: int) -> NDArray[np.float64]:
             count = self.spaces.num_agents

@@ -37,6 +37,8 @@ class IoSpec:
         group = parse_group(name, self.spaces.num_agents)
         if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
             raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents")
+        if field := next((field for field in self.layout.fields if field.sorted_by), None):
+            raise UserError(f"no network is equivariant on '{field.name}', whose items are sorted; use mlp or set")
         admit(name, group, self.spaces, instead="use another network")
         return group
 

@@ -233,7 +233,7 @@ class MessagePassing(Memoryless):
 def _fields(io: IoSpec) -> tuple[Field, Field]:
     """Return the field of pictures and that of relative positions."""
     fields = io.layout.fields
-    pictures = [f for f in fields if f.kind == Kind.PICTURE]
+    pictures = [f for f in fields if f.kind == Kind.PICTURE and not f.parts]
     others = [f for f in fields if f.kind == Kind.VECTOR and f.items is Items.OTHERS]
     if (len(pictures), len(others)) == (1, 1) and len(fields) > 2:
         more = ", ".join(field.name for field in fields if field not in (*pictures, *others))

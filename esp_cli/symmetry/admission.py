@@ -141,14 +141,15 @@ def _usable(spaces: Spaces) -> str:
 def exchangeable(spaces: Spaces) -> dict[str, int]:
     """Return the fields whose items may change places as far as layouts tell, each with how many it has.
 
-    An agent sees two to `MOST_ITEMS` of them, they are no pictures and follow no agents, the state has them too, and
-    the name is one word of letters, digits and underscores.
+    An agent sees two to `MOST_ITEMS` of them, they are no pictures, are not sorted and follow no agents, the state has
+    them too, and the name is one word of letters, digits and underscores.
     """
     own = {field.name for field in spaces.state.fields}
     return {
         field.name: field.count
         for field in spaces.observation.fields
         if field.items is Items.FIXED and field.pixels is None and 2 <= field.count <= MOST_ITEMS
+        if not field.sorted_by
         if field.name in own or spaces.is_joint
         if is_item_name(field.name)
     }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -165,7 +165,11 @@ def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
     geometries = list(dict.fromkeys(element.geometry for element in elements))
     index = [geometries.index(element.geometry) for element in elements]
     if field.parts:
-        return layout_operator(Layout(field.parts), [Element(geometry) for geometry in geometries]).selected(index)
+        parts = layout_operator(Layout(field.parts), [Element(geometry) for geometry in geometries]).selected(index)
+        if field.pixels is None:
+            return parts
+        pixels = item_operator(replace(field, parts=()), elements).source[..., 0]
+        return parts.repeated(pixels.shape[1]).ordered(numbers_of(pixels, parts.width))
     each = [_item_operator(field, geometry) for geometry in geometries]
     terms = max(one.terms for one in each)
     source, weight = (

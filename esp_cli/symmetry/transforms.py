@@ -31,7 +31,7 @@ from esp_cli.symmetry.representation import (
     state_operator,
 )
 from esp_envs.errors import UserError
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Discrete, Layout, Spaces
 
 _STACK_LIMIT = 512  # most elements that are built once; of more (d4*agents with N >= 5) those that are drawn
 
@@ -51,6 +51,7 @@ class Transform:
     output_map: Map  # K_g of one number per discrete action, or of a continuous action, likewise
     # K_g of a discrete action, [S, A] int64: what action j becomes; None of continuous ones
     action_index: Tensor | None
+    spaces: Spaces  # whose sorted items are sorted anew
 
     @property
     def num_seeds(self) -> int:
@@ -86,15 +87,16 @@ class Transform:
             state_map=self.state_map.apply(pick),
             output_map=self.output_map.apply(pick),
             action_index=None if self.action_index is None else pick(self.action_index),
+            spaces=self.spaces,
         )
 
     def obs(self, x: Tensor) -> Tensor:
         """Apply L_g to observations [S, ..., N, D]; row i moves to row sigma(i)."""
-        return self._move(x, self.obs_map, agent_axis=-2)
+        return sorted_anew(self._move(x, self.obs_map, agent_axis=-2), self.spaces.observation)
 
     def state(self, x: Tensor) -> Tensor:
         """Apply L_g to global states [S, ..., Ds]."""
-        return self._move(x, self.state_map)
+        return sorted_anew(self._move(x, self.state_map), self.spaces.state)
 
     def action(self, action: Tensor) -> Tensor:
         """Apply K_g to actions: [S, ..., N] int64 (discrete) or [S, ..., N, width]."""
@@ -174,7 +176,20 @@ def build_transform(
         state_map=map_of(state, device, dtype),
         output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
         action_index=None if image is None else torch.as_tensor(image, device=device),
+        spaces=spaces,
     )
+
+
+def sorted_anew(rows: Tensor, layout: Layout) -> Tensor:
+    """Return rows [..., D] with the items of fields in the order that `Field.sorted_by` says."""
+    for field in (field for field in layout.fields if field.sorted_by):
+        where = layout.slices()[field.name]
+        items = rows[..., where].unflatten(-1, (field.count, -1))
+        for key in reversed(field.sorted_by):
+            order = items[..., abs(key) - 1].argsort(dim=-1, descending=key < 0, stable=True)
+            items = items.gather(-2, order.unsqueeze(-1).expand_as(items))
+        rows = torch.cat([rows[..., : where.start], items.flatten(-2), rows[..., where.stop :]], -1)
+    return rows
 
 
 class TransformSet:

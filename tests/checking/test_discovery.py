@@ -23,7 +23,7 @@ from esp_cli.checking import (
 from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
 from esp_cli.checking.paired import _verdict
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, chance, concluded
+from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, chance, concluded
 from esp_cli.symmetry import parse_elements, transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -384,6 +384,17 @@ def test_where_nothing_is_found_there_is_no_prior() -> None:
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:"}))
     plain = resolve_config("navigation")
     assert prepared(plain) is plain
+
+
+@pytest.mark.parametrize("logs", [False, True])
+def test_what_does_not_fit_into_the_time_is_not_covered(logs: bool) -> None:
+    """What is declared is tried first, and one element is always tried."""
+    undeclared, declared = check_symmetry(
+        lambda n, seeds: make("navigation", n, seeds, {"wind": 0.3}), "rot90,flip-x", logs, seconds=0
+    ).elements
+    assert (undeclared.outcome, undeclared.reason) == ("not covered", LATE)
+    assert declared.reason == ""
+    assert logs or declared.outcome == "holds"
 
 
 def test_few_transitions_say_nothing() -> None:

@@ -10,6 +10,7 @@ from esp_cli.checking import check_symmetry
 from esp_envs import Continuous, Environment, Field, Items, Kind, generators_for, layout
 from esp_envs.adapters.gymnasium import SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelTask
+from esp_envs.drawing import draw
 from esp_envs.mpe.task import FORCE, MOVES
 from esp_envs.spec import Discrete
 
@@ -104,8 +105,33 @@ class Placed(Tri):
         env.place = state.astype(float)
 
 
-class Deaf(Tri):
-    kind = Hidden
+class Sliding(Point):
+    """What it does to its speed, which nobody sees, moves it."""
+
+    def reset(self, seed=None, options=None):
+        self.speed = np.zeros(2)
+        return super().reset(seed)
+
+    def step(self, action):
+        self.speed = 0.9 * self.speed + action
+        return super().step(self.speed)
+
+
+class Aging(Point):
+    """In the second half of an episode it is pushed aside."""
+
+    def reset(self, seed=None, options=None):
+        self.age = 0
+        return super().reset(seed)
+
+    def step(self, action):
+        self.age += 1
+        return super().step(action + np.array([0.5, 0.0]) * (self.age > 12))
+
+
+class Uncopied(Point):
+    def __deepcopy__(self, memo):
+        raise TypeError("it holds a window")
 
 
 def worlds(cls: type[Environment], num_envs: int = 8, **settings) -> Environment:
@@ -174,13 +200,45 @@ def test_three_places_that_nobody_sees_are_no_symmetry_of_a_simulator_that_can_b
     assert [element.outcome for element in found.elements] == ["broken"] * 3 + ["holds"]
 
 
-@pytest.mark.parametrize("task", [Tri, Deaf])
-def test_what_cannot_be_set_is_judged_by_transitions(task) -> None:
-    """A state that is only written down would make every symmetric start look like a symmetry."""
-    found = report(task, "rot90,rot180,flip-y")
-    assert found.method == "transitions"
-    assert found.found == "c1"
+@pytest.mark.parametrize("kind", [Point, Hidden])
+def test_an_environment_that_can_be_copied_is_paired_by_its_attributes(kind, monkeypatch) -> None:
+    """A state that is only written down, beside the one that decides, does no harm."""
+    monkeypatch.setattr(Tri, "kind", kind)
+    found = report(Tri, "rot90,rot180,flip-y,flip-x")
+    assert (found.method, found.found) == ("paired states", "flip-x")
+    assert [element.outcome for element in found.elements] == ["broken"] * 3 + ["holds"]
+
+
+@pytest.mark.parametrize("kind", [Sliding, Aging, Uncopied])
+def test_what_cannot_be_set_is_judged_by_transitions(kind, monkeypatch) -> None:
+    """A hidden speed or a clock would make a state that is set another than the one that was read."""
+    monkeypatch.setattr(Tri, "kind", kind)
+    found = report(Tri, "rot90,rot180,flip-y")
+    assert (found.method, found.found) == ("transitions", "c1")
     assert "holds" not in {element.outcome for element in found.elements}
+
+
+class Walled(Point):
+    """Square walls, far from where it starts."""
+
+    places = np.zeros((3, 2))
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed)
+        self.place = 0.2 * self.place
+        return self._seen(), {}
+
+    def step(self, action):
+        _, _, *rest = super().step(action)
+        self.place = self.place.clip(-3, 3)
+        return self._seen(), -float(np.linalg.norm(self.place)), *rest
+
+
+def test_what_holds_only_where_play_went_is_not_covered(monkeypatch) -> None:
+    monkeypatch.setattr(Tri, "kind", Walled)
+    turn, quarter = report(Tri, "rot45,rot90").elements
+    assert (turn.outcome, quarter.outcome) == ("not covered", "holds")
+    assert turn.reason == "holds where play went, but further out obs.place, state.place, reward would differ"
 
 
 class Listed:
@@ -215,6 +273,68 @@ def test_agents_in_tuple_spaces_act_as_the_task_says() -> None:
     step = env.step(torch.tensor([[[2, 2], [1, 0]]]))
     assert step.reward.tolist() == [[[2.0, 0.0], [1.0, 2.0]]]
     assert step.metrics["highest"].tolist() == [[2.0, 2.0]]
+
+
+class Gripper:
+    """It sees and acts in Dict spaces, sees a Tuple in one of them, and draws itself."""
+
+    render_mode, number = "rgb_array", gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    action_space = gymnasium.spaces.Dict(grip=gymnasium.spaces.Discrete(2), push=number)
+
+    def reset(self, seed=None, options=None):
+        self.at = np.zeros(1)
+        return self._seen(), {}
+
+    def step(self, action):
+        self.at = self.at + action["push"] * action["grip"]
+        return self._seen(), float(self.at[0]), False, False, {}
+
+    def render(self):
+        return np.full((20, 40, 3), int(10 * self.at[0]), np.uint8)
+
+    def _seen(self):
+        return {"picture": None, "at": self.at, "again": self.at * 10}
+
+
+class Gripping(SingleAgentTask):
+    observation = layout(Field("again", P), Field("at", P))
+    action = Continuous(layout(Field("push", P), Field("grip", Kind.SCALAR)))
+    symmetry, convention = "flip-x", "gripper"
+
+    def make_single(self):
+        return Gripper()
+
+    def acting(self, agent, action):
+        return {"push": 2 * action[:1], "grip": int(action[1] > 0)}
+
+
+def test_dict_spaces_are_read_by_the_fields_names_and_acted_in_by_the_hook() -> None:
+    env = Gripping(Gripping.Settings(), 1, generators_for([0]))
+    env.reset()
+    seen = [env.step(torch.tensor([[[action]]])).next.obs.flatten().tolist() for action in ([0.5, 1.0], [0.5, -1.0])]
+    assert seen == [[10.0, 1.0], [10.0, 1.0]]
+
+    class Misnamed(Gripping):
+        observation = layout(Field("place", P))
+
+    with pytest.raises(ValueError, match="sees picture, at, again, and the layout has 'place'; name fields"):
+        Misnamed(Misnamed.Settings(), 1, generators_for([0]))
+
+
+def test_parts_of_a_tuple_are_read_in_their_order() -> None:
+    seen = (np.ones(2), 3.0)
+    assert Gripping.reading(None, "agent", seen).tolist() == [1, 1, 3]
+
+
+def test_an_environment_draws_itself() -> None:
+    env = Gripping(Gripping.Settings(), 1, generators_for([0]))
+    env.reset()
+    env.step(torch.tensor([[[[0.5, 1.0]]]]))
+    assert env.has("scene")
+    picture = draw(env.scene(), 20)
+    assert (picture.shape, int(picture.max()), int(picture.min())) == ((10, 20, 3), 10, 10)
+    assert not Cart(Cart.Settings(), 1, generators_for([0])).has("scene"), "it was made without a render mode"
+    assert not Gripping(Gripping.Settings(workers=2), 2, generators_for([0])).has("scene"), "others draw elsewhere"
 
 
 def test_unlike_agents_are_refused_with_what_to_do() -> None:

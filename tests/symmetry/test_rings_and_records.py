@@ -74,16 +74,48 @@ def test_records_and_rings_stand_beside_pictures() -> None:
     np.testing.assert_array_equal(operator.push(row), operator.matrix @ row)
 
 
+def test_the_pixels_of_a_picture_hold_directions() -> None:
+    """A quarter turn brings what is on the right to the top, and turns the way and the ray that stand there."""
+    way = Field("way", Kind.VECTOR), Field("facing", Kind.RING, rays=4)
+    cells = layout(Field("cells", Kind.PICTURE, pixels=(3, 3), parts=way))
+    assert (cells.width, cells.fields[0].described) == (
+        54,
+        "picture of 3 x 3 of way (vector x 1), facing (ring of 4 rays x 1) x 1",
+    )
+    before, after = np.zeros((3, 3, 6)), np.zeros((3, 3, 6))
+    before[1, 2] = [1, 2, 1, 0, 0, 0]
+    after[0, 1] = [-2, 1, 0, 1, 0, 0]
+    turned = rows_operator(cells, [rotation(90)], 1).push(before.ravel())
+    np.testing.assert_array_equal(turned[0], after.ravel())
+
+
+def test_items_that_are_sorted_are_sorted_anew(make_spec) -> None:
+    """By y from the top, then by x: of (-1, 1), (2, 1), (0, 0) a quarter turn makes (-1, -1), (-1, 2), (0, 0)."""
+    marks = Field(
+        "marks", Kind.RECORD, 3, parts=(Field("at", Kind.VECTOR), Field("name", Kind.SCALAR)), sorted_by=(-2, 1)
+    )
+    spec = replace(make_spec(action=FORCE), observation=layout(marks), state=layout(marks), num_agents=1)
+    seen = torch.tensor([-1.0, 1, 7, 2, 1, 8, 0, 0, 9])
+    transform = build_transform([rotation(90)], spec)
+    expected = [-1, 2, 8, 0, 0, 9, -1, -1, 7]
+    assert transform.obs(seen.view(1, 1, 1, 9)).flatten().tolist() == expected
+    assert transform.state(seen.view(1, 1, 9)).flatten().tolist() == expected
+    unsorted = replace(spec, observation=layout(replace(marks, sorted_by=())))
+    assert build_transform([rotation(90)], unsorted).obs(seen.view(1, 1, 1, 9)).flatten().tolist() != expected
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
+        ({"kind": Kind.VECTOR, "sorted_by": (3,)}, r"sorted_by is \(3,\); give which numbers"),
+        ({"kind": Kind.VECTOR, "sorted_by": (1,), "items": Items.AGENTS}, "of items that are no agents"),
         ({"kind": Kind.RING}, "a ring, and nothing else, says how many rays"),
         ({"kind": Kind.VECTOR, "rays": 4}, "a ring, and nothing else"),
         ({"kind": Kind.VECTOR, "rays": -1}, "a ring, and nothing else"),
         ({"kind": Kind.PICTURE, "pixels": (0, 4)}, r"pixels are \(0, 4\); give at least one row"),
         ({"kind": Kind.PICTURE}, "a picture, and nothing else"),
         ({"kind": Kind.VECTOR, "pixels": (2, 2)}, "a picture, and nothing else"),
-        ({"kind": Kind.RECORD}, "a record, and nothing else, says what parts"),
+        ({"kind": Kind.RECORD}, "a record, and nothing else but a picture, says"),
         ({"kind": Kind.SCALAR, "parts": SEEN}, "a record, and nothing else"),
         ({"kind": Kind.RECORD, "parts": (Field("x", Kind.SCALAR, items=Items.OTHERS),)}, "count over no agents"),
     ],

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
+from esp_envs.adapters.attributes import Attributes
 from esp_envs.adapters.pairing import Simulator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
@@ -49,6 +50,8 @@ class CopyHooks(ABC):
 
     simulated: Layout | None = None
     """What `take` returns, so that checks can pair states; known of MPE's particles, and where agents see all of it."""
+    attributes: Attributes | None = None
+    """Where the state stands in the environment, which is looked for when a check asks."""
 
     @abstractmethod
     def make_one(self) -> Any:
@@ -67,11 +70,29 @@ class CopyHooks(ABC):
         raise NotImplementedError
 
     def reading(self, agent: str, observation: Any) -> Array:
-        """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order."""
-        return np.asarray(observation["observation"] if _has(observation, "action_mask") else observation)
+        """Turn what an agent is given into the numbers of the layout: an angle into (cos, sin), axes into order.
+
+        Entries of a Dict space are taken by the names of the layout's fields, parts of a Tuple in their order.
+
+        Raises:
+            UserError: a Dict space has no entry of a field's name.
+        """
+        given = observation["observation"] if _has(observation, "action_mask") else observation
+        if isinstance(given, Mapping):
+            names = [field.name for field in self.observation.fields]
+            if missing := next((name for name in names if name not in given), None):
+                raise UserError(
+                    f"{agent} sees {', '.join(map(str, given))}, and the layout has '{missing}'; name fields as the "
+                    "entries, or define 'reading'"
+                )
+            given = tuple(given[name] for name in names)
+        return np.concatenate([np.ravel(part) for part in given]) if isinstance(given, tuple) else np.asarray(given)
 
     def acting(self, agent: str, action: Any) -> Any:
-        """Turn an action of the layout, stretched to the bounds of a Box, into what the environment takes."""
+        """Turn an action of the layout, stretched to the bounds of a Box, into what the environment takes.
+
+        A task that defines it may act in any space, as Dict, Tuple or MultiDiscrete.
+        """
         return action
 
     def allowed(self, agent: str, observation: Any, info: Mapping[str, Any]) -> Array:
@@ -118,7 +139,7 @@ class Copy:
         if len(set(self.agents)) < len(self.agents):
             raise UserError("'possible_agents' names an agent twice; give each a name of its own")
         self.rest = [name for name in self.agents if name not in self.learners]
-        self.simulator = Simulator(self.env, self.learners)
+        self.simulator = Simulator(self.env, self.learners, task.attributes)
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
         self._boxes = [_bounds(space) for space in spaces]
         starts = [getattr(space, "start", 0) for space in spaces]
@@ -147,6 +168,11 @@ class Copy:
             raise UserError(f"{name} sees {width} numbers, but the layout has {self._task.observation.width}")
         return row
 
+    def seen(self, given: Mapping[Any, Any]) -> Array:
+        """Return what learning agents see [N, D]; zeros of those that see nothing."""
+        rows = {name: self.see(name, given[name]) for name in self.learners if name in given}
+        return np.array([rows.get(name, np.zeros(self._task.observation.width)) for name in self.learners])
+
     def require_spaces(self) -> None:
         """Refuse spaces that differ from the layouts, by looking at the first observation.
 
@@ -165,6 +191,8 @@ class Copy:
                 if size != task.action.count:
                     raise UserError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
             space = foreign.space_of(self.env, name)
+            if type(task).acting is not CopyHooks.acting and _bounds(space) is None:
+                continue  # it makes of the layout's actions what the space holds
             if isinstance(task.action, Discrete):
                 if getattr(space, "n", None) != task.action.count or space.shape != ():
                     raise UserError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
@@ -200,7 +228,7 @@ class Copy:
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""
         if (box := self._boxes[i]) is None:
-            return self._starts[i] + int(action)
+            return self._starts[i] + int(action) if np.ndim(action) == 0 else np.nan_to_num(action).clip(-1, 1)
         low, high = box
         action = np.nan_to_num(action)  # of a seed that is about to stop: its environment should not stop the others
         return (low + (action.clip(-1, 1) + 1) / 2 * (high - low)).clip(low, high).astype(low.dtype)

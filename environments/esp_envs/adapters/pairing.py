@@ -1,7 +1,8 @@
 """The state of a simulator of others: read and set, so that a check can begin in a state and in its image.
 
 Known are particles (the MPE tasks of mpe2 and PettingZoo), MuJoCo, and environments that keep all that moves in one
-array `state`, as the classic tasks of Gymnasium. Others say how by the hooks `simulated`, `take` and `put`.
+array `state`, as the classic tasks of Gymnasium. Of others that can be copied, `attributes` are looked for that hold
+what agents see. The rest says how by the hooks `simulated`, `take` and `put`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from esp_envs.adapters.attributes import Attributes
 from esp_envs.spec import Field, Items, Kind, Layout
 
 Array = NDArray[Any]
@@ -23,10 +25,12 @@ class Simulator:
     Args:
         env: the environment, with any wrappers.
         learners: names of the agents that learn.
+        attributes: where the state stands, of a simulator of no known kind.
     """
 
-    def __init__(self, env: Any, learners: Sequence[Any]) -> None:
-        self._bare, self._learners = getattr(env, "unwrapped", env), list(learners)
+    def __init__(self, env: Any, learners: Sequence[Any], attributes: Attributes | None = None) -> None:
+        self.bare, self._learners = getattr(env, "unwrapped", env), list(learners)
+        self._attributes = attributes
 
     @property
     def layout(self) -> Layout | None:
@@ -39,7 +43,9 @@ class Simulator:
 
     def read(self) -> Array | None:
         """Return the state; None where the simulator is of no known kind."""
-        bare = self._bare
+        bare = self.bare
+        if self._attributes is not None:
+            return self._attributes.read(bare)
         if columns := self._columns():
             return np.concatenate([np.ravel(getattr(e.state, what)) for _, some, what, _ in columns for e in some])
         if _is_mujoco(bare):
@@ -50,8 +56,11 @@ class Simulator:
 
     def write(self, numbers: Array) -> None:
         """Put it into a state."""
-        bare, at = self._bare, 0
+        bare, at = self.bare, 0
         numbers = np.array(numbers, float)
+        if self._attributes is not None:
+            self._attributes.write(bare, numbers)
+            return
         for _, entities, what, _ in self._columns():
             for entity in entities:
                 width = np.size(getattr(entity.state, what))
@@ -64,7 +73,7 @@ class Simulator:
 
     def look(self, agents: Sequence[Any]) -> Mapping[Any, Any] | None:
         """Return what agents see now, without a step; None where the environment has no way to say so."""
-        bare = self._bare
+        bare = self.bare
         if callable(getattr(bare, "observe", None)):
             return {agent: bare.observe(agent) for agent in agents}
         get = getattr(bare, "_get_obs", getattr(bare, "_get_ob", None))
@@ -72,7 +81,7 @@ class Simulator:
 
     def _columns(self) -> list[tuple[str, Sequence[Any], str, Items]]:
         """Return name, entities, attribute and items of each part of the state of particles; none of others."""
-        world = getattr(self._bare, "world", None)
+        world = getattr(self.bare, "world", None)
         agents, landmarks = (list(getattr(world, name, None) or []) for name in ("agents", "landmarks"))
         if not agents or not all(hasattr(getattr(e, "state", None), "p_pos") for e in [*agents, *landmarks]):
             return []

@@ -15,6 +15,7 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of
+from esp_envs.adapters.attributes import deciding_attributes
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.hooks import Array, Copy, CopyHooks
 from esp_envs.adapters.settable import simulated_layout
@@ -22,11 +23,16 @@ from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
+from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
 
 _FEW_COPIES = 8
 """Up to this number of copies, worker processes cost more time than they save."""
+
+
+_TRIED_STEPS = 64
+"""Steps of an episode, at most, in which attributes of an environment have to decide what follows."""
 
 
 class ParallelSettings(TaskSettings):
@@ -84,6 +90,7 @@ class ParallelTask(CopyHooks, Environment):
             settings=settings.model_dump(),
         )
         one.require_spaces()
+        self._draws = getattr(one.simulator.bare, "render_mode", None) == "rgb_array"
         one.close()
         self._copies: Stepper | None = None
         self._simulated = False
@@ -139,14 +146,30 @@ class ParallelTask(CopyHooks, Environment):
         one = Copy(self)
         with one.naming("put"):
             found = simulated_layout(one, self.observation, self.simulated)
+            if found is None and self.simulated is None:
+                self.attributes = deciding_attributes(one, self.observation, min(self.spec.horizon, _TRIED_STEPS))
+                found = None if self.attributes is None else self.attributes.layout
         one.close()
         if found is not None:
             self._simulated, self._copies, self.spec = True, None, replace(self.spec, state=found)
         return self._simulated
 
     def has(self, method: str) -> bool:
-        """Return whether the task offers an optional method; `set_state` where it is `settable`."""
+        """Return whether the task offers an optional method.
+
+        It has `set_state` where it is `settable`, and `scene` where copies of this process draw themselves.
+        """
+        if method == "scene" and type(self).scene is ParallelTask.scene:
+            return self._draws and not self._processes()
         return self._simulated if method == "set_state" else super().has(method)
+
+    def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
+        """Return the picture that an environment made with `render_mode="rgb_array"` draws of itself."""
+        copies = self._started()
+        if not self._draws or not isinstance(copies, CopyStepper):
+            return super().scene(world)  # refuses
+        picture = copies.picture(world[0] * self.num_envs + world[1])
+        return Scene((), (0.0, picture.shape[1], 0.0, picture.shape[0]), picture=picture)
 
     def set_state(self, state: Tensor) -> Observation:
         """Put every copy into a state of its simulator, at the start of an episode.
@@ -167,10 +190,7 @@ class ParallelTask(CopyHooks, Environment):
     def _started(self) -> Stepper:
         """Return the copies, made when they are first needed."""
         if self._copies is None:
-            count, workers = self._base.numel(), self.settings.workers
-            if workers is None:
-                cores = min(available_cores(), torch.get_num_threads())  # a run of a study has one of them
-                workers = cores if cores > 1 and count > _FEW_COPIES else 0
+            count, workers = self._base.numel(), self._processes()
             spec, discrete = self.spec, isinstance(self.action, Discrete)
             sizes = Sizes(
                 count,
@@ -181,11 +201,19 @@ class ParallelTask(CopyHooks, Environment):
                 None if discrete else self.action_shape[-1],
                 self.action.count if isinstance(self.action, Discrete) and self.masks else 0,
             )
-            if workers and can_fork():
-                self._copies = WorkerCopies(sizes, self._stepper, min(workers, count))
+            if workers:
+                self._copies = WorkerCopies(sizes, self._stepper, workers)
             else:
                 self._copies = self._stepper(Board(sizes), range(count))
         return self._copies
+
+    def _processes(self) -> int:
+        """Return how many worker processes step the copies; 0 is none."""
+        count, workers = self._base.numel(), self.settings.workers
+        if workers is None:
+            cores = min(available_cores(), torch.get_num_threads())  # a run of a study has one of them
+            workers = cores if cores > 1 and count > _FEW_COPIES else 0
+        return min(workers, count) if can_fork() else 0
 
     def _stepper(self, board: Board, copies: range) -> CopyStepper:
         return CopyStepper(self, board, copies, self._simulated)

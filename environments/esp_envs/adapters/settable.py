@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,14 +17,14 @@ _UNLIKE = 0.1
 
 
 def simulated_layout(copy: Copy, observation: Layout, declared: Layout | None) -> Layout | None:
-    """Return the layout of a copy's state, None where a check cannot put it into one.
+    """Return the layout of the state of a known simulator, None where a check cannot put it into one.
 
     Args:
         copy: one that nobody uses yet.
         observation: what its agents see.
         declared: what the task says that the layout is.
     """
-    seen = _seen(copy, copy.start(0)[0])
+    seen = copy.seen(copy.start(0)[0])
     size = copy.take().size
     found = declared or copy.simulator.layout
     if found is None and seen.shape == (1, size) and np.allclose(seen[0], copy.take(), atol=1e-5):
@@ -52,7 +50,7 @@ def _takes_effect(copy: Copy) -> bool:
             copy.start(_TRIED * twin + k)
             if copy.put(state) is None and copy.rest:
                 return False  # the others act by what they see
-            reached[-1].append(_seen(copy, copy.env.step(action)[0]))
+            reached[-1].append(copy.seen(copy.env.step(action)[0]))
     one, other = np.array(reached).swapaxes(0, 1)
     spread = one.var(0)
     apart = ((one - other) ** 2).mean(0)[spread > 1e-12] / (2 * spread[spread > 1e-12])
@@ -65,16 +63,10 @@ def _with_names(copy: Copy, found: Layout, observation: Layout) -> Layout:
     for field, where in zip(observation.fields, observation.slices().values(), strict=True):
         if marks is None or (field.kind, field.count, field.items) != (marks.kind, marks.count, marks.items):
             continue
-        rows, state = [_seen(copy, copy.start(0)[0])[:, where]], copy.take()
+        rows, state = [copy.seen(copy.start(0)[0])[:, where]], copy.take()
         state[found.slices()[marks.name]] = np.roll(state[found.slices()[marks.name]], 2)
         if (seen := copy.put(state)) is not None and marks.count > 1:
-            rows.append(_seen(copy, seen)[:, where])
+            rows.append(copy.seen(seen)[:, where])
             if np.allclose(np.roll(rows[0], 2, 1), rows[1], atol=1e-5):
                 return Layout(tuple(replace(f, name=field.name) if f is marks else f for f in found.fields))
     return found
-
-
-def _seen(copy: Copy, given: Mapping[Any, Any]) -> Array:
-    """Return what learning agents see [N, D]; zeros of those that see nothing."""
-    rows = {name: copy.see(name, given[name]) for name in copy.learners if name in given}
-    return np.array([rows.get(name, np.zeros_like(next(iter(rows.values())))) for name in copy.learners])

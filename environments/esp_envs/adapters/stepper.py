@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board
@@ -41,6 +42,11 @@ class CopyStepper:
         """Advance every copy by one step, and reset those whose episode ends."""
         for k, copy in self._copies.items():
             self._step(k, copy)
+
+    def picture(self, k: int) -> NDArray[np.uint8]:
+        """Return what the environment of a copy draws of itself, [H, W, 3]."""
+        with self._copies[k].naming("render", k):
+            return np.asarray(self._copies[k].simulator.bare.render(), np.uint8)
 
     def place(self) -> None:
         """Put every copy, which has just been reset, into the state on the board."""
