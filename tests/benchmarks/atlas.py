@@ -40,14 +40,13 @@ BUILT_IN = {
 COMMANDS = {"vmas": "pip install vmas", "mpe2": "pip install mpe2", "sisl": "pip install 'pettingzoo[sisl]'",
             "mujoco": "pip install 'gymnasium[mujoco]'", "foraging": "pip install lbforaging"}  # fmt: skip
 NOT_CARRIED = {
-    "mpe2 simple_reference, _crypto, _speaker_listener, _world_comm": "agents see and do unlike things.",
-    "mpe2 collect_treasure": "agents sort what they see by distance.",
+    "mpe2 simple_crypto": "nothing in it has a place.",
+    "vmas mpe and debug": "the former are the tasks of mpe2, the latter try the simulator.",
     "vmas sampling": "no state says what is sampled.",
     "vmas road_traffic": "agents steer.",
     "vmas football": "an agent sees 28 vectors without names.",
     "sisl waterworld": "it is not part of PettingZoo 1.27.",
     "sisl multiwalker": "no turn or mirror of the plane moves what walkers see.",
-    "mujoco Ant, Humanoid, HumanoidStandup": "their mirrors are those of bodies.",
     "mujoco HalfCheetah, Hopper, Pusher": "no element could move anything in them.",
 }
 """Why tasks are left out."""
@@ -61,8 +60,11 @@ def tasks() -> Iterator[tuple[str, str, Callable[[], tuple[str, dict[str, object
         yield "vmas", name, lambda name=name: (register(f"{_VMAS}:{name}"), {}), None
     for package, found in (("mpe2", atlas_tasks.MPE), ("mujoco", atlas_tasks.MUJOCO)):
         for name, task in found.items():
-            texts = f"{atlas_tasks.LEGS}" if name.startswith("Walker") else None
+            texts = {"Walker2d-v5": atlas_tasks.LEGS, "collect_treasure (collectors)": "d4,agents"}.get(name)
             yield package, name, lambda task=task: (register(task), {"workers": 0}), texts
+    for name in ("Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"):
+        given = (lambda name=name: (register(atlas_tasks.legged(name)), {"workers": 0}))  # fmt: skip
+        yield "mujoco", name, given, "d4" if name == "Ant-v5" else "flip-x"
     yield "sisl", "pursuit_v5", lambda: (register(atlas_tasks.PURSUIT), {"workers": 0}), "d4"
     yield "foraging", "8x8-2p-3f", lambda: (register(atlas_tasks.Foraging), {"workers": 0}), "d4,agents"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def gym(name: str, *seen: Field, torques: int = 0, **attributes: Any) -> type[Si
 
 def still(self: ParallelTask, agent: str, observation: Any, generator: np.random.Generator) -> int:
     """Let an agent that does not learn do anything."""
-    return int(generator.integers(5))
+    return int(generator.integers({"speaker_0": 3, "leadadversary_0": 20}.get(agent, 5)))
 
 
 def first_vectors(task: ParallelTask, agent: str, observation: Any) -> Any:
@@ -74,6 +75,33 @@ MPE = {
         "mpe2.simple_adversary_v3",
         *(Field("goal", V), Field("landmarks", V, 2), Field("adversary", V), Field("other", V, items=OTHERS)),
         learners="agent",
+        opponent=still,
+    ),
+    "simple_reference": zoo(
+        "mpe2.simple_reference_v3",
+        *(Field("velocity", V), Field("landmarks", V, 3), Field("color", S, 3), Field("words", S, 10)),
+        action=Discrete(V, MOVES.points * 10, tuple(f"{move}, {word}" for word in range(10) for move in MOVES.names)),
+    ),
+    "simple_speaker_listener (listener)": zoo(
+        "mpe2.simple_speaker_listener_v4",
+        *(Field("velocity", V), Field("landmarks", V, 3), Field("words", S, 3)),
+        learners="listener",
+        opponent=still,
+    ),
+    "simple_world_comm (adversaries)": zoo(
+        "mpe2.simple_world_comm_v3",
+        *(Field("velocity", V), Field("position", V), Field("things", V, 5), Field("leader", V)),
+        *(Field("others", V, 2, items=OTHERS), Field("prey", V, 2), Field("prey_velocity", V, 2)),
+        *(Field("in_forest", S, 2), Field("words", S, 4)),
+        learners="adversary",
+        opponent=still,
+    ),
+    "collect_treasure (collectors)": zoo(
+        "mpe2.collect_treasure_v1",
+        *(Field("position", V), Field("velocity", V), Field("holding", S, 2)),
+        Field("others", Kind.RECORD, 7, parts=(Field("at", V), Field("speed", V), Field("is", S, 4))),
+        Field("treasures", Kind.RECORD, 6, parts=(Field("at", V), Field("is", S, 2))),
+        learners="collector",
         opponent=still,
     ),
     "simple_push (agent)": zoo(
@@ -112,6 +140,25 @@ MUJOCO = {
     ),
     "Reacher-v5": gym("Reacher-v5", *ARM, torques=2, reading=first_vectors),
 }
+
+
+def legged(name: str) -> type[SingleAgentTask]:
+    """Return a task of a body with limbs, whose mirrors its model says."""
+    import gymnasium
+
+    from esp_cli.bodies import Body
+
+    parts = dict.fromkeys(("cinert", "cvel", "qfrc_actuator", "cfrc_ext") if "Human" in name else ("cfrc_ext",), False)
+
+    def make_single(_: Any) -> Any:
+        return gymnasium.make(name, **{f"include_{part}_in_observation": wanted for part, wanted in parts.items()})
+
+    body = Body.from_mjcf(Path(gymnasium.__file__).parent / "envs/mujoco/assets" / f"{name[:-3].lower()}.xml")
+    seen = (Field("height", S), body.attitude(), body.positions(), body.velocity(), body.spin(), body.velocities())
+    members = {"simulated": layout(Field("place", V), *seen), "make_single": make_single}
+    return gym(name, *seen, action=Continuous(layout(body.controls())), **members)
+
+
 LEGS = "joints-3-4-5-0-1-2*rates-3-4-5-0-1-2*torque-3-4-5-0-1-2"
 """The exchange of the walker's legs."""
 PURSUIT = zoo(
@@ -123,13 +170,17 @@ PURSUIT = zoo(
 )
 
 
+AT = (Field("at", V), Field("level", S))
+FOODS = Field("foods", Kind.RECORD, 3, parts=(*AT, Field("is_there", S)), sorted_by=(-4, -2, 1))
+
+
 class Foraging(ParallelTask):
-    """Level-based foraging: foods, then players, the own one first, each (row, column, level); foods sorted by row."""
+    """Level-based foraging: foods from the top, each row from the left, then players, the own one first."""
 
     observation = layout(
-        Field("foods", Kind.RECORD, 3, parts=(Field("at", V), Field("level", S))),
-        Field("players", Kind.RECORD, 2, parts=(Field("at", V), Field("level", S))),
+        FOODS, Field("own", Kind.RECORD, parts=AT), Field("others", Kind.RECORD, parts=AT, items=OTHERS)
     )
+    simulated = layout(FOODS, Field("players", Kind.RECORD, 2, parts=AT, items=Items.AGENTS), Field("spawned", S))
     action = Discrete(
         V, ((0, 0), (0, 1), (0, -1), (-1, 0), (1, 0), (0, 0)), ("stay", "up", "down", "left", "right", "load")
     )
@@ -139,15 +190,34 @@ class Foraging(ParallelTask):
         """Return the environment."""
         from lbforaging.foraging import ForagingEnv
 
-        return (
-            ForagingEnv(
-                players=2, min_player_level=1, max_player_level=2, min_food_level=1, max_food_level=None,
-                field_size=(8, 8), max_num_food=3, sight=8, max_episode_steps=50, force_coop=False,
-            )
+        return ForagingEnv(
+            players=2, min_player_level=1, max_player_level=2, min_food_level=1, max_food_level=None,
+            field_size=(8, 8), max_num_food=3, sight=8, max_episode_steps=50, force_coop=False,
         )  # fmt: skip
 
     def reading(self, agent: str, observation: Any) -> Any:
-        """Turn (row, column) from the top into (x, y) about the middle; what is not there is (-1, -1, 0)."""
+        """Turn (row, column) from the top into (x, y) about the middle; what is not there is 0."""
         row, column, level = np.asarray(observation).reshape(-1, 3).T
         there = row >= 0
-        return np.stack([np.where(there, column - 3.5, 0), np.where(there, 3.5 - row, 0), level], 1)
+        seen = np.stack([there * (column - 3.5), there * (3.5 - row), level, there], 1)
+        return np.concatenate([seen[:3].ravel(), seen[3:, :3].ravel()])
+
+    def take(self, env: Any) -> Any:
+        """Return what the environment holds."""
+        bare = env.unwrapped
+        found = [(row, column, bare.field[row, column]) for row, column in zip(*np.nonzero(bare.field), strict=True)]
+        players = [(*player.position, player.level) for player in bare.players]
+        every = found + [(-1, -1, 0)] * (3 - len(found)) + players
+        return np.append(self.reading("", np.array(every, float)), bare._food_spawned)
+
+    def put(self, env: Any, state: Any) -> None:
+        """Put foods and players to their places."""
+        bare = env.unwrapped
+        bare.field[:] = 0
+        for x, y, level, there in state[:12].reshape(3, 4):
+            if there > 0.5:
+                bare.field[round(3.5 - y), round(x + 3.5)] = round(level)
+        for player, (x, y, level) in zip(bare.players, state[12:18].reshape(2, 3), strict=True):
+            player.position, player.level = (round(3.5 - y), round(x + 3.5)), round(level)
+        bare._food_spawned = state[18]
+        bare._gen_valid_moves()
