@@ -63,8 +63,8 @@ def tasks() -> Iterator[tuple[str, str, Callable[[], tuple[str, dict[str, object
             texts = {"Walker2d-v5": atlas_tasks.LEGS, "collect_treasure (collectors)": "d4,agents"}.get(name)
             yield package, name, lambda task=task: (register(task), {"workers": 0}), texts
     for name in ("Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"):
-        given = (lambda name=name: (register(atlas_tasks.legged(name)), {"workers": 0}))  # fmt: skip
-        yield "mujoco", name, given, "d4" if name == "Ant-v5" else "flip-x"
+        texts = "d4" if name == "Ant-v5" else "flip-x"
+        yield "mujoco", name, lambda name=name: (register(atlas_tasks.legged(name)), {"workers": 0}), texts
     yield "sisl", "pursuit_v5", lambda: (register(atlas_tasks.PURSUIT), {"workers": 0}), "d4"
     yield "foraging", "8x8-2p-3f", lambda: (register(atlas_tasks.Foraging), {"workers": 0}), "d4,agents"
 
