@@ -81,7 +81,8 @@ def check_paired(
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
     visited = _visit(make(worlds, [0]))
     if most is None:  # one step of many worlds takes less time than many steps
-        visited = [tuple(torch.cat(part, 1) for part in zip(*visited, strict=True))]
+        states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
+        visited = [(states, actions)]
     some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in visited]
     everywhere, few = (cache(lambda states=states: _Pairs(make, states)) for states in (visited, some))
     further = cache(lambda: _Pairs(make, [(_stretched(state, shown.state), action) for state, action in visited]))

@@ -126,6 +126,9 @@ def test_elements_that_hold_are_never_gated_and_a_prior_without_its_gate_says_so
     assert [isinstance(g, GatedTransform) for g in (turn, mirror)] == [True, False]
     certain = SymmetryPrior(config.model_copy(update={"weights": {"rot90": 1.0, "flip-x": 1.0}}), ONE)
     assert not any(isinstance(g, GatedTransform) for g in certain.copies(batch, generators(1)).transforms)
+    uncovered = SymmetryPrior(config.model_copy(update={"weights": {"rot90": 0.0, "flip-x": 0.0}}), ONE)
+    uncovered.gate = one_body(1e6)
+    assert not uncovered.copies(batch, generators(1)).transforms, "what nobody knows is not copied, in no row"
 
 
 LEFT_AND_BROKEN = [

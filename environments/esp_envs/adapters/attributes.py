@@ -11,53 +11,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
+from esp_envs.adapters.hooks import Array, Copy
+from esp_envs.adapters.pairing import Attributes, Path
 from esp_envs.spec import Field, Items, Layout
 
-if TYPE_CHECKING:
-    from esp_envs.adapters.hooks import Copy
-
-Array = NDArray[Any]
-Path = tuple[tuple[bool, Any], ...]
-"""From the environment to one of its parts: whether each step is an attribute or an entry, and which one."""
 _TRIED = 16
 _DEEP, _MOST = 4, 256
 """How deep parts are looked for, and how many numbers one has at most."""
-
-
-class Attributes:
-    """Numbers inside of an environment that are those of a layout.
-
-    Args:
-        layout: what they are.
-        places: for each number, where it stands: the paths of parts, and its index in each.
-    """
-
-    def __init__(self, layout: Layout, places: Sequence[Sequence[tuple[Path, int]]]) -> None:
-        self.layout, self._places = layout, places
-
-    def read(self, bare: Any) -> Array:
-        """Return the numbers."""
-        return np.array([np.ravel(_follow(bare, same[0][0]))[same[0][1]] for same in self._places])
-
-    def write(self, bare: Any, numbers: Array) -> None:
-        """Write the numbers, whole ones where whole ones stand."""
-        for number, same in zip(numbers, self._places, strict=True):
-            for path, index in same:
-                old = _follow(bare, path)
-                new = np.array(old)
-                new.flat[index] = number if new.dtype.kind == "f" else round(float(number))
-                kept = new if isinstance(old, np.ndarray) else type(old)(new.tolist())
-                owner, (is_attribute, key) = _follow(bare, path[:-1]), path[-1]
-                if is_attribute:
-                    setattr(owner, key, kept)
-                else:
-                    owner[key] = kept
 
 
 def deciding_attributes(copy: Copy, observation: Layout, steps: int) -> Attributes | None:
@@ -131,12 +96,6 @@ def _leaves(thing: Any, path: Path = (), known: set[int] | None = None) -> Itera
         inside = getattr(thing, "__dict__", {}) if is_attribute else thing
         for key, part in list(inside.items() if isinstance(inside, Mapping) else enumerate(inside)):
             yield from _leaves(part, (*path, (is_attribute, key)), known)
-
-
-def _follow(thing: Any, path: Path) -> Any:
-    for is_attribute, key in path:
-        thing = getattr(thing, key) if is_attribute else thing[key]
-    return thing
 
 
 def _played(copy: Copy, space: Mapping[Any, Any], seed: int, steps: int) -> Mapping[Any, Any]:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
-from esp_envs.adapters.attributes import Attributes
-from esp_envs.adapters.pairing import Simulator
+from esp_envs.adapters.pairing import Attributes, Simulator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
 

@@ -13,10 +13,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from esp_envs.adapters.attributes import Attributes
 from esp_envs.spec import Field, Items, Kind, Layout
 
 Array = NDArray[Any]
+Path = tuple[tuple[bool, Any], ...]
+"""From an environment to one of its parts: whether each step is an attribute or an entry, and which one."""
+
+
+class Attributes:
+    """Numbers inside of an environment that are those of a layout.
+
+    Args:
+        layout: what they are.
+        places: for each number, where it stands: the paths of parts, and its index in each.
+    """
+
+    def __init__(self, layout: Layout, places: Sequence[Sequence[tuple[Path, int]]]) -> None:
+        self.layout, self._places = layout, places
+
+    def read(self, bare: Any) -> Array:
+        """Return the numbers."""
+        return np.array([np.ravel(_follow(bare, same[0][0]))[same[0][1]] for same in self._places])
+
+    def write(self, bare: Any, numbers: Array) -> None:
+        """Write the numbers, whole ones where whole ones stand."""
+        for number, same in zip(numbers, self._places, strict=True):
+            for path, index in same:
+                old = _follow(bare, path)
+                new = np.array(old)
+                new.flat[index] = number if new.dtype.kind == "f" else round(float(number))
+                kept = new if isinstance(old, np.ndarray) else type(old)(new.tolist())
+                owner, (is_attribute, key) = _follow(bare, path[:-1]), path[-1]
+                if is_attribute:
+                    setattr(owner, key, kept)
+                else:
+                    owner[key] = kept
 
 
 class Simulator:
@@ -102,3 +133,9 @@ class Simulator:
 def _is_mujoco(bare: Any) -> bool:
     data = getattr(bare, "data", None)
     return hasattr(data, "qpos") and hasattr(data, "qvel") and callable(getattr(bare, "set_state", None))
+
+
+def _follow(thing: Any, path: Path) -> Any:
+    for is_attribute, key in path:
+        thing = getattr(thing, key) if is_attribute else thing[key]
+    return thing
