@@ -420,7 +420,7 @@ SINGLE = {
         "'step' returns 4 parts",
     ),
     "multi": (single(action_space=spaces.MultiBinary(3)), r"agent acts in MultiBinary\(3\)"),
-    "a dictionary": (single(reset=lambda self, seed=None: ({"x": 1}, {})), "what agent sees is a dict"),
+    "a dictionary": (single(reset=lambda self, seed=None: ({"x": 1}, {})), "agent sees x, and the layout has"),
     "no reward": (
         single(step=lambda self, a: (np.zeros(2), None, False, False, {})),
         "the reward of agent is a None",
