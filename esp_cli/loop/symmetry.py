@@ -295,7 +295,6 @@ class Symmetry(Draws):
     def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
         key = (device, dtype)
         if key not in self._sets:
-            self._sets[key] = TransformSet(
-                admitted_elements(self.group, self.spaces, shapes.ANOTHER), self.spaces, *key
-            )
+            elements = admitted_elements(self.group, self.spaces, shapes.ANOTHER)
+            self._sets[key] = TransformSet(elements, self.spaces, *key)
         return self._sets[key]
