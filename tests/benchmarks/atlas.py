@@ -44,7 +44,7 @@ NOT_CARRIED = {
     "vmas mpe and debug": "the former are the tasks of mpe2, the latter try the simulator.",
     "vmas sampling": "no state says what is sampled.",
     "vmas road_traffic": "agents steer.",
-    "vmas football": "an agent sees 28 vectors without names.",
+    "vmas football": "its opponents keep plans that no state holds.",
     "sisl waterworld": "it is not part of PettingZoo 1.27.",
     "sisl multiwalker": "no turn or mirror of the plane moves what walkers see.",
     "mujoco HalfCheetah, Hopper, Pusher": "no element could move anything in them.",
