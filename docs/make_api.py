@@ -22,6 +22,14 @@ What `esp_cli.__all__` lists is public: `from esp_cli import Symmetry, train`. A
 [changelog](../CHANGELOG.md). `python docs/make_api.py` writes this page from the docstrings;
 [the library page](library.md) shows how the parts work together.
 """
+_GROUPS = {
+    "Train and use a policy": ("train", "Run", "Metrics", "Progress", "load_policy", "LoadedPolicy"),
+    "A training loop of your own": (
+        *("Symmetry", "layout", "discrete_moves", "Field", "Kind", "Items", "Layout", "Discrete", "Continuous"),
+        "Transitions",
+    ),
+    "Robots": ("Body",),
+}
 _SECTIONS = ("Args", "Attributes", "Raises", "Returns", "Shape", "Yields")
 
 
@@ -58,20 +66,27 @@ def digest(found: dict[str, str]) -> str:
 
 def page() -> str:
     """Return the page."""
-    return _HEAD + "".join(_entry(name, thing) for name, thing in members())
+    found = dict(members())
+    text = _HEAD
+    for title, names in _GROUPS.items():
+        own = [name for top in names for name in found if name.partition(".")[0] == top]
+        text += f"\n## {title}\n" + "".join(_entry(name, found.pop(name)) for name in own)
+    if found:
+        raise ValueError(f"no group of docs/make_api.py has {', '.join(found)}")
+    return text
 
 
 def _entry(name: str, thing: Any) -> str:
     text = inspect.getdoc(thing) or ""
     if isinstance(thing, property):
         return f"\n`{name}`: {_markdown(text)}\n"
-    level = "###" if "." in name else "##"
+    level = "####" if "." in name else "###"
     return f"\n{level} {name}\n\n```text\n{_wrapped(name, signature(thing))}\n```\n\n{_markdown(text)}\n"
 
 
 def _wrapped(name: str, text: str) -> str:
-    """Return a signature in lines of at most 120 characters."""
-    return "\n".join(textwrap.wrap(name + text, 120, subsequent_indent="    ", break_long_words=False))
+    """Return a signature in lines of at most 88 characters."""
+    return "\n".join(textwrap.wrap(name + text, 88, subsequent_indent="    ", break_long_words=False))
 
 
 def _markdown(text: str) -> str:
