@@ -27,6 +27,8 @@ window.onload = () => {{
     if (!page.querySelector("h1")) say("has no heading");
     if (root.scrollWidth > root.clientWidth) say("is " + (root.scrollWidth - root.clientWidth) + " px too wide");
     for (const picture of page.images) if (!picture.naturalWidth) say("does not show " + picture.getAttribute("src"));
+    for (const code of page.querySelectorAll("article pre > code"))
+      if (code.scrollWidth > code.clientWidth + 1) say("cuts a line of " + code.innerText.slice(0, 60));
     for (const table of page.querySelectorAll("article table")) {{
       const box = table.parentElement.closest(".md-typeset__scrollwrap, .highlighttable, .highlight") || page.body;
       const cut = table.getBoundingClientRect().right > root.clientWidth + 1;

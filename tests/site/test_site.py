@@ -89,12 +89,13 @@ def test_a_browser_shows_every_page_whole_and_says_nothing(site: Path, width: in
 def test_a_browser_notices_a_wide_page_a_cut_table_a_lost_picture_and_a_failing_script(tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(
-        "<h1>Bad</h1><article><table><tr><td style='min-width: 2000px'>x<th>ahead</table></article><img src='lost.png'>"
+        "<h1>Bad</h1><article><table><tr><td style='min-width: 2000px'>x<th>ahead</table>"
+        "<pre><code style='display: block; overflow: auto; width: 9em'>one line that is far too long</code></pre></article><img src='lost.png'>"
         "<script>nothing.here()</script>"
     )
     (tmp_path / "scratch").mkdir()
     found = "\n".join(complaints([page], PHONE, tmp_path / "scratch"))
     assert "nothing is not defined" in found
-    for part in ("px too wide", "cuts a table", "does not show lost.png", "hides who is ahead"):
+    for part in ("px too wide", "cuts a table", "does not show lost.png", "hides who is ahead", "cuts a line"):
         assert part in found
     assert "hides the last column" in "\n".join(complaints([page], DESKTOP, tmp_path / "scratch"))
