@@ -90,7 +90,8 @@ def test_a_browser_notices_a_wide_page_a_cut_table_a_lost_picture_and_a_failing_
     page = tmp_path / "bad.html"
     page.write_text(
         "<h1>Bad</h1><article><table><tr><td style='min-width: 2000px'>x<th>ahead</table>"
-        "<pre><code style='display: block; overflow: auto; width: 9em'>one line that is far too long</code></pre></article><img src='lost.png'>"
+        "<pre><code style='display: block; overflow: auto; width: 9em'>a line that is too long</code></pre></article>"
+        "<img src='lost.png'>"
         "<script>nothing.here()</script>"
     )
     (tmp_path / "scratch").mkdir()
