@@ -18,7 +18,15 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.policies import CategoricalPolicies, Frame, GaussianPolicies, divergence_by_choice
+from esp_cli.networks.kernels.library import computes
+from esp_cli.networks.policies import (
+    CategoricalPolicies,
+    CompiledCategoricalPolicies,
+    Frame,
+    GaussianPolicies,
+    Policies,
+    divergence_by_choice,
+)
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 _INITIAL_STD = 0.6
@@ -45,6 +53,7 @@ class Head(nn.Module, ABC):
 
     num_outputs: int  # numbers that it reads of an agent; an encoded action has as many
     masks: bool = False  # whether outputs come with masked actions
+    compiled: bool = False  # whether losses of outputs on the CPU go through the compiled kernel
 
     @abstractmethod
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
@@ -122,9 +131,10 @@ class Categorical(Choice):
         """Return KL[p || q] of two sets of log-probabilities: [S, B, N]."""
         return divergence_by_choice(p, q, p.exp()).sum(-1)
 
-    def policies(self, outputs: WithVJP, frame: Frame) -> CategoricalPolicies:
+    def policies(self, outputs: WithVJP, frame: Frame) -> Policies:
         """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
-        return CategoricalPolicies(outputs, frame)
+        orders = frame.orders(self.num_outputs) if computes(self.compiled, outputs.tensor) else None
+        return CategoricalPolicies(outputs, frame) if orders is None else CompiledCategoricalPolicies(outputs, orders)
 
 
 class BoundedGaussian(Head):

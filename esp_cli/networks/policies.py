@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
+from esp_cli.networks.kernels.choices import CompiledChoices, Slope
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
@@ -32,6 +33,9 @@ class Frame(Protocol):
 
     def pull_items(self, item: Tensor, outputs: Tensor) -> Tensor | None:
         """Return the items [W] of numbers beside outputs in the frame, or None where all parts have the same."""
+
+    def orders(self, num_actions: int) -> Tensor | None:
+        """Return which output of each part is the original's action [S or 1, P, A], where that is all that differs."""
 
 
 class Policies(ABC):
@@ -111,6 +115,44 @@ class CategoricalPolicies(Policies):
     def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
         by_logits = torch.addcmul(slope, self.probs, slope.sum(1, keepdim=True), value=-1)
         return [(self._outputs, self._frame.push_outputs(by_logits.unflatten(3, self._shape[2:5]).movedim(1, -1)))]
+
+
+class CompiledCategoricalPolicies(Policies):
+    """What `CategoricalPolicies` are, by a kernel: of copies that differ in the order of their outputs alone.
+
+    A slope is a list of what the kernel is asked to add up.
+
+    Args:
+        outputs: [S, P B, T, N, A] of a network.
+        orders: [S or 1, P, A] which output of each part is the original's action.
+    """
+
+    def __init__(self, outputs: WithVJP, orders: Tensor) -> None:
+        self._outputs, self._shape = outputs, outputs.tensor.shape
+        rows = outputs.tensor.flatten(1, -2)
+        self._choices = CompiledChoices(rows, orders.expand(len(rows), -1, -1))
+
+    def log_prob(self, action: Tensor, learned: int) -> Tensor:
+        return self._choices.log_probs.gather(1, _index(action, learned)).squeeze(1)
+
+    def entropy(self, learned: int) -> Tensor:
+        return self._choices.entropies[:, :learned]
+
+    def divergence(self, copies: slice, originals: slice) -> Tensor:
+        assert originals == slice(0, 1)
+        return self._choices.gaps[:, copies]
+
+    def add_slope(self, slope: Any, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> list[Slope]:
+        return [*(slope or []), Slope(chosen=(action, by_log_prob, by_entropy))]
+
+    def add_divergence_slope(self, slope: Any, weights: Weights, stop_gradient: str) -> list[Slope]:
+        *before, last = slope or [Slope()]
+        gaps = (weights, stop_gradient)
+        return [*before, last._replace(gaps=gaps)] if last.gaps is None else [*before, last, Slope(gaps=gaps)]
+
+    def back(self, slope: list[Slope]) -> list[tuple[WithVJP, Tensor]]:
+        first, *others = map(self._choices.back, slope)
+        return [(self._outputs, sum(others, start=first).unflatten(1, self._shape[1:-1]))]
 
 
 def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from esp_cli.networks.build import Network, NetworkConfig, build_network
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.separate import Separate, action_parts
 from esp_envs.spec import Spaces
@@ -47,6 +48,9 @@ class Policy(nn.Module):
         self.num_agents = spec.num_agents
         self.head = head
         head.masks = spec.masks
+        head.compiled = getattr(network, "compiled", False) is True
+        if head.compiled:
+            begin("choices")
         inputs = spec.observation.width + num_extra
         if isinstance(network, PlainConfig) and network.separate_parts:
             parts = action_parts(spec.action)

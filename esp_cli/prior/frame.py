@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.symmetry import Transform
+from esp_cli.symmetry.maps import Gather
 
 
 class Frame:
@@ -42,6 +43,19 @@ class Frame:
             return None
         parts = self._parts(item.to(outputs.dtype).expand_as(outputs))
         return self._each(parts, lambda g: g.pull_back_variance).round().long()
+
+    def orders(self, num_actions: int) -> Tensor | None:
+        """Return which output of each part is the original's action [S or 1, 1 + K, A].
+
+        None where copies differ in more than the order of the outputs of an agent.
+        """
+        maps = [g.output_map for g in self._transforms if type(g) is Transform]
+        backs = [m.back for m in maps if isinstance(m, Gather) and m.sign is None]
+        if self._moves_agents or len(backs) < len(self._transforms):
+            return None
+        num_seeds = max((len(back) for back in backs), default=1)
+        stays = torch.arange(num_actions).expand(num_seeds, -1)
+        return torch.stack([stays, *(back.expand(num_seeds, -1) for back in backs)], 1)
 
     def pull_values(self, values: Tensor) -> Tensor:
         """Return values [S, (1 + K) B, ..., C] in the frame: [S, 1 + K, B, ..., C]."""
