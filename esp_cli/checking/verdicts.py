@@ -6,8 +6,8 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Literal
-
 
 from esp_cli.symmetry import Element
 
@@ -90,7 +90,7 @@ def concluded(
 
 def chance(gap: float, tolerance: float, error: float) -> float:
     """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
-    return float(ndtr((gap - tolerance) / max(error, 1e-12)))
+    return NormalDist().cdf((gap - tolerance) / max(error, 1e-12))
 
 
 def unwatched(done: int, total: int) -> None:
