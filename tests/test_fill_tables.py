@@ -18,7 +18,8 @@ from tests.studies.small_studies import small_study, write_run, write_study
 
 FILL = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "fill_tables.py"))
 Verdict, filled, files_of, join, leaders = (FILL[n] for n in ("Verdict", "filled", "files_of", "join", "leaders"))
-methods_table, paper_table, side, verdicts = (FILL[n] for n in ("methods_table", "paper_table", "side", "verdicts"))
+methods_table, side, verdicts = (FILL[n] for n in ("methods_table", "side", "verdicts"))
+paper_table = FILL["TABLES"]["paper"]
 verdicts_table = FILL["verdicts_table"]
 __all__ = ["material"]  # a fixture
 BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
