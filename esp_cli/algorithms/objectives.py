@@ -14,8 +14,7 @@ from torch.nn.functional import huber_loss
 
 from esp_cli.networks.policies import Policies
 from esp_cli.prior import Copies, Loss, Term, shares
-from esp_cli.prior.frame import Values
-from esp_cli.prior.losses import Stated
+from esp_cli.prior.losses import Stated, Values
 
 
 def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, entropy_coef: float) -> Loss:

@@ -85,13 +85,20 @@ def check_paired(
         visited = [(states, actions)]
     some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in visited]
     everywhere, few = (cache(lambda states=states: _Pairs(make, states)) for states in (visited, some))
-    further = cache(lambda: _Pairs(make, [(_stretched(state, shown.state), action) for state, action in visited]))
+
+    @cache
+    def further() -> _Pairs | None:
+        try:
+            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in visited])
+        except Exception:  # such states, or what was done elsewhere, are not for this task
+            return None
 
     def judge(element: Element) -> ElementVerdict:
         if len(elements) > _SOME and (found := few().judge(element)).outcome == "broken":
             return found
         found = everywhere().judge(element)
-        if found.outcome == "holds" and (beyond := further().judge(element)).outcome == "broken":
+        pairs = further() if found.outcome == "holds" else None
+        if pairs is not None and (beyond := pairs.judge(element)).outcome == "broken":
             fields = tuple(replace(f, outcome="not covered") for f in beyond.fields if f.outcome == "broken")
             return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
         return found

@@ -65,10 +65,6 @@ class EpsilonGreedy(ExploringChoice):
     def mode(self, outputs: Tensor) -> Tensor:
         return best(outputs)
 
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return the mean squared difference of the values: [S, B, N]."""
-        return (p - q).square().mean(-1)
-
 
 class ExploringCategorical(ExploringChoice, Categorical):
     """One of A allowed actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""

@@ -22,11 +22,11 @@ from esp_cli.networks.kernels.library import computes
 from esp_cli.networks.policies import (
     CategoricalPolicies,
     CompiledCategoricalPolicies,
-    Frame,
     GaussianPolicies,
     Policies,
     divergence_by_choice,
 )
+from esp_cli.symmetry.frame import Frame
 from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 _INITIAL_STD = 0.6
@@ -70,10 +70,6 @@ class Head(nn.Module, ABC):
     @abstractmethod
     def mode(self, outputs: Tensor) -> Tensor:
         """Return the greedy action."""
-
-    @abstractmethod
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return how far the policy with outputs p is from that with outputs q: [S, B, N]."""
 
     def to_environment(self, action: Tensor) -> Tensor:
         """Return what `Environment.step` takes: the action as it is, unless a head says more."""

@@ -9,33 +9,18 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.choices import CompiledChoices, Slope
+from esp_cli.symmetry.frame import Frame
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
 Weights = Tensor | float  # A number, or [S, 1, R]
-
-
-class Frame(Protocol):
-    """Brings outputs for copies back to the originals, and slopes to the copies; see `prior.frame.Frame`."""
-
-    def pull_outputs(self, outputs: Tensor) -> Tensor:
-        """Return outputs [S, P B, T, N, ...] in the frame: [S, P, B, T, N, ...]."""
-
-    def push_outputs(self, outputs: Tensor) -> Tensor:
-        """Undo `pull_outputs`."""
-
-    def pull_items(self, item: Tensor, outputs: Tensor) -> Tensor | None:
-        """Return the items [W] of numbers beside outputs in the frame, or None where all parts have the same."""
-
-    def orders(self, num_actions: int) -> Tensor | None:
-        """Return which output of each part is the original's action [S or 1, P, A], where that is all that differs."""
 
 
 class Policies(ABC):

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Generic
 import torch
 from torch import Tensor
 
-from esp_cli.prior.frame import Frame, Values
-from esp_cli.prior.losses import Loss, OfGraph, Term, policy_consistency_loss, policy_gap, value_gap
+from esp_cli.prior.losses import Loss, OfGraph, Term, Values, policy_consistency_loss, policy_gap, value_gap
 from esp_cli.prior.seed_batch import Rows, average, shares
 from esp_cli.symmetry import Transform
+from esp_cli.symmetry.frame import Frame
 
 if TYPE_CHECKING:
     from esp_cli.prior.config import PriorConfig

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from esp_cli.prior.frame import Values
 from esp_cli.prior.seed_batch import average, shares
+from esp_cli.symmetry.frame import Frame
 
 
 class Stated(NamedTuple):
@@ -109,6 +109,24 @@ class Loss:
         return stated, [root for on, slope in sums.values() for root in on.back(slope)]
 
 
+class Values:
+    """What a critic outputs for originals and copies; a slope is by `rows`.
+
+    Attributes:
+        count: C.
+        rows: [S, 1 + K, B T C] in the frame.
+    """
+
+    def __init__(self, values: Any, frame: Frame) -> None:
+        self._values, self._frame = values, frame
+        pulled = frame.pull_values(values.tensor)
+        self._shape, self.count, self.rows = pulled.shape, pulled.shape[-1], pulled.flatten(2)
+
+    def back(self, slope: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values and the slope by them."""
+        return [(self._values, self._frame.push_values(slope.view(self._shape)))]
+
+
 class OfGraph:
     """What a network returned under autograd: `graph`, and `tensor` without the graph."""
 
@@ -179,7 +197,7 @@ def policy_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
 
 
 def value_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
-    """Return the mean of S_V (S_Q) over copies and rows that count, as an equation on `prior.frame.Values`."""
+    """Return the mean of S_V (S_Q) over copies and rows that count, as an equation on `Values`."""
 
     def equation(values: Values, weight: float, slope: Tensor | None) -> Stated:
         slope = torch.zeros_like(values.rows) if slope is None else slope

@@ -6,8 +6,8 @@ import torch
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.choices import CompiledChoices, Slope
 from esp_cli.networks.policies import CategoricalPolicies, CompiledCategoricalPolicies
-from esp_cli.prior.frame import Frame
 from esp_cli.symmetry import transform_set
+from esp_cli.symmetry.frame import Frame
 from tests.algorithms.test_objectives import SPACES
 from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry import Transform
 from esp_cli.symmetry.maps import Gather
+from esp_cli.symmetry.transforms import Transform
 
 
 class Frame:
@@ -72,21 +71,3 @@ class Frame:
     def _each(self, parts: Tensor, move: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
         here, *copies = parts.unbind(1)
         return torch.stack([here, *(move(g)(copy) for g, copy in zip(self._transforms, copies, strict=True))], 1)
-
-
-class Values:
-    """What a critic outputs for originals and copies; a slope is by `rows`.
-
-    Attributes:
-        count: C.
-        rows: [S, 1 + K, B T C] in the frame.
-    """
-
-    def __init__(self, values: Any, frame: Frame) -> None:
-        self._values, self._frame = values, frame
-        pulled = frame.pull_values(values.tensor)
-        self._shape, self.count, self.rows = pulled.shape, pulled.shape[-1], pulled.flatten(2)
-
-    def back(self, slope: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values and the slope by them."""
-        return [(self._values, self._frame.push_values(slope.view(self._shape)))]
