@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pprint
+from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
-from esp_cli.bodies import written
+from esp_cli.bodies import proven, written
 from esp_cli.bodies.body import Body
 from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of
 from esp_cli.defaults import __version__
@@ -45,11 +47,25 @@ def emitted(body: Body, numbers: Numbers, model: str) -> str:
         "ACTIONS": moves.pop(ACTION),
         "OBSERVATIONS": moves,
     }
-    # names of strangers enter as Python literals alone
+    return _filled(written, data)
+
+
+def proof(body: Body, numbers: Numbers, file: str) -> str:
+    """Return the source of tests for an `emitted` file of a name, with a row of each group and its images."""
+    recorded, generator = {}, np.random.default_rng(0)
+    for name, layout in numbers.items():
+        row = generator.standard_normal(layout.width).round(3)
+        images = {element.name: (map_of(layout, element) @ row).round(12).tolist() for element in body.elements}
+        recorded[name] = {"row": row.tolist(), **images}
+    return _filled(proven, {"MIRROR": file, "RECORDED": recorded})
+
+
+def _filled(module: ModuleType, data: Mapping[str, object]) -> str:
+    """Return the source of a module with its data; names of strangers enter as Python literals alone."""
     lines = [
         f"{name} = {pprint.pformat(value, width=110, compact=True, sort_dicts=False)}" for name, value in data.items()
     ]
-    template = Path(written.__file__).read_text(encoding="utf-8").splitlines()
+    template = Path(str(module.__file__)).read_text(encoding="utf-8").splitlines()
     return "\n".join("\n".join(lines) if line.endswith("# DATA") else line for line in template) + "\n"
 
 

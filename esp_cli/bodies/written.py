@@ -65,11 +65,12 @@ def compute_symmetric_states(
 
 
 def augment(obs: Any, actions: Any, *numbers: Any, group: str | None = None, axis: int = 0) -> Any:
-    """Return rows, actions, and numbers that stay (rewards, log-probabilities), each followed by its copies.
+    """Return rows, actions, and numbers that stay (rewards, log-probabilities, None), each followed by its copies.
 
+    Copies are made of all ELEMENTS; take out those under which your reward is another.
     Histories [T, B, D] of a recurrent policy are rows with axis=1: mirror them whole, from their first step.
     """
     group = group or next(iter(OBSERVATIONS), "policy")
     obs = with_copies(obs, [mirrored(obs, element, group) for element in ELEMENTS], axis)
     actions = with_copies(actions, [mirrored(actions, element) for element in ELEMENTS], axis)
-    return obs, actions, *(with_copies(x, [x] * len(ELEMENTS), axis) for x in numbers)
+    return obs, actions, *(x if x is None else with_copies(x, [x] * len(ELEMENTS), axis) for x in numbers)

@@ -70,8 +70,8 @@ def mirror(
 
     if (emit is None) != (out is None):
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
-    if out is not None and out.exists() and not force:
-        raise UserError(f"{out} exists; choose another path, or add --force")
+    if out is not None and not force and (taken := [path for path in (out, _proof_of(out)) if path.exists()]):
+        raise UserError(f"{taken[0]} exists; choose another path, or add --force")
     if rows is not None and policy is None:
         raise UserError("--rows are observations for --policy; name the policy too")
     body = Body.from_mjcf(model, root)
@@ -115,16 +115,22 @@ def described(body: Body, model: Path) -> dict[str, Any]:
 
 
 def _write(body: Body, model: Path, numbers: str | None, host: str, out: Path) -> None:
-    from esp_cli.bodies.emitting import HOSTS, emitted
+    from esp_cli.bodies.emitting import HOSTS, emitted, proof
     from esp_cli.bodies.numbers import numbers_of
     from esp_cli.files.writing import write_file
 
     layouts = numbers_of(body, numbers)
     write_file(out, emitted(body, layouts, model.name).encode())
+    write_file(_proof_of(out), proof(body, layouts, out.name).encode())
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
     console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
+    console.note(f"{_proof_of(out)} proves it, with numpy alone")
     if numbers is None:
         console.note("the numbers are those of Isaac Lab's velocity tasks; --numbers names a function with yours")
+
+
+def _proof_of(out: Path) -> Path:
+    return out.with_name(f"test_{out.stem}.py")
 
 
 def _audited(check: str, body: Body, numbers: str | None) -> list[Copy]:

@@ -67,6 +67,7 @@ def test_the_file_does_what_the_layouts_say(body, tmp_path):
         np.ones((7, 5, numbers["policy"].width)), np.ones((7, 5, 9)), np.ones((7, 5)), axis=1
     )
     assert (obs.shape[1], actions.shape[1], reward.shape[1]) == (10, 10, 10)
+    assert module.augment(obs[0], actions[0], None)[2] is None
     assert module.mirrored(np.ones((0, 9), "f2")[:, ::-1], "flip-x").dtype == np.float16
     for rows, group, sentence in (
         (np.ones((2, 8)), None, "rows of actions have 8 numbers, the mirror 9"),
@@ -257,11 +258,20 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert esp("mirror", "biped.xml", "--check", "my_mirror:compute_symmetric_states").stdout == (
         "my_mirror:compute_symmetric_states is right: its copies are identity, flip-x\n"
     )
-    text = Path("my_mirror.py").read_text().replace("[[-1,", "[[1,")
+    proof = [sys.executable, "-I", "test_my_mirror.py"]
+    assert subprocess.run(proof, capture_output=True, text=True, check=True).stdout == "proven\n"
+    right = Path("my_mirror.py").read_text()
+    text = right.replace("[[-1,", "[[1,")
+    Path("my_mirror.py").write_text(text)
+    assert b"AssertionError" in subprocess.run(proof, capture_output=True, check=False).stderr, "one sign is wrong"
+    Path("my_mirror.py").write_text(right)
     Path("my_wrong.py").write_text(text)
     result = esp("mirror", "biped.xml", "--check", "my_wrong:compute_symmetric_states", "--json", "-", code=1)
     assert json.loads(result.stdout)["check"][1]["wrong"] == [["actions.waist", "actions.waist", "-actions.waist"]]
     assert "exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
+    Path("my_mirror.py").unlink()
+    assert "test_my_mirror.py exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
+    Path("my_mirror.py").write_text(right)
     assert "belong together" in refused("mirror", "biped.xml", "--emit", "numpy")
     assert "cannot import" in refused("mirror", "biped.xml", "--check", "nowhere:mirror")
     assert "names no function" in refused("mirror", "biped.xml", "--check", "nowhere")
