@@ -85,3 +85,20 @@ def test_steps_are_those_at_which_both_first_have_a_return_and_the_tuned_gain_ha
     gap = next(cell.summary.gap for name, cell in tuned.items() if name.startswith("ESP, tuned"))
     assert format_interval(gap.difference.ci95) == "[5.68, 7.03]"
     assert interval[1:] == ("5.7", "7.0")
+
+
+def test_the_learners_of_the_notebook_end_as_its_text_says() -> None:
+    book = json.loads((DOCS / "tutorial.ipynb").read_text(encoding="utf-8"))
+    shown = "".join(text for cell in book["cells"] for one in cell.get("outputs", []) for text in one.get("text", []))
+    plain, ours = (float(re.search(rf"{name} +([\d.]+) ±", shown)[1]) for name in ("plain", "ESP"))
+    assert ours > 2 * plain, "far ahead"
+    assert "far ahead" in str(book["cells"])
+
+
+def test_each_part_of_the_prior_is_ahead_in_the_first_study() -> None:
+    runs = cells("first-study.json", "predator-prey, MAPPO, 50k")
+    assert {name: cell.summary.gap.ahead for name, cell in runs.items() if name != "none"} == {
+        "loss": "ahead",
+        "augmentation": "ahead",
+        "both": "ahead",
+    }
