@@ -1,17 +1,17 @@
-"""The tasks of docs/own-tasks.md, taken from the page as a reader would."""
+"""The tasks of docs/own-tasks.md and docs/adapters.md, taken from the pages as a reader would."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "docs" / "own-tasks.md"
+PAGES = [Path(__file__).parents[1] / "docs" / name for name in ("own-tasks.md", "adapters.md")]
 _SAVED_BLOCK = re.compile(r"[Ss]ave this as `([\w.]+)`.*?```python\n(.*?)```", re.DOTALL)
 
 
 def page_files() -> dict[str, str]:
-    """Return the files that the page tells its reader to save."""
-    return dict(_SAVED_BLOCK.findall(PAGE.read_text(encoding="utf-8")))
+    """Return the files that the pages tell their reader to save."""
+    return dict(block for page in PAGES for block in _SAVED_BLOCK.findall(page.read_text(encoding="utf-8")))
 
 
 def save_page_files(folder: Path) -> None:
