@@ -160,7 +160,7 @@ def test_settings_and_reports_of_what_is_not_installed(folder: Path) -> None:
     assert "'rendezvous:RendezvousSettings' is no task, algorithm or network" in (
         esp(folder, "settings", "rendezvous:RendezvousSettings", code=2).stderr
     )
-    shown = esp(folder, "report", "a=run", "b=run", "--task", TASK).stdout
+    shown = esp(folder, "report", "a=run", "b=run", "--task", TASK, "--full").stdout
     assert f"esp report a=run b=run --task {TASK}" in " ".join(shown.split())
 
 
