@@ -120,7 +120,7 @@ def test_a_folder_never_imports_an_algorithm_or_a_network(saved):
 def test_a_study_trains_both_in_jobs_of_their_own(saved):
     esp("ablate", "prior", *ALGO, "--task", "navigation", "--set", "network.name=skip:SkipConfig", "--steps", "800",
         "--seeds", 1, "--episodes", 2, *TINY, "--jobs", 1, "--out", "study")  # fmt: skip
-    table = esp("report", "study", *ALGO, *NETWORK).stdout
+    table = esp("report", "study", *ALGO, *NETWORK, "--full").stdout
     assert "REINFORCE-ESP" in table
 
 
