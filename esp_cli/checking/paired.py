@@ -30,7 +30,6 @@ from esp_cli.checking.verdicts import (
     Watch,
     chance,
     concluded,
-    unwatched,
     verdicts_of,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
@@ -61,7 +60,7 @@ def check_paired(
     make: MakeWorlds,
     elements: Sequence[Element],
     most: int | None = None,
-    watch: Watch = unwatched,
+    watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state.
@@ -89,7 +88,7 @@ def check_paired(
     @cache
     def further() -> _Pairs | None:
         try:
-            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in visited])
+            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in some])
         except Exception:  # such states, or what was done elsewhere, are not for this task
             return None
 

@@ -11,7 +11,7 @@ from esp_cli.checking import paired, transitions
 from esp_cli.checking.candidates import candidates, refused
 from esp_cli.checking.naming import named
 from esp_cli.checking.recorded import Transitions, collect
-from esp_cli.checking.verdicts import ElementVerdict, Watch, unwatched
+from esp_cli.checking.verdicts import ElementVerdict, Watch
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
 from esp_cli.symmetry.elements import AGENTS
@@ -72,7 +72,7 @@ def check_symmetry(
     make: MakeWorlds,
     transforms: str | None = None,
     from_transitions: bool = False,
-    watch: Watch = unwatched,
+    watch: Watch = lambda *_: None,
     seconds: float = math.inf,
 ) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
@@ -105,7 +105,7 @@ def judged(
     make: MakeWorlds,
     elements: Sequence[Element],
     from_transitions: bool = False,
-    watch: Watch = unwatched,
+    watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
     """Return the method that a task allows, and what it says of some elements until the time is over."""

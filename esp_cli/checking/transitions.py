@@ -33,7 +33,6 @@ from esp_cli.checking.verdicts import (
     FieldVerdict,
     Watch,
     concluded,
-    unwatched,
     verdicts_of,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
@@ -61,7 +60,7 @@ def check_transitions(
     spaces: Spaces,
     data: Transitions,
     elements: Sequence[Element],
-    watch: Watch = unwatched,
+    watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements from transitions.
@@ -76,7 +75,7 @@ def check_transitions(
     Raises:
         UserError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
     """
-    data = _in_float32(data)
+    data = Transitions(*(x.float() if x.is_floating_point() else x for x in vars(data).values() if x is not None))
     _refuse_what_says_nothing(spaces, data)
     data = replace(data, reward=_without_tails(data.reward))
     stride = -(-len(data.obs) * data.obs.shape[1] * spaces.num_agents // _MOST_ROWS)
@@ -105,7 +104,9 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
         still = halves[0].is_still(name)
         never = name == "reward" and not any(half.is_paid for half in halves)
-        verdicts.append(_of_nothing(name, never) if still else _judged(name, alone, squares, planted[:, counts]))
+        # that it never changes is its law where it is seen; that of a reward that never came is unknown
+        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(never))
+        verdicts.append(of_nothing if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
     shift, preference = _shift(first.obs, image.obs), _shift(_done(first, spaces), _done(image, spaces))
@@ -115,11 +116,6 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         reason = f"the first actions differ from their image by {preference:.2f} s.d."
         return ElementVerdict(element.name, declared, (), reason)
     return found
-
-
-def _of_nothing(name: str, never_came: bool) -> FieldVerdict:
-    """Judge what never changes: that is its law where it is seen; that of a reward that never came is unknown."""
-    return concluded(name, 0.0, 0.0, broken=False, p_value=float(never_came))
 
 
 def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
@@ -235,11 +231,6 @@ def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:
 
 def _is_beyond(gap: Tensor | float, error: Tensor | float, errors: float = SIGNIFICANT) -> bool:
     return bool(gap > errors * error) and bool(gap > _SEEN * TOLERATED**2)
-
-
-def _in_float32(data: Transitions) -> Transitions:
-    parts = [part for part in vars(data).values() if part is not None]
-    return Transitions(*(part.float() if part.is_floating_point() else part for part in parts))
 
 
 def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:

@@ -93,15 +93,11 @@ def chance(gap: float, tolerance: float, error: float) -> float:
     return NormalDist().cdf((gap - tolerance) / max(error, 1e-12))
 
 
-def unwatched(done: int, total: int) -> None:
-    """Take what nobody shows."""
-
-
 def verdicts_of(
     elements: Sequence[Element],
     judge: Callable[[Element], ElementVerdict],
     is_declared: Callable[[Element], bool],
-    watch: Watch = unwatched,
+    watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements, declared ones first, and tell how many are done.

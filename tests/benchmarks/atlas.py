@@ -110,6 +110,10 @@ def page(rows: list[dict[str, Any]]) -> str:
     return text.replace("TABLE", "\n".join(lines)).replace("LEFT", "\n".join(left + missing))
 
 
+def _is_further_out(found: list[dict[str, Any]] | str) -> bool:
+    return not isinstance(found, str) and any(field["gap"] > 0 for field in found)
+
+
 def _line(row: dict[str, Any]) -> str:
     worst: dict[str, tuple[float, str, str]] = {}
     for element, fields in row.get("broken", {}).items():
@@ -118,8 +122,10 @@ def _line(row: dict[str, Any]) -> str:
         worst.setdefault(found["field"], (found["gap"], element, share))
         worst[found["field"]] = max(worst[found["field"]], (found["gap"], element, share))
     told = [f"{field} by {gap:.3g} s.d. ({element}{share})" for field, (gap, element, share) in worst.items()]
-    if unseen := row.get("not covered"):
-        told.append("not covered: " + ", ".join(list(unseen)[:4]) + (" and more" if len(unseen) > 4 else ""))
+    unseen = dict(row.get("not covered", {}))
+    far = {name: unseen.pop(name) for name, found in list(unseen.items()) if _is_further_out(found)}
+    for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
+        told += [f"{why}: {', '.join(names[:4])}" + (" and more" if len(names) > 4 else "")] if names else []
     return f"| {row['package']} {row['task']} | `{row['found']}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
 
 

@@ -129,6 +129,17 @@ class Aging(Point):
         return super().step(action + np.array([0.5, 0.0]) * (self.age > 12))
 
 
+class Stale(Point):
+    """It says what is seen by what it saw last, which is another scene's where its place alone is written."""
+
+    def _get_obs(self):
+        return self.last
+
+    def _seen(self):
+        self.last = np.round(self.place, 3).astype(np.float32)
+        return super()._seen()
+
+
 class Uncopied(Point):
     def __deepcopy__(self, memo):
         raise TypeError("it holds a window")
@@ -209,7 +220,7 @@ def test_an_environment_that_can_be_copied_is_paired_by_its_attributes(kind, mon
     assert [element.outcome for element in found.elements] == ["broken"] * 3 + ["holds"]
 
 
-@pytest.mark.parametrize("kind", [Sliding, Aging, Uncopied])
+@pytest.mark.parametrize("kind", [Sliding, Aging, Stale, Uncopied])
 def test_what_cannot_be_set_is_judged_by_transitions(kind, monkeypatch) -> None:
     """A hidden speed or a clock would make a state that is set another than the one that was read."""
     monkeypatch.setattr(Tri, "kind", kind)

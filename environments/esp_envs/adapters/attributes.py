@@ -18,10 +18,11 @@ import numpy as np
 from esp_envs.adapters import foreign
 from esp_envs.adapters.hooks import Array, Copy
 from esp_envs.adapters.pairing import Attributes, Path
+from esp_envs.adapters.settable import played, seeded_spaces
 from esp_envs.spec import Field, Items, Layout
 
 _TRIED = 16
-_DEEP, _MOST = 4, 256
+_DEEP, _MOST = 6, 256
 """How deep parts are looked for, and how many numbers one has at most."""
 
 
@@ -33,31 +34,33 @@ def deciding_attributes(copy: Copy, observation: Layout, steps: int) -> Attribut
         observation: what its agents see.
         steps: of an episode.
     """
-    space = {name: foreign.space_of(copy.env, name) for name in copy.agents}
-    for k, one in enumerate(space.values()):
-        one.seed(k)
+    space = seeded_spaces(copy)
     lengths = [k * steps // _TRIED for k in range(_TRIED)]
     seen, parts = [], []
     for k, length in enumerate(lengths):
-        seen.append(copy.seen(_played(copy, space, k, length)))
+        seen.append(copy.seen(played(copy, space, k, length)))
         parts.append({path: part.astype(np.float32) for path, part in _leaves(copy.simulator.bare)})
     found = _matched(observation, np.array(seen, np.float32), parts)
     if not found.layout.width or (copy.rest and copy.simulator.look(copy.agents) is None):
         return None
-    for k, length in enumerate(lengths):
-        _played(copy, space, k, length)
-        state, action = found.read(copy.simulator.bare), {name: one.sample() for name, one in space.items()}
-        try:
-            twin = deepcopy(copy.env)
-        except Exception:  # whatever a class refuses to be copied with
-            return None
-        followed = [_outcome(copy, env, action) for env in (copy.env, twin)]
-        copy.start(_TRIED + k)
-        found.write(copy.simulator.bare, state)
-        followed.append(_outcome(copy, copy.env, action))
-        if not all(np.allclose(followed[0], other, 1e-5, 1e-5) for other in followed[1:]):
-            return None
-    return found
+    try:  # whatever a class refuses to be copied with, or to be written into
+        return found if all(_decides(copy, found, space, k, length) for k, length in enumerate(lengths)) else None
+    except Exception:
+        return None
+
+
+def _decides(copy: Copy, found: Attributes, space: Mapping[Any, Any], seed: int, steps: int) -> bool:
+    """Return whether a deep copy steps as the environment does, and another episode that is put into its state."""
+    here = copy.seen(played(copy, space, seed, steps))
+    state, action = found.read(copy.simulator.bare), {name: one.sample() for name, one in space.items()}
+    twin = deepcopy(copy.env)
+    followed = [_outcome(copy, env, action) for env in (copy.env, twin)]
+    copy.start(_TRIED + seed)
+    found.write(copy.simulator.bare, state)
+    shown = copy.simulator.look(copy.agents)
+    pairs = [] if shown is None else [(here, copy.seen(shown))]
+    pairs += [(followed[0], other) for other in (followed[1], _outcome(copy, copy.env, action))]
+    return all(np.allclose(one, other, 1e-5, 1e-5) for one, other in pairs)
 
 
 def _matched(observation: Layout, seen: Array, parts: Sequence[Mapping[Path, Array]]) -> Attributes:
@@ -66,7 +69,9 @@ def _matched(observation: Layout, seen: Array, parts: Sequence[Mapping[Path, Arr
     for path in parts[0]:
         rows = [part.get(path, np.zeros(0)) for part in parts]
         if all(row.shape == rows[0].shape for row in rows):
-            for index, column in enumerate(np.array(rows).T):
+            for index, column in enumerate(np.array(rows).T if len(rows[0]) else ()):
+                if np.ptp(column) == 0:
+                    continue  # a constant is the law of the task, and equals others by chance
                 places.setdefault((column + 0.0).tobytes(), []).append((path, index))
     fields, held = list[Field](), list[list[tuple[Path, int]]]()
     for field, where in zip(observation.fields, observation.slices().values(), strict=True):
@@ -96,18 +101,6 @@ def _leaves(thing: Any, path: Path = (), known: set[int] | None = None) -> Itera
         inside = getattr(thing, "__dict__", {}) if is_attribute else thing
         for key, part in list(inside.items() if isinstance(inside, Mapping) else enumerate(inside)):
             yield from _leaves(part, (*path, (is_attribute, key)), known)
-
-
-def _played(copy: Copy, space: Mapping[Any, Any], seed: int, steps: int) -> Mapping[Any, Any]:
-    """Start a copy and take some random steps, up to the end of the episode; return what agents see."""
-    seen = copy.start(seed)[0]
-    for _ in range(steps):
-        action = {name: one.sample() for name, one in space.items()}
-        following, _, *flags, _ = foreign.parts(copy.env.step(action), "step")
-        if any(map(any, foreign.ends(copy.env, copy.agents, *flags))):
-            return copy.start(seed)[0]
-        seen = following
-    return seen
 
 
 def _outcome(copy: Copy, env: Any, action: Mapping[Any, Any]) -> Array:

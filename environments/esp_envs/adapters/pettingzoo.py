@@ -31,10 +31,6 @@ _FEW_COPIES = 8
 """Up to this number of copies, worker processes cost more time than they save."""
 
 
-_TRIED_STEPS = 64
-"""Steps of an episode, at most, in which attributes of an environment have to decide what follows."""
-
-
 class ParallelSettings(TaskSettings):
     """What a user may change of every task of this kind; a subclass adds its own."""
 
@@ -147,7 +143,7 @@ class ParallelTask(CopyHooks, Environment):
         with one.naming("put"):
             found = simulated_layout(one, self.observation, self.simulated)
             if found is None and self.simulated is None:
-                self.attributes = deciding_attributes(one, self.observation, min(self.spec.horizon, _TRIED_STEPS))
+                self.attributes = deciding_attributes(one, self.observation, min(self.spec.horizon, 64))
                 found = None if self.attributes is None else self.attributes.layout
         one.close()
         if found is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -34,16 +36,32 @@ def simulated_layout(copy: Copy, observation: Layout, declared: Layout | None) -
     return found if declared else _with_names(copy, found, observation)
 
 
-def _takes_effect(copy: Copy) -> bool:
-    """Return whether much the same follows a state and an action, whatever the reset before drew."""
+def seeded_spaces(copy: Copy) -> dict[Any, Any]:
+    """Return the action space of each agent, from which the same actions are drawn each time."""
     spaces = {name: foreign.space_of(copy.env, name) for name in copy.agents}
     for k, space in enumerate(spaces.values()):
         space.seed(k)
+    return spaces
+
+
+def played(copy: Copy, space: Mapping[Any, Any], seed: int, steps: int) -> Mapping[Any, Any]:
+    """Start a copy and take some random steps, up to the end of the episode; return what agents see."""
+    seen = copy.start(seed)[0]
+    for _ in range(steps):
+        action = {name: one.sample() for name, one in space.items()}
+        following, _, *flags, _ = foreign.parts(copy.env.step(action), "step")
+        if any(map(any, foreign.ends(copy.env, copy.agents, *flags))):
+            return copy.start(seed)[0]
+        seen = following
+    return seen
+
+
+def _takes_effect(copy: Copy) -> bool:
+    """Return whether much the same follows a state and an action, whatever the reset before drew."""
+    spaces = seeded_spaces(copy)
     reached: list[list[Array]] = []
     for k in range(_TRIED):
-        copy.start(k)
-        for _ in range(k % 3):
-            copy.env.step({name: space.sample() for name, space in spaces.items()})
+        played(copy, spaces, k, k % 3)
         state, action = copy.take(), {name: space.sample() for name, space in spaces.items()}
         reached.append([])
         for twin in (2, 3):
