@@ -82,7 +82,7 @@ def looked_at(package: str, name: str, given: Callable[[], tuple[str, Any]], tex
         report = check_symmetry(worlds, texts)
     except (ImportError, ValueError) as error:
         return row | {"not run": f"{error}", "command": COMMANDS.get(package, "")}
-    row |= {"found": report.found, "method": report.method, "elements": len(report.elements)}
+    row |= {"further out": True, "found": report.found, "method": report.method, "elements": len(report.elements)}
     for element in report.elements:
         fields = [
             {
@@ -111,7 +111,7 @@ def page(rows: list[dict[str, Any]]) -> str:
 
 
 def _is_further_out(found: list[dict[str, Any]] | str) -> bool:
-    return not isinstance(found, str) and any(field["gap"] > 0 for field in found)
+    return not isinstance(found, str) and any(field["share"] for field in found)
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -126,7 +126,8 @@ def _line(row: dict[str, Any]) -> str:
     far = {name: unseen.pop(name) for name, found in list(unseen.items()) if _is_further_out(found)}
     for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
         told += [f"{why}: {', '.join(names[:4])}" + (" and more" if len(names) > 4 else "")] if names else []
-    return f"| {row['package']} {row['task']} | `{row['found']}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
+    name = f"{row['package']} {row['task']}" + ("" if row.get("further out") else " *")
+    return f"| {name} | `{row['found']}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
 
 
 def main() -> None:
