@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     from pydantic import ValidationError
 
 _HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+_OTHER_NAMES = {
+    "--seed": "--seeds 3 takes the seeds 0 to 2, --seed-list 7 that seed",
+    "--num-envs": "write --set mappo.num_envs=64",
+    "--wandb": "write --track wandb; it stays offline unless WANDB_MODE=online",
+}
+"""Options of other programs -> what is written here."""
 EXIT_MACHINE, EXIT_USER, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -107,6 +113,8 @@ def report(failure: Exception) -> int | None:
     if isinstance(failure, typer.TyperException):
         message, context = failures.own_words(failure.format_message()), getattr(failure, "ctx", None)
         if message:  # empty where no argument was given at all: typer has shown the help already
+            hint = _OTHER_NAMES.get(getattr(failure, "option_name", ""))
+            message = f"{message.split(' (')[0]}; {hint}" if hint else message
             console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
         return failure.exit_code
     if isinstance(failure, typer.Abort):

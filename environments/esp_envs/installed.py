@@ -24,6 +24,7 @@ from esp_envs.errors import UserError
 T = TypeVar("T")
 _FOREIGN: set[str] = set()  # top-level modules of the classes that are registered or installed
 
+_ELSEWHERE = {"simple_spread": "navigation", "simple_tag": "predator-prey"}  # names of tasks in MPE
 _MODULE_AND_CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
@@ -86,7 +87,8 @@ class Registry(Mapping[str, type[T]]):
             raise UserError(
                 f"the {self.noun} '{name}' is not installed; add {self.option} {name} to let esp import and run it"
             )
-        near = get_close_matches(name.lower(), self, n=1)
+        other = _ELSEWHERE.get(name.lower())
+        near = [other] if other in self else get_close_matches(name.lower(), self, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"the {self.noun}s are {', '.join(self)}"
         raise UserError(f"unknown {self.noun} '{name[:80]}'; {hint}; name your own as module:Class")
 

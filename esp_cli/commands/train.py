@@ -108,6 +108,8 @@ def train(
         _train(runs.Run(resume), trackers, not no_check)
         return
     require(trackers)
+    if prior == "none" and transforms is not None:
+        raise UserError("--prior none uses no symmetry; leave out --transforms, or --prior none")
     short = {
         "prior.kind": prior,
         "prior.transforms": transforms,

@@ -80,7 +80,7 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "idle"),
     [
-        (["--prior", "none", "--transforms", "c4"], "prior.transforms"),
+        (["--prior", "none", "--set", "prior.transforms=c4"], "prior.transforms"),
         (["--set", 'prior.weights={"rot90":0.5}', "--set", "prior.doubt=2"], "prior.doubt, prior.weights"),
         (["--prior", "consistency", "--consistency-coef", "0", "--transforms", "c4"], "prior.transforms"),
         (["--network", "equivariant", "--set", "network.relaxation=weights"], "network.relaxation"),
@@ -100,6 +100,18 @@ def test_a_setting_that_changes_nothing_beside_the_others_is_named(tmp_path: Pat
     assert ("without effect" in told) == (idle is not None)
     assert idle is None or f"without effect beside the other settings: {idle}\n" in told
     assert ("broken" in told) == ("prior.trust=measured" in options)
+
+
+def test_transforms_without_a_prior_and_options_of_other_programs_are_answered() -> None:
+    assert "--prior none uses no symmetry" in refused("train", "--prior", "none", "--transforms", "c4")
+    for option, told in {
+        "--seed": "--seed-list 7",
+        "--num-envs": "mappo.num_envs=64",
+        "--wandb": "--track wandb",
+    }.items():
+        assert f"No such option: {option}; " in (message := refused("train", option, "3"))
+        assert told in message
+    assert "did you mean 'navigation'?" in refused("train", "--task", "simple_spread")
 
 
 def test_a_setting_of_a_small_file_that_changes_nothing_is_named_and_of_a_whole_one_is_not(tmp_path: Path) -> None:
