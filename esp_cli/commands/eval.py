@@ -47,17 +47,31 @@ def evaluate(
 
 
 def _print(result: FinalEvaluation, policy: str) -> None:
-    rows = []
+    rows, by_hand = [], [value for key, value in result.anchors.items() if key != "random"]
+    low, high = result.anchors.get("random", math.nan), max(by_hand, default=math.nan)
+
+    def score(value: float | None) -> str:
+        return f"{(value - low) / (high - low):.2f}" if value is not None and high > low else "-"
+
     for mode in ("greedy", "stochastic"):
         returns = result.returns(mode)
         error = result.over_episodes.get(mode, returns)  # of one seed that stopped there is neither
-        rows.append((mode, console.format_mean(returns.mean, error.sem), console.format_interval(error.ci95)))
+        rows.append(
+            (
+                mode,
+                console.format_mean(returns.mean, error.sem),
+                console.format_interval(error.ci95),
+                score(returns.mean),
+            )
+        )
     first = "".join(result.heuristics[:1])
     names = {"random": "random", "heuristic": f"heuristic {first}"}
     names = {key: names.get(key, f"heuristic {key}") for key in result.anchors}
     for key, value in result.anchors.items():
         error = result.over_episodes[key]
-        rows.append((names[key], console.format_mean(value, error.sem), console.format_interval(error.ci95)))
+        rows.append(
+            (names[key], console.format_mean(value, error.sem), console.format_interval(error.ci95), score(value))
+        )
     title = (
         f"{policy} on {result.task} version {result.task_version} after {console.format_count(result.step)} steps, "
         f"{len(result.seeds)} seed(s) x {result.episodes} episodes"
@@ -68,7 +82,8 @@ def _print(result: FinalEvaluation, policy: str) -> None:
         else "over seeds, of reference policies over episodes"
     )
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
-    console.table(("policy", "episode return>", "95 % interval>"), rows, title=title, caption=caption)
+    caption += "; normalised: 0 random, 1 the best heuristic"
+    console.table(("policy", "episode return>", "95 % interval>", "normalised>"), rows, title=title, caption=caption)
     metrics = [
         (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key].get(metric, math.nan):.4f}" for key in names))
         for metric, value in result.metrics.items()

@@ -56,7 +56,9 @@ def test_one_seed_has_no_error_over_seeds_and_states_that_over_episodes(tmp_path
     assert low < result["greedy"]["mean"] < high
     cells = [cell.strip() for cell in row.strip("│").split("│")]
     shown = f"{result['greedy']['mean']:.2f} ± {spread['greedy']['sem']:.2f}"
-    assert cells == ["greedy", shown, f"[{low:.2f}, {high:.2f}]"]
+    random, best = (result["anchors"]["random"], max(v for k, v in result["anchors"].items() if k != "random"))
+    score = (result["greedy"]["mean"] - random) / (best - random)
+    assert cells == ["greedy", shown, f"[{low:.2f}, {high:.2f}]", f"{score:.2f}"]
     assert "95 % interval over 8 episodes of one seed" in told
 
 
@@ -67,8 +69,8 @@ def test_one_seed_that_stopped_has_no_return(monkeypatch: pytest.MonkeyPatch) ->
     assert told.exit_code == 0
     rows = [[cell.strip() for cell in line.strip("│").split("│")] for line in told.stdout.splitlines()]
     assert [row for row in rows if row[0] in ("greedy", "stochastic")] == [
-        ["greedy", "-", "-"],
-        ["stochastic", "-", "-"],
+        ["greedy", "-", "-", "-"],
+        ["stochastic", "-", "-", "-"],
     ]
     assert "heuristic greedy" in told.stdout
     assert "metric" not in told.stdout
