@@ -43,6 +43,7 @@ def fork(job: Callable[[], None], path: Path, log: Path | None = None, errors: P
             os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666), number)
         sys.stdout, sys.stderr = (os.fdopen(fd, "w", 1, closefd=False) for fd in (1, 2))  # pytest has its own
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # this process may be under nohup
         try:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             job()

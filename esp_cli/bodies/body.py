@@ -16,7 +16,7 @@ from esp_cli.bodies.deriving import Match, derive
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.parts import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY, Proof, prove
-from esp_cli.bodies.reading import MOST_DOFS, printable, read_model
+from esp_cli.bodies.reading import MOST_PARTS, printable, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
@@ -118,8 +118,11 @@ class Body:
 
     @classmethod
     def _from_model(cls, model: Any, tolerated: float) -> Body:
-        if not 0 < model.nv <= MOST_DOFS:
-            raise UserError(f"the model has {model.nv} degrees of freedom; give one robot, of 1 to {MOST_DOFS}")
+        if not model.nv or max(model.nv, model.nu, model.nbody) > MOST_PARTS:
+            raise UserError(
+                f"the model has {model.nv} degrees of freedom, {model.nu} actuators and {model.nbody} bodies; give one "
+                f"robot, with at least one degree of freedom and at most {MOST_PARTS} of each"
+            )
         self, frame = cls([], {}), Frame(model)
         idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot
         found: dict[PlaneElement, Found] = {}

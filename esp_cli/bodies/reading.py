@@ -15,8 +15,8 @@ from esp_envs.errors import UserError
 
 XML_MIB, ASSET_MIB = 16, 256
 """Largest size of an XML file, and of a mesh or picture."""
-MOST_ELEMENTS, MOST_DEPTH, MOST_DOFS = 50_000, 100, 1000
-"""Most elements of a model after replication, how deep they nest, and most degrees of freedom."""
+MOST_ELEMENTS, MOST_DEPTH, MOST_PARTS = 50_000, 100, 1000
+"""Most elements of a model after replication, how deep they nest; most degrees of freedom, actuators and bodies."""
 _LIMITS = dict.fromkeys(("nrow", "ncol", "width", "height", "nuser", "nkey"), 65_536)
 _LIMITS |= dict.fromkeys(("njmax", "nconmax", "nstack"), 10**7) | {"memory": 2**30}
 """Largest numbers that ask MuJoCo for memory, by how their attributes begin."""
@@ -126,18 +126,20 @@ def _files(main: Path, name: str, folders: set[Path], allowed: Path) -> list[Pat
     """Return the files that a name may stand for; MuJoCo may also take the last part of it alone.
 
     Raises:
-        UserError: one lies outside the folder that may be read.
+        UserError: one lies outside the folder that may be read, or is no regular file.
     """
     name = name.removeprefix("package://").replace("\\", "/")
     if len(name) > 1000 or "\0" in name:
         raise UserError(f"{main} names the file {printable(name[:40])}...; give a shorter name")
     names = {name, PurePosixPath(name).name} - {""}
-    found = [path for path in (folder / one for folder in folders for one in names) if path.is_file()]
+    found = [path for path in (folder / one for folder in folders for one in names) if path.exists()]
     if any(not path.resolve().is_relative_to(allowed) for path in found):
         raise UserError(
             f"{main} names the file {printable(name)}, which lies outside {allowed}; name the folder that holds "
             "all its files as root (--root)"
         )
+    if odd := next((path for path in found if not path.is_file()), None):
+        raise UserError(f"{main} names the file {printable(name)}, but {printable(str(odd))} is no regular file")
     return found
 
 

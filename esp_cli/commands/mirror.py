@@ -70,6 +70,8 @@ def mirror(
 
     if (emit is None) != (out is None):
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
+    if numbers is not None and emit is None and check is None and policy is None:
+        raise UserError("--numbers is for --emit, --check and --policy; give one of them, or leave --numbers out")
     if out is not None and not force and (taken := [path for path in (out, _proof_of(out)) if path.exists()]):
         raise UserError(f"{taken[0]} exists; choose another path, or add --force")
     if rows is not None and policy is None:

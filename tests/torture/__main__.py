@@ -1,6 +1,6 @@
-"""An assault on the application that never ends by itself: kills, spoilt files and wrong command lines.
+"""An assault on the application that never ends by itself: kills, spoilt files, wrong command lines, hostile robots.
 
-    python -m tests.torture --minutes 10 [--seed 0] [--part kills|files|lines] [--record FILE]
+    python -m tests.torture --minutes 10 [--seed 0] [--part kills|files|lines|models] [--record FILE]
 
 Every case follows from the seed and its number alone, so that a finding is repeated by `--only NUMBER`. The record is a
 JSON file; the next call with the same file goes on where this one ended. The exit code is 1 if there are findings.
@@ -21,11 +21,11 @@ from pathlib import Path
 
 import torch
 
-from tests.torture import files, kills, lines
+from tests.torture import files, kills, lines, models
 from tests.torture.record import Record
 
-PARTS = {"files": files.Files, "kills": kills.Kills, "lines": lines.Lines}
-SHARES = {"kills": 0.6, "files": 0.25, "lines": 0.15}
+PARTS = {"files": files.Files, "kills": kills.Kills, "lines": lines.Lines, "models": models.Models}
+SHARES = {"kills": 0.55, "files": 0.2, "lines": 0.15, "models": 0.1}
 """Of the time; a kill takes longest."""
 
 

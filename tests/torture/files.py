@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import functools
 import json
 import random
 import resource
@@ -20,20 +21,26 @@ from typer.testing import CliRunner
 from esp_cli.app import app
 from esp_cli.checking import collect
 from esp_cli.checking.logs import read_transitions
+from esp_cli.export.export import _refuse_mixture
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.policies.loading import TrainedPolicy
+from esp_cli.reporting.results import read_results
 from esp_cli.reporting.tuning_page import budget_table
 from esp_cli.studies.catalogue import plan
 from esp_cli.studies.search import Search
 from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
+from esp_cli.studies.tuning import TUNING_FORMAT, Tuning
+from esp_cli.studies.tuning_space import read_space
+from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import parse_config
+from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.metrics import MetricsError, column, read_last_row, read_metrics
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
 from esp_cli.training.trainer import Trainer
 from esp_envs.registry import make
+from esp_envs.spec import TaskSpec
 from tests.studies.small_studies import request
 from tests.studies.test_tuner import search
 from tests.studies.test_tuning import tuning
@@ -47,6 +54,8 @@ COMMAND_SHARE = 1 / 2000
 FORGED_SHARE = 1 / 100
 """Of policies and checkpoints whose checksum is right: for them networks are built, which takes milliseconds."""
 RUN, STUDY = "run", "study"
+ORDERS = {"task": "navigation", "prior": {"kind": "esp", "transforms": "d4*agents-1-0-2,landmarks-1-0-2"}}
+SPACE = b"mappo.num_epochs = [5, 10]\n[mappo.learning_rate]\nlow = 1e-4\nhigh = 0.01\nlog = true\n"
 TUNING = tuning(priors=("none",), budget=2, steps=300)
 
 
@@ -130,7 +139,7 @@ class Files:
     def _load_originals(self) -> dict[str, Any]:
         return {
             name: load_checkpoint(self.scratch / KINDS[name].path, _format(name))
-            for name in ("policy", "checkpoint", "prey")
+            for name in ("policy", "checkpoint", "prey", "crowd")
         }
 
     def _forge(self, name: str, path: Path, rng: random.Random) -> None:
@@ -185,6 +194,14 @@ def _make_sound_files(scratch: Path) -> None:
     arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
     np.savez(scratch / "transitions.npz", **arrays)
     search(scratch / "tuning", TUNING)
+    many = {"task.num_agents": 12, "task.sees": 3, "task.density": 8.0, "network.name": "set", "network.width": 8}
+    crowd = tiny_folder(scratch / "crowd", steps=100, **{name.replace(".", "__"): x for name, x in many.items()})
+    with crowd.lock():
+        Trainer(parse_config(crowd.config, crowd.path), crowd).run(lambda news: True)
+    _run_command(["export", str(folder.path), "-f", "numpy", "-o", str(scratch / "export"), "--seed", "0"])
+    _run_command(["report", str(study.path), "-o", str(scratch / "page")])
+    (scratch / "orders.json").write_text(json.dumps(ORDERS))
+    (scratch / "space.toml").write_bytes(SPACE)
     (scratch / "bundled").mkdir()
     manifest = json.loads((bundled_folder() / MANIFEST).read_text())
     manifest["policies"] = manifest["policies"][:2]  # the others are alike
@@ -283,8 +300,34 @@ def _prey(path: Path) -> None:
     make("predator-prey", 1, [0], {"prey": "policy", "prey_policy": str(path)})
 
 
+@functools.cache
+def _spec() -> TaskSpec:
+    return make("navigation", 1, [0]).spec
+
+
 def _transitions(path: Path) -> None:
-    read_transitions(path, make("navigation", 1, [0]).spec)
+    read_transitions(path, _spec())
+
+
+def _orders(path: Path) -> None:
+    config = resolve_config("navigation", overrides=read_config_file(path).settings)
+    admitted_elements(config.prior.transforms, _spec())
+
+
+def _space(path: Path) -> None:
+    read_space(path)
+
+
+def _results(path: Path) -> None:
+    read_results(path)
+
+
+def _export(path: Path) -> None:
+    _refuse_mixture(["numpy"], path.parent)
+
+
+def _tuning(path: Path) -> str | None:
+    return _document(TUNING_FORMAT, path, TUNING_FORMAT.parse(path, Tuning).model_dump(mode="json"))
 
 
 def _journal(path: Path) -> None:
@@ -308,6 +351,12 @@ _ALL = (
     ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
     ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
     ("tuning/journal.jsonl", _journal, "report {scratch}/tuning", spoil_json),
+    ("tuning/tuning.json", _tuning, "report {scratch}/tuning", spoil_json),
+    ("crowd/policy.safetensors", _policy, "eval {scratch}/crowd -e 2", spoil_header),
+    ("orders.json", _orders, "train --config {scratch}/orders.json --print-config", spoil_json),
+    ("space.toml", _space, "tune --space {scratch}/space.toml --out {scratch}/never --budget 1 --dry-run", spoil_bytes),
+    ("page/results.json", _results, "report {scratch}/study -o {scratch}/page", spoil_json),
+    ("export/policy.json", _export, "export {scratch}/run -f c -o {scratch}/export --force --seed 0", spoil_json),
 )
 _NAMES = (
     "policy",
@@ -320,6 +369,12 @@ _NAMES = (
     "prey",
     "transitions",
     "journal",
+    "tuning",
+    "crowd",
+    "orders",
+    "space",
+    "results",
+    "description",
 )
 KINDS = {
     name: Kind(path, load, tuple(command.split()), spoil)

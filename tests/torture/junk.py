@@ -11,7 +11,8 @@ from typing import Any
 JUNK: tuple[Any, ...] = (
     None, True, False, 0, -1, 1, 2, 7, 10**9, 2**53, 2**63, 10**30, -(10**30), 0.5, -0.0, 1e308, -1e308, 1e-320,
     "", " ", "x", "x" * 5000, "../../x", "/etc/passwd", "a\nb", "\u0000", "\ud800", "é", "NaN", "1", "true", "[]",
-    "|`$(x)", [], {}, [[]], [None], [1, 2], [1.5] * 50, {"a": 1}, {"format": "x"}, [[[[[[[[[[]]]]]]]]]],
+    "|`$(x)", "c0", "d99999*agents", "rot1e9", "agents-1-0-2", "agents-0-0", "landmarks-2-0-1", "*", "discovered:x",
+    [], {}, [[]], [None], [1, 2], [1.5] * 50, {"a": 1}, {"format": "x"}, [[[[[[[[[[]]]]]]]]]],
 )  # fmt: skip
 TEXTS = (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"null", b"true", b"[" * 200_000, b'{"a":' * 5000, b"\xff\xfe")
 

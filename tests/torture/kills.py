@@ -19,7 +19,7 @@ from tests.torture.disks import WHY_NOT, can_mount, start_on_full_disk, start_on
 from tests.torture.runs import all_configs, newest_step, run_job, run_state
 from tests.torture.studies import forked_study, kill_some, real_study, study_state
 
-SIGNALS = ("KILL", "KILL", "TERM", "INT")
+SIGNALS = ("KILL", "KILL", "TERM", "INT", "HUP")
 ERRORS = ("ENOSPC", "EROFS", "EIO", "EDQUOT")
 SIZES = (0, 1000, 10_000, 50_000)
 KINDS = ("moment", "moment", "place", "place", "place", "error", "limit", "full", "read-only", "two", "all", "clock")
@@ -52,7 +52,7 @@ class Kills:
             print(f"{WHY_NOT}; the size of files is limited instead", flush=True)
 
     def count(self) -> int:
-        """Return the interruptions since the last call."""
+        """Return the interruptions since the last call that took effect: a process did not end with exit code 0."""
         done, self._kills = self._kills, 0
         return done
 
@@ -80,7 +80,7 @@ class Kills:
         for _ in range(rng.randint(1, MAX_INTERRUPTIONS)):
             disturb = kill_some if study and rng.random() < 0.5 else interrupt
             how, code = disturb(rng, job, path, reference.seconds)
-            self._kills += 1
+            self._kills += code != 0
             history.append(f"{how} -> {code}")
             step = newest_step(path)
             wrong_code = how.split()[-1] in FAULTS_OF_THE_DISK and code not in (0, 1)

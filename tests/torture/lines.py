@@ -23,6 +23,7 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 from esp_envs.registry import task_class, task_names
+from tests.bodies.models import biped
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
 
 BATCH = 10
@@ -53,6 +54,10 @@ class Lines:
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "lines", seed
         self.scratch.mkdir()
+        robot = scratch / "robot.xml"
+        robot.write_text(biped())
+        self.arguments = {"check": {"task": "navigation"}, "mirror": {"model": str(robot)}}
+        """Good ones, by command and name."""
         self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
         self.settings = dict(_settings())
         self._runner, self._done = CliRunner(), 0
@@ -103,6 +108,8 @@ class Lines:
         for argument in command.params:
             if argument.param_type_name == "argument":
                 sound = typing.get_args(argument.type_descriptor.annotation) or ("nowhere", "no/such/place", "x" * 300)
+                if (good := self.arguments.get(name, {}).get(argument.name)) and rng.random() < 0.7:
+                    sound = (good,)
                 words += ["nowhere" if isinstance(sound[0], type) else rng.choice(("nowhere", *sound))]
         words += _NEEDED.get(name, [])
         choice = rng.random()
@@ -186,6 +193,8 @@ _NAMES = (
     "methods",
     "formats",
     "reference",
+    "numbers",
+    "check",
 )
 _NUMBERS: dict[str, tuple[str, ...]] = {
     "steps": ("0", "-1", "1e30", "x", "1.5", "nan", "1kk", "500x", "9" * 300),

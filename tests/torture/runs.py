@@ -34,6 +34,7 @@ def all_configs() -> dict[str, RunConfig]:
             settings |= {f"{algorithm}.warmup_episodes": 2, f"{algorithm}.replay_episodes": 64}
             settings |= {f"{algorithm}.batch_episodes": 2}
         settings |= {f"task.{name}": value for name, value in chosen.items()}
+        settings |= {"network.width": 8} if network.startswith("set") else {}
         try:
             config = resolve_config(task, algorithm, steps=60, seeds=(0, 1), overrides=settings)
             trainer.build_learner(config)
@@ -53,6 +54,9 @@ def _choices() -> Iterator[Choice]:
                 if task == "formation":
                     for physics in ("mujoco", "mujoco-3d", "pymunk"):
                         yield algorithm, network, task, {**actions, "physics": physics}
+    for algorithm, network in itertools.product(("mappo", "maddpg", "qmix"), ("set", "set-equivariant")):
+        yield algorithm, network, "navigation", {}
+        yield algorithm, network, "navigation", {"num_agents": 20, "sees": 3, "density": 8.0}
     for network in ("mpn", "empn", "equivariant"):
         yield "mappo", network, "navigation", {}
     if find_spec("gymnasium"):

@@ -51,7 +51,7 @@ def real_study(path: Path) -> None:
 
 def kill_some(rng: random.Random, job: Job, path: Path, seconds: float) -> tuple[str, int]:
     """Start a study and kill a part of it at a random moment; return how, and the exit code of its scheduler."""
-    target, name = rng.choice(TARGETS), rng.choice(("KILL", "KILL", "TERM", "INT"))
+    target, name = rng.choice(TARGETS), rng.choice(("KILL", "KILL", "TERM", "INT", "HUP"))
     end = time.monotonic() + rng.uniform(0, seconds * 1.2)
     return f"{target} {name}", kill_members(job, path, target, name, lambda members: time.monotonic() > end)
 

@@ -48,7 +48,7 @@ def kills(tmp_path_factory):
 def test_runs_that_were_killed_end_as_runs_that_were_not(kills, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert [kills.run(number) for number in range(4)] == [None] * 4
-    assert kills.count() >= 4
+    assert kills.count() > 0
 
 
 @pytest.mark.slow
