@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import reduce
 from operator import matmul
 
+from esp_cli.files.documents import shortened
 from esp_cli.symmetry.elements import AGENTS, Element, Geometry, order_name
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,
@@ -48,10 +49,11 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
     if len(listed) < len(items):
         if len(items) == 1 and isinstance(items[0], Group):
             return items[0]
-        raise UserError(f"transforms '{text}' list a group that is sampled; let so2, o2 or a large group stand alone")
+        said = f"transforms '{shortened(text)}' list a group that is sampled"
+        raise UserError(f"{said}; let so2, o2 or a large group stand alone")
     unique = tuple(dict.fromkeys(e for item in listed for e in item if not e.is_identity))
     if not unique:
-        raise UserError(f"transforms '{text}' hold only the identity; name one that moves something")
+        raise UserError(f"transforms '{shortened(text)}' hold only the identity; name one that moves something")
     return unique
 
 
@@ -73,7 +75,8 @@ def declared_factors(text: str, num_agents: int) -> list[Group]:
     if are_independent(groups):
         return sorted(groups, key=rank)
     if not all(isinstance(group, FiniteGroup) for group in groups):
-        raise UserError(f"'{text}' generates no group that can be listed; let so2, o2 or many agents act on their own")
+        said = f"'{shortened(text)}' generates no group that can be listed"
+        raise UserError(f"{said}; let so2, o2 or many agents act on their own")
     return [FiniteGroup.generated_by(text, [g for group in groups for g in group.generators()])]
 
 
@@ -119,15 +122,17 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
             group = direct_product(*sorted(groups, key=rank))
             return group.elements if isinstance(group, FiniteGroup) else group
         if ordered:
-            raise UserError(f"'{part}' is not a direct product; write each thing that moves once, as in d4*agents")
+            said = f"'{shortened(part)}' is not a direct product"
+            raise UserError(f"{said}; write each thing that moves once, as in d4*agents")
     lists = []
     for factor in factors:
         if isinstance(factor, Group) and not isinstance(factor, FiniteGroup):
-            raise UserError(f"'{part}' multiplies a sampled group; write a planar group times agents, as in o2*agents")
+            said = f"'{shortened(part)}' multiplies a sampled group"
+            raise UserError(f"{said}; write a planar group times agents, as in o2*agents")
         lists.append(factor.elements if isinstance(factor, FiniteGroup) else (factor,))
     size = math.prod(map(len, lists))
     if size > LISTED_LIMIT:
-        raise UserError(f"'{part}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
+        raise UserError(f"'{shortened(part)}' has {size} products, more than {LISTED_LIMIT}; use fewer factors")
     return reduce(lambda a, b: tuple(g @ h for g in a for h in b), lists)
 
 
@@ -136,8 +141,8 @@ def _factor(word: str, text: str, num_agents: int) -> Element | Group:
     found = _read_word(word.lower(), num_agents)
     found = _read_items(word) if found is None else found
     if found is None:
-        where = f" in '{text}'" if word != text else ""
-        raise UserError(f"unknown transform '{word}'{where}; write for example {_KNOWN}")
+        where = f" in '{shortened(text)}'" if word != text else ""
+        raise UserError(f"unknown transform '{shortened(word)}'{where}; write for example {_KNOWN}")
     return found
 
 
@@ -178,5 +183,6 @@ def _order(word: str, count: int) -> tuple[int, ...]:
     places = tuple(map(int, numbers))
     if sorted(places) != list(range(count)):
         example = order_name(name, swap_and_round(count)[1])
-        raise UserError(f"'{word}' is not an order of {count} {name}; write each place once, as in {example}")
+        said = f"'{shortened(word)}' is not an order of {count} {name}"
+        raise UserError(f"{said}; write each place once, as in {example}")
     return places

@@ -14,7 +14,7 @@ from pydantic_core import to_jsonable_python
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, parse_value, validated
+from esp_cli.files.documents import Strict, parse_value, shortened, validated
 from esp_cli.files.formatting import nearest
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -210,7 +210,7 @@ def _no_section(dotted: str, task: str, algorithm: str) -> str:
     homes = {name: section for section, model in reversed(models.items()) for name in model.model_fields}
     name = nearest(dotted.rpartition(".")[2], homes)
     hint = f"; did you mean '{homes[name]}.{name}'?" if name else ""
-    return f"cannot set '{dotted}': a setting is SECTION.NAME with a section of {', '.join(models)}{hint}"
+    return f"cannot set '{shortened(dotted)}': a setting is SECTION.NAME with a section of {', '.join(models)}{hint}"
 
 
 def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import flat, one_sentence, read_table, validate
+from esp_cli.files.documents import flat, one_sentence, read_table, shortened, validate
 from esp_cli.files.formatting import did_you_mean
 from esp_cli.training.config import SECTIONS, RunConfig, completed
 from esp_cli.training.run_folder import RunFolder, read_run_config
@@ -49,11 +49,11 @@ def read_config_file(path: Path) -> ConfigFile:
             # TOML cannot hold the name of the task and a table of its settings under one key
             setting = name.replace("task_settings.", "task.", 1)
             if setting in settings:
-                raise UserError(f"{path} sets '{setting}' twice; leave one of them out")
+                raise UserError(f"{path} sets '{shortened(setting)}' twice; leave one of them out")
             settings[setting] = value
         else:
             hint = did_you_mean(name, CHOICES) or f"; write one of {', '.join(CHOICES)}, or a setting as SECTION.NAME"
-            raise UserError(f"{path} sets '{name}', which is not a choice of a run{hint}")
+            raise UserError(f"{path} sets '{shortened(name)}', which is not a choice of a run{hint}")
     return ConfigFile(path, choices, settings)
 
 

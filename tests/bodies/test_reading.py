@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from esp_cli.bodies import Body, read_model
@@ -48,6 +50,9 @@ def sentence(path, **choice) -> str:
         ('<mujoco><compiler meshdir=".."/><asset><mesh file="secret.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><asset><mesh file="link.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><include file="inner/more.xml"/></mujoco>', "outside"),
+        ('<mujoco><include file="pipe"/></mujoco>', "no regular file"),
+        ('<mujoco><asset><mesh file="pipe"/></asset></mujoco>', "no regular file"),
+        ('<mujoco><asset><texture file="../pipe"/></asset></mujoco>', "outside"),
         ('<mujoco><asset><mesh file="missing.stl"/></asset></mujoco>', "cannot read"),
         ('<mujoco><worldbody><body><joint/></body></worldbody></mujoco>', "mass and inertia"),
         ('<mujoco><worldbody><body name="&#10;\'*/"><joint type="a&#10;b"/></body></worldbody></mujoco>', "keyword"),
@@ -58,6 +63,8 @@ def test_bad_files_end_in_one_sentence(tmp_path, text, words):
     (folder / "inner").mkdir(parents=True)
     (tmp_path / "secret.xml").write_text(BOX)
     (folder / "link.xml").symlink_to(tmp_path / "secret.xml")
+    for pipe in (folder / "pipe", tmp_path / "pipe"):
+        os.mkfifo(pipe)
     (folder / "inner" / "more.xml").write_text('<mujocoinclude><include file="../../secret.xml"/></mujocoinclude>')
     path = folder / "robot.xml"
     path.write_text(text)
@@ -81,6 +88,16 @@ def test_missing_and_huge_files_are_refused(tmp_path):
         mesh.truncate(300 * 2**20)
     (tmp_path / "mesh.xml").write_text('<mujoco><asset><mesh file="huge.stl"/></asset></mujoco>')
     assert "has 300 MiB" in sentence(tmp_path / "mesh.xml")
+
+
+def test_models_of_thousands_of_parts_are_refused(tmp_path):
+    path = tmp_path / "many.xml"
+    for many in (
+        biped(extra="<body/>" * 1000),
+        biped().replace("</actuator>", '<motor joint="waist"/>' * 1000 + "</actuator>"),
+    ):
+        path.write_text(many)
+        assert "at most 1000 of each" in refused("mirror", path)
 
 
 def test_a_urdf_moves_freely_and_keeps_its_mimic_joint(tmp_path):

@@ -61,7 +61,7 @@ class Lines:
         self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
         self.settings = dict(_settings())
         self._runner, self._done = CliRunner(), 0
-        train._train = lambda run, trackers: None  # a run that can begin is not a wrong line
+        train._train = lambda *_: None  # a run that can begin is not a wrong line
 
     def count(self) -> int:
         """Return the command lines since the last call."""
@@ -150,8 +150,9 @@ def _settings() -> Iterator[tuple[str, type[BaseModel]]]:
 def _bad_setting(model: type[BaseModel], name: str, rng: random.Random) -> str:
     """Return a value that a setting cannot have."""
     annotation = model.model_fields[name].annotation if name in model.model_fields else str
-    kinds = set(typing.get_args(annotation)) or {annotation}
-    values = [value for value in VALUES if not (value == "null" and NoneType in kinds)]
+    kinds = {annotation, *typing.get_args(annotation)}
+    sound = {"null"} if NoneType in kinds else {"{}"} if typing.get_origin(annotation) is dict else set()
+    values = [value for value in VALUES if value not in sound]
     if bool in kinds:
         values += ["2", "-1", "0.5"]
     elif int in kinds or float in kinds:
@@ -201,6 +202,7 @@ _NUMBERS: dict[str, tuple[str, ...]] = {
     "at": ("0", "-1", "1e30", "x", "1.5", "nan", "1kk", "500x", "9" * 300),
     "seeds": ("0", "-1", "x", "1,1", "5000", "1.5", "9" * 300, ",", "1,,2"),
     "seed_list": ("-1", "x", "1,1", "1.5", "9" * 300, ",", "1,,2"),
+    "seconds": ("x", "nan", "-1", "true", "[1]", "1,5", "é"),
     "speed": ("0", "nan", "x", "-1", "1e9", "xx"),
     "settings": ("x", "=1", "task.x=1", "mappo=1", "x.y=2", ".=1", "task.=1"),
 }

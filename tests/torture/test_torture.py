@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from esp_cli.bodies import emitting, reading
 from esp_cli.files import writing
 from esp_cli.training import trainer
 from tests.forks import fork, wait
 from tests.torture.files import KINDS, Files
 from tests.torture.kills import Kills
 from tests.torture.lines import Lines
+from tests.torture.models import Models
 from tests.torture.record import Record
 from tests.torture.studies import forked_study, kill_members, real_study, study_state
 
@@ -37,6 +39,27 @@ def test_wrong_command_lines_end_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr("esp_cli.commands.train._train", None)  # put back after the test
     lines = Lines(tmp_path, 1)
     assert [lines.run(number) for number in range(10)] == [None] * 10
+
+
+@pytest.fixture
+def models(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return Models(tmp_path, 1)
+
+
+def test_models_of_strangers_read_write_and_run_nothing_that_was_not_named(models):
+    assert [models.run(number) for number in range(4)] == [None] * 4
+    assert models.count() == 20
+
+
+def test_a_name_that_reaches_the_code_unescaped_is_found(models, monkeypatch):
+    monkeypatch.setattr(emitting.pprint, "pformat", lambda value, **_: "'" + str(value) + "'")
+    assert any(models.run(number) for number in range(20))
+
+
+def test_a_file_outside_that_is_opened_is_found(models, monkeypatch):
+    monkeypatch.setattr(reading, "_files", lambda main, name, folders, allowed: [])
+    assert any("outside was opened" in (models.run(number) or "") for number in range(40))
 
 
 @pytest.fixture(scope="module")
