@@ -151,7 +151,7 @@ def _bad_setting(model: type[BaseModel], name: str, rng: random.Random) -> str:
     """Return a value that a setting cannot have."""
     annotation = model.model_fields[name].annotation if name in model.model_fields else str
     kinds = {annotation, *typing.get_args(annotation)}
-    sound = {"null"} if NoneType in kinds else {"{}"} if typing.get_origin(annotation) is dict else set()
+    sound = {"null"} if NoneType in kinds else {"{}", '{"a":1}'} if typing.get_origin(annotation) is dict else set()
     values = [value for value in VALUES if value not in sound]
     if bool in kinds:
         values += ["2", "-1", "0.5"]
