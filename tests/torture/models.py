@@ -17,13 +17,14 @@ import shutil
 import signal
 import sys
 from pathlib import Path
+from types import ModuleType
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import mujoco  # noqa: F401 - before the forks
 
 from esp_cli import app
-from esp_cli.bodies import Body, auditing, emitting, written  # noqa: F401 - before the forks
+from esp_cli.bodies import Body, auditing, emitting, proven, written  # noqa: F401 - before the forks
 from esp_cli.bodies.emitting import HOSTS
 from tests.bodies.models import QUADRUPED, biped, legged
 from tests.bodies.test_reading import URDF
@@ -178,6 +179,7 @@ class Models:
 
     def _try(self, path: Path, rng: random.Random) -> str | None:
         """Run the command, with a file for a loop in most cases, and audit that file; return what is wrong."""
+        proof = self.folder / "test_out.py"
         out, host, told = self.folder / "out.py", rng.choice(list(HOSTS)), rng.random() < 0.3
         numbers = ["--numbers", "told:numbers"] if told else []
         words = ["mirror", path.name, "--json", "-"]
@@ -186,16 +188,17 @@ class Models:
         try:
             code, wrong = self._run(words)
             if wrong is None and out.exists():
-                wrong = _unlike_template(out.read_text())
+                wrong = _unlike_template(out, written) or _unlike_template(proof, proven)
                 if wrong is None and code == 0:
                     _, wrong = self._run(
                         ["mirror", path.name, "--check", "out:compute_symmetric_states", *numbers], (0,)
                     )
-            left = sorted(entry.name for entry in self.folder.iterdir() if entry not in (path, out))
+            left = sorted(entry.name for entry in self.folder.iterdir() if entry not in (path, out, proof))
             if wrong is None and left != self._sound:
                 wrong = f"leaves {set(left) - set(self._sound)}"
         finally:
             out.unlink(missing_ok=True)
+            proof.unlink(missing_ok=True)
         return None if wrong is None else f"{' '.join(words)[:200]!r}: {wrong}"
 
     def _run(self, words: list[str], codes: tuple[int, ...] = (0, 1, 2)) -> tuple[int, str | None]:
@@ -227,17 +230,17 @@ class Models:
         return code, None
 
 
-def _unlike_template(text: str) -> str | None:
+def _unlike_template(file: Path, module: ModuleType) -> str | None:
     """Say how an emitted file differs from its template in anything but literals."""
-    template = ast.parse(Path(written.__file__).read_text()).body
+    template = [ast.dump(node) for node in ast.parse(Path(str(module.__file__)).read_text()).body]
     try:
-        made = ast.parse(text).body
-        data = [node for node in made if isinstance(node, ast.Assign)]
+        made = ast.parse(file.read_text()).body
+        data = [node for node in made if isinstance(node, ast.Assign) and ast.dump(node) not in template]
         for node in data:
             ast.literal_eval(node.value)
     except (SyntaxError, ValueError) as error:
-        return f"the file is no Python with literals: {error}"
+        return f"{file.name} is no Python with literals: {error}"
     rest = [ast.dump(node) for node in made if node not in data]
-    if rest != [ast.dump(node) for node in template if not isinstance(node, ast.Assign)] or len(data) != 7:
-        return "the file has other statements than its template"
+    if not data or rest != [line for line in template if line in rest] or len(template) != len(rest) + 1:
+        return f"{file.name} has other statements than its template"
     return None
