@@ -17,6 +17,7 @@ from esp_cli.bodies.deriving import Match
 from esp_cli.bodies.frame import BALL, FREE, Frame
 from esp_cli.bodies.reading import quiet
 from esp_cli.symmetry.elements import Floats
+from esp_envs.errors import UserError
 
 EXACT, NEARLY = 1e-5, 0.05
 """Largest gap of a mirror that is exact up to rounding, and of one that holds but for a model's small asymmetry."""
@@ -143,7 +144,10 @@ def _accelerations(data: Any, samples: Sequence[Sample], disabled: int) -> Float
     for sample in samples:
         data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
         data.qacc_warmstart[:] = 0
-        mujoco.mj_forward(model, data)
+        try:
+            mujoco.mj_forward(model, data)
+        except mujoco.FatalError as error:  # as where contacts take more memory than the model grants
+            raise UserError(f"MuJoCo cannot compute its accelerations ({str(error).splitlines()[0]})") from None
         found.append(data.qacc.copy())
     model.opt.disableflags = before
     return np.stack(found)

@@ -82,7 +82,8 @@ def _print(result: FinalEvaluation, policy: str) -> None:
         else "over seeds, of reference policies over episodes"
     )
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
-    caption += "; normalised: 0 random, 1 the best heuristic"
+    if result.heuristics:
+        caption += "; normalised: 0 random, 1 the best heuristic"
     console.table(("policy", "episode return>", "95 % interval>", "normalised>"), rows, title=title, caption=caption)
     metrics = [
         (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key].get(metric, math.nan):.4f}" for key in names))

@@ -22,7 +22,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
     _SEARCHED: ("budget", "space", "goal", "reach", "trial_seeds"),
     _PRIOR: ("transforms", "consistency_coef"),
     _SETTINGS: ("settings", "config", "print_config", "init_from"),
-    _RUN: ("resume", "device", "jobs", "dry_run", "reuse", "engine", "address", "gpu_share", "no_check"),
+    _RUN: ("resume", "device", "jobs", "dry_run", "seconds", "reuse", "engine", "address", "gpu_share", "no_check"),
     _POLICY: (
         "task",
         "algo",

@@ -49,7 +49,7 @@ def mirror(
         str | None, typer.Option("--check", help="Audit a mirror that you wrote.", metavar="MODULE:NAME")
     ] = None,
     policy: Annotated[
-        str | None,
+        Path | None,
         typer.Option(
             "--policy", help="Measure how far a policy is from turning with its body.", metavar="FILE|MODULE:NAME"
         ),
@@ -80,13 +80,13 @@ def mirror(
     if emit is not None and out is not None:
         _write(body, model, numbers, emit, out)
     audited = [] if check is None else _audited(check, body, numbers)
-    measured = [] if policy is None else _measured(policy, rows, body, numbers)
+    measured = [] if policy is None else _measured(str(policy), rows, body, numbers)
 
     def show() -> None:
         if check:
             _print_audit(check, audited)
         if policy:
-            _print_turning(policy, measured)
+            _print_turning(str(policy), measured)
         if not check and not policy:
             _print(body, model)
 

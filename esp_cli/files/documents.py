@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from esp_cli.files.failures import attempting, own_words
-from esp_cli.files.formatting import nearest
+from esp_cli.files.formatting import nearest, shortened
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
@@ -230,12 +230,6 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
     message = "it has to be a list, as [64,64]" if first["type"] == "tuple_type" else own_words(first["msg"])
     given = "" if isinstance(first["input"], Mapping) else f" {shortened(repr(first['input']))}"
     return f"bad value{given} for '{name}': {message[0].lower()}{message[1:]}"
-
-
-def shortened(text: str) -> str:
-    """Return a text that fits into a sentence, whatever a file or a command line put into it."""
-    line = next(iter(text.splitlines()), "")
-    return line if len(line) <= 80 else f"{line[:77]}..."
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:

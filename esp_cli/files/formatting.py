@@ -94,3 +94,9 @@ def did_you_mean(text: str, known: Iterable[str]) -> str:
     """Return "; did you mean 'NAME'?", or nothing where no known name is near."""
     name = nearest(text, known)
     return f"; did you mean '{name}'?" if name else ""
+
+
+def shortened(text: str) -> str:
+    """Return a text that fits into a sentence, whatever a file or a command line put into it."""
+    line = next(iter(text.splitlines()), "")
+    return line if len(line) <= 80 else f"{line[:77]}..."

@@ -18,8 +18,7 @@ from torch import Tensor
 from esp_cli.algorithms.learner import Learner, below
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import shortened
-from esp_cli.files.formatting import did_you_mean
+from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.policies import bundled

@@ -25,7 +25,8 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from esp_cli.files.documents import parse_value, shortened
+from esp_cli.files.documents import parse_value
+from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import require_held
 from esp_cli.files.writing import mend_last_line, remove_file, replace_file
 from esp_cli.studies.run_set import Cell, RefusedError, RunSet, StudyError

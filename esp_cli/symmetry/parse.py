@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import reduce
 from operator import matmul
 
-from esp_cli.files.documents import shortened
+from esp_cli.files.formatting import shortened
 from esp_cli.symmetry.elements import AGENTS, Element, Geometry, order_name
 from esp_cli.symmetry.groups import (
     LISTED_LIMIT,

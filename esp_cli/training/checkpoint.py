@@ -26,8 +26,9 @@ from safetensors import torch as safetensors_torch
 from torch import Tensor
 
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import DocumentError, parse_object, shortened
+from esp_cli.files.documents import DocumentError, parse_object
 from esp_cli.files.failures import attempting
+from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.training.config import InitialPolicy, RunConfig

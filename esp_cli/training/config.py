@@ -14,8 +14,8 @@ from pydantic_core import to_jsonable_python
 from esp_cli.algorithms.presets import preset_layers
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, parse_value, shortened, validated
-from esp_cli.files.formatting import nearest
+from esp_cli.files.documents import Strict, parse_value, validated
+from esp_cli.files.formatting import nearest, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ValidationError
 
 from esp_cli.algorithms.registry import ALGORITHMS
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import flat, one_sentence, read_table, shortened, validate
-from esp_cli.files.formatting import did_you_mean
+from esp_cli.files.documents import flat, one_sentence, read_table, validate
+from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.training.config import SECTIONS, RunConfig, completed
 from esp_cli.training.run_folder import RunFolder, read_run_config
 from esp_envs.errors import UserError

@@ -56,7 +56,7 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
     assert "0 runs to do" in esp(*reused, "--dry-run").stdout
     assert not (tmp_path / "copied").exists()
     assert esp(*reused).stderr.count("taking over") == 2
-    report = esp("report", out)
+    report = esp("report", out, "--full")
     assert "stochastic return" in report.stdout, "what this kind of study reports"
     assert (out / "report" / "report.html").exists()
 
