@@ -28,9 +28,9 @@ from esp_cli.files.documents import (
     DocumentFormat,
     Strict,
     parse_object,
-    shortened,
     validate,
 )
+from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import open_own, read_regular, require_held
 from esp_cli.files.writing import remove_file
 from esp_cli.policies.evaluation import FinalEvaluation
