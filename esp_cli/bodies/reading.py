@@ -88,7 +88,8 @@ def _inspected(path: Path, allowed: Path) -> str:
     if tag not in ("mujoco", "robot"):
         raise UserError(f"{path} is neither MJCF nor URDF: its first element is {printable(tag)}")
     folders = {folder for folder, _ in trees}
-    folders |= {path.parent / x for _, tree in trees for c in tree.iter("compiler") for x in c.attrib.values() if x}
+    told = {x for _, tree in trees for c in tree.iter("compiler") for x in c.attrib.values() if x}
+    folders |= {path.parent / _short(path, x) for x in told}
     elements = 0
     for _, tree in trees:
         waiting = [(tree, 1, 1)]
@@ -128,9 +129,7 @@ def _files(main: Path, name: str, folders: set[Path], allowed: Path) -> list[Pat
     Raises:
         UserError: one lies outside the folder that may be read, or is no regular file.
     """
-    name = name.removeprefix("package://").replace("\\", "/")
-    if len(name) > 1000 or "\0" in name:
-        raise UserError(f"{main} names the file {printable(name[:40])}...; give a shorter name")
+    name = _short(main, name.removeprefix("package://").replace("\\", "/"))
     names = {name, PurePosixPath(name).name} - {""}
     found = [path for path in (folder / one for folder in folders for one in names) if path.exists()]
     if any(not path.resolve().is_relative_to(allowed) for path in found):
@@ -141,6 +140,13 @@ def _files(main: Path, name: str, folders: set[Path], allowed: Path) -> list[Pat
     if odd := next((path for path in found if not path.is_file()), None):
         raise UserError(f"{main} names the file {printable(name)}, but {printable(str(odd))} is no regular file")
     return found
+
+
+def _short(main: Path, name: str) -> str:
+    """Return the name of a file or folder, which is refused where no file system takes it."""
+    if len(name) > 1000 or "\0" in name:
+        raise UserError(f"{main} names the file {printable(name[:40])}...; give a shorter name")
+    return name
 
 
 def _whole(word: str) -> int:

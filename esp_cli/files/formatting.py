@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
+from unicodedata import category
 
 NOTHING = "-"
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def escaped(text: str) -> str:
-    r"""Return a text whose control characters, line breaks and tabs aside, are written as "\x1b"."""
-    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+    r"""Return a text in which what cannot be printed is written as "\x1b"; line breaks, tabs and spaces stay."""
+    return text if text.isprintable() else "".join(c if _stays(c) else repr(c)[1:-1] for c in text)
+
+
+def _stays(character: str) -> bool:
+    return character.isprintable() or character in "\n\t" or category(character) == "Zs"
 
 
 def format_mean(mean: float | None, sem: float | None = None) -> str:

@@ -88,6 +88,9 @@ def test_missing_and_huge_files_are_refused(tmp_path):
         mesh.truncate(300 * 2**20)
     (tmp_path / "mesh.xml").write_text('<mujoco><asset><mesh file="huge.stl"/></asset></mujoco>')
     assert "has 300 MiB" in sentence(tmp_path / "mesh.xml")
+    for place in ('<compiler meshdir="{}"/>', '<asset><mesh file="{}"/></asset>'):
+        (tmp_path / "mesh.xml").write_text(f"<mujoco>{place.format('x/' * 3000)}</mujoco>")
+        assert "give a shorter name" in sentence(tmp_path / "mesh.xml")
 
 
 def test_models_of_thousands_of_parts_are_refused(tmp_path):
