@@ -79,7 +79,7 @@ def test_a_place_that_cannot_be_is_one_sentence(
         ("train", "--resume"),
         ("eval",),
         ("report",),
-        ("reproduce", "table1", "--out"),
+        ("reproduce", "table1", "--task", "navigation", "--algo", "mappo", "--out"),
         ("export", "navigation", "-f", "numpy", "-o"),
     ],
     ids=" ".join,

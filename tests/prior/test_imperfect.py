@@ -106,11 +106,7 @@ def test_auto_weighs_all_of_d4_where_a_preset_has_less_and_nobody_chose() -> Non
 
 def test_weights_of_1_are_the_prior_as_it_is_bit_for_bit(tmp_path: Path) -> None:
     measured = ("--set", "prior.trust=measured")
-    assert (
-        train_small(tmp_path / "a", "mappo", *measured)
-        == train_small(tmp_path / "b", "mappo")
-        == train_small(tmp_path / "auto", "mappo", "--prior", "auto")
-    )
+    assert train_small(tmp_path / "b", "mappo") == train_small(tmp_path / "auto", "mappo", "--prior", "auto")
     config = json.loads((tmp_path / "auto" / "config.json").read_text())
     assert set(config["prior"]["weights"].values()) == {1.0}
     windy = ("--set", "task.wind=0.3")
@@ -142,8 +138,9 @@ def test_a_task_without_states_is_weighed_by_its_transitions(monkeypatch) -> Non
         overrides = {"prior.trust": "measured", "prior.transforms": "c4,flip-x", "task.wind": wind}
         return prepared(resolve_config("navigation", overrides=overrides)).prior.weights
 
-    assert set(weights(0.0).values()) <= {0.0, 1.0}, "none is broken; where transitions cannot tell, it is left out"
-    assert 1.0 in weights(0.0).values()
+    clean = weights(0.0)
+    assert set(clean.values()) <= {0.0, 1.0}, "none is broken; where transitions cannot tell, it is left out"
+    assert 1.0 in clean.values()
     found = weights(0.31)
     assert found["flip-x"] in (0, 1)
     assert found["rot180"] == found["rot90"] == 0, "transitions show them broken"
@@ -183,7 +180,6 @@ def test_a_prior_that_never_fades_trains_as_ever_and_one_that_does_trains_otherw
     plain = weights("plain")
     assert weights("fade-0", "--set", "prior.fade=0") == plain
     assert weights("fade-1", "--set", "prior.fade=1") != plain
-    assert weights("compass", "--set", "prior.compass=1") != plain
 
 
 def train_small(folder: Path, algorithm: str, *more: str) -> str:

@@ -226,25 +226,27 @@ def test_a_run_stopped_at_its_first_evaluation_trains_nothing_and_is_resumed(tmp
     assert untimed(straight) == untimed(halted)
 
 
-FORGED = {
-    "a name is missing": lambda t, name: t.pop(name),
-    "a name is another": lambda t, name: t.update({f"{name}x": t.pop(name)}),
-    "a name is new": lambda t, name: t.update({f"{name}.new": t[name]}),
-    "a shape is another": lambda t, name: t.update({name: t[name].unsqueeze(0)}),
-    "an axis is cut": lambda t, name: t.update({name: t[name][:1]}),
-    "a type is another": lambda t, name: t.update({name: t[name].to(torch.int32)}),
-}
+FORGED = [
+    lambda t, name: t.pop(name),
+    lambda t, name: t.update({f"{name}x": t.pop(name)}),
+    lambda t, name: t.update({f"{name}.new": t[name]}),
+    lambda t, name: t.update({name: t[name].unsqueeze(0)}),
+    lambda t, name: t.update({name: t[name][:1]}),
+    lambda t, name: t.update({name: t[name].to(torch.int32)}),
+]
+"""A name is missing, another or new; a shape is another, an axis cut, a type another."""
 
 
-@pytest.mark.parametrize("forge", FORGED.values(), ids=FORGED)
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
-def test_a_forged_checkpoint_with_a_valid_checksum_is_one_sentence(tmp_path, algorithm, forge):
+def test_a_forged_checkpoint_with_a_valid_checksum_is_one_sentence(tmp_path, algorithm):
+    """Of every module, optimiser, generator and world, one tensor in two ways; the ways come in turn."""
     config = small_config(algorithm)
     folder = RunFolder.create(tmp_path / "run", config.model_dump(mode="json"))
     trainer(folder).run(stop_after(2))
     tensors, meta = folder.latest_checkpoint(pytest.fail)
     kinds = {name.rsplit(".", 1)[0]: name for name in tensors if tensors[name].dim()}
-    for name in kinds.values():  # one of every module, optimiser, generator and world
+    pairs = [(name, FORGED[(place + skip) % 6]) for place, name in enumerate(kinds.values()) for skip in (0, 3)]
+    for name, forge in pairs:
         changed = dict(tensors)
         forge(changed, name)
         if changed.keys() == tensors.keys() and all(same_bits(changed[n], tensors[n]) for n in tensors):
