@@ -9,10 +9,10 @@ BIN := $(VENV)/bin
 DEMO := runs/demo
 # Images of containers often forbid Python to keep what it compiled; every start of `esp` then takes twice as long.
 export PYTHONDONTWRITEBYTECODE :=
-PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist loadscope --max-worker-restart 0
+PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist worksteal --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow check bench docs site torture clean
+.PHONY: help demo test test-slow test-all check bench docs site torture clean
 
 help: ## list what make can do
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -25,6 +25,9 @@ test: $(VENV)/.installed-test ## run the tests (5 minutes), but for those marked
 
 test-slow: $(VENV)/.installed-test ## run the tests marked slow (3 minutes)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
+
+test-all: $(VENV)/.installed-test ## run both, in one go
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## lint, format and types over every package
 	$(BIN)/ruff check .
