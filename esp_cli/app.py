@@ -64,7 +64,7 @@ class LazyGroup(TyperGroup):
             _refuse_empty(sys.argv[1:] if args is None else args)
             _refuse_deleted_folder()
             code = super().main(args, prog_name or self.name, **extra)
-        except Exception as failure:
+        except (Exception, SystemExit) as failure:  # of the user's code: sys.exit is no end of a command
             code = report(failure)
             if code is None or os.environ.get("ESP_TRACEBACK"):
                 raise
@@ -108,7 +108,7 @@ def build_command(name: str, target: str) -> Any:
     return arrange(command)
 
 
-def report(failure: Exception) -> int | None:
+def report(failure: Exception | SystemExit) -> int | None:
     """Print the sentence that a failure deserves and return its exit code; None where it is a bug without one."""
     if isinstance(failure, typer.TyperException):
         message, context = failures.own_words(failure.format_message()), getattr(failure, "ctx", None)

@@ -62,6 +62,7 @@ class BatchedTask(Environment):
         self._episode_time = torch.zeros(
             self._worlds_shape, dtype=torch.int64, device=self.device
         )  # where worlds end apart
+        self._lost = set(self.spec.totals)  # names that no step's metrics had yet
         self._unproven = self.spec.horizon  # steps in which all that a subclass gives is still looked at
 
     @abstractmethod
@@ -222,6 +223,14 @@ class BatchedTask(Environment):
         for name, value in metrics.items():
             if value.shape != self._worlds_shape:  # first, since the sentence takes time
                 require_shape(f"metric {name} that '_advance' of {self.spec.name} gives", value, self._worlds_shape)
+        if self._lost:
+            self._lost -= metrics.keys()
+            if self._lost and self._unproven == 1:
+                told = ", ".join(metrics) or "no metric"
+                raise UserError(
+                    f"'_advance' of {self.spec.name} gives no metric '{min(self._lost)}' in a whole episode, but "
+                    f"'totals' of its spec names it; it gives {told}"
+                )
         is_new = self.makes_new_tensors
         return _owned(reward, is_new), {name: _owned(value, is_new) for name, value in metrics.items()}
 

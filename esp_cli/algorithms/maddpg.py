@@ -40,7 +40,8 @@ class MaddpgConfig(ExploringConfig):
     tau: float = Field(0.005, gt=0, le=1, description="share of the way that target networks go at each step")
     actor_actions: Literal["own", "all"] = Field(
         "all",
-        description="the actor's gradient: all agents' actions are the policy's; paper: each agent's own alone is",
+        description="the actor's gradient: all agents' actions are the policy's, and it follows the "
+        "mean of the agents' Q; paper: each agent's own alone is",
     )
     actor_gradient: Literal["sampled", "expected"] = Field(
         "sampled",

@@ -119,7 +119,7 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     known = {name: values[name] for name in takes if name in values}
     try:
         result = function(**known) if known else function(rows[ACTION].clone())
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"the function raises {last_line(error)}; it was given {', '.join(known) or ACTION}") from error
     results = tuple(result) if isinstance(result, tuple | list) else (result,)
     if not set(known) & set(_OBS):

@@ -92,7 +92,7 @@ def check_paired(
     def further() -> _Pairs | None:
         try:
             return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in some])
-        except Exception:  # such states, or what was done elsewhere, are not for this task
+        except (Exception, SystemExit):  # such states, or what was done elsewhere, are not for this task
             return None
 
     def judge(element: Element) -> ElementVerdict:
@@ -135,7 +135,7 @@ class _Pairs:
         declared, transform = is_declared(element, self._spec), build_transform([element], self._spec)
         try:
             there = [_outcomes(env, self._visited, transform) for env in self._twins]
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
         first, second, *nudged = (_fields(steps, self._spec, transform) for steps in self._here)

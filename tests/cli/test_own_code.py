@@ -34,6 +34,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 WRONG = """
+import sys
+from dataclasses import replace
 import torch
 from rendezvous import Rendezvous
 
@@ -91,6 +93,14 @@ class Differs(Rendezvous):
         reward, metrics = super()._advance(world, action)
         return reward.unsqueeze(-1) * torch.arange(3), metrics
 
+class Leaves(Rendezvous):
+    def _advance(self, world, action):
+        sys.exit(0)
+
+class Misspells(Rendezvous):
+    def _describe(self):
+        return replace(super()._describe(), totals=("spred",))
+
 class Pays(Rendezvous):
     def _advance(self, world, action):
         reward, metrics = super()._advance(world, action)
@@ -101,10 +111,12 @@ class Pays(Rendezvous):
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [
-        ("Raises", "your code raises in '_advance' (wrong.py, line 11): KeyError: 'lost'"),
-        ("Builds", "your code raises in '__init__' (wrong.py, line 24): RuntimeError: no simulator here"),
-        ("Looks", "your code raises in '_advance' (wrong.py, line 16): ValueError: 3 is not in list"),
-        ("Forgets", "your code raises in '_advance' (wrong.py, line 20): KeyError: 'nothing'"),
+        ("Raises", "your code raises in '_advance' (wrong.py, line 13): KeyError: 'lost'"),
+        ("Builds", "your code raises in '__init__' (wrong.py, line 26): RuntimeError: no simulator here"),
+        ("Looks", "your code raises in '_advance' (wrong.py, line 18): ValueError: 3 is not in list"),
+        ("Forgets", "your code raises in '_advance' (wrong.py, line 22): KeyError: 'nothing'"),
+        ("Leaves", "your code raises in '_advance' (wrong.py, line 63): SystemExit: 0"),
+        ("Misspells", "'_advance' of rendezvous gives no metric 'spred' in a whole episode, but 'totals' of its spec"),
         ("Describes", "'_describe' of Describes returns None; return a TaskSpec"),
         ("Starts", "'position' of what '_start' of rendezvous gives is no tensor; give tensors"),
         ("StartsAlone", "'_start' of rendezvous gives Tensor; give a dict of tensors by name"),

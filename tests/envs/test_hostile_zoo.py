@@ -253,6 +253,9 @@ STEPPED = {
     "no action": (task(masks=True, allowed=lambda *_: np.zeros(3)), "the mask of a allows nothing; leave it one"),
     "state shrinks": (task(of={"state": lambda self: [*self.x.values()][: 2 - self.time]}, state=Task.observation),
                       "the state has 1 numbers, expected 2"),
+    "metric misspelt": (task(put(INFOS, {"a": {"hits": 1}}), metrics=("hit",)),
+                        "no info of Zoo holds the metric 'hit' in a whole episode; they hold hits; correct"),
+    "metric nowhere": (task(metrics=("hits",)), "the metric 'hits' in a whole episode; they hold nothing; correct"),
     "exits": (task(at(2, lambda self, out: sys.exit(0))), "copy 0 of Zoo raises in 'step': SystemExit: 0"),
     "raises": (task(lambda self, out: {}["x\ny"]), "copy 0 of Zoo raises in 'step': KeyError"),
 }  # fmt: skip
@@ -317,6 +320,7 @@ RIGHT = {
     "equal bounds": (box([-2, -2], [2, 2], "d4*agents"), "...c...c."),
     "unequal where nothing turns": (box([-1, -2], [1, 2], "agents"), "...c...c."),
     "unequal under half a turn": (box([-1, -2], [1, 2], "d2"), "...c...c."),
+    "a metric at the end": (task(at(LENGTH, put(INFOS, {"a": {"won": 1}})), metrics=("won",)), "...c...c."),
     "off centre without a turn": (box([0, 0], [1, 3], "c1"), "...c...c."),
 }  # fmt: skip
 

@@ -142,6 +142,20 @@ def test_arguments_that_a_scenario_does_not_take_are_refused() -> None:
         Odd(Odd.Settings(), 2, generators_for([0]))
 
 
+def test_a_metric_that_no_info_holds_and_a_scenario_that_calls_exit_are_one_sentence_each(monkeypatch) -> None:
+    class Misspelt(vmas_scenarios.Navigation):
+        metrics = ("agent_colisions",)
+
+    task = Misspelt(Misspelt.Settings(), 2, generators_for([0]))
+    task.reset()
+    with pytest.raises(UserError, match=r"has no metric 'agent_colisions'; it has pos_rew, .*agent_collisions"):
+        task.step(task.random_action())
+    task.metrics = ()
+    monkeypatch.setattr(type(task._sims[0].scenario), "reward", lambda *_: sys.exit(0))
+    with pytest.raises(UserError, match="the VMAS scenario raises SystemExit: 0"):
+        task.step(task.random_action())
+
+
 def test_goals_that_are_not_one_for_each_agent_are_refused() -> None:
     class Shared(vmas_scenarios.Transport):
         own_goals = "package"

@@ -179,6 +179,7 @@ def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
     page = (tmp_path / "README.md").read_text()
     for part in ("   2..3  obstacle: vector x 1 (m)\n", "STM32F407", "never on hardware", "Worked example", "10000"):
         assert part in page
+    assert page.count("float64") == 1, "of onnx alone"
     import onnx
 
     model = onnx.load(tmp_path / "policy.onnx")

@@ -221,7 +221,7 @@ def _work(
 def _failure_of(command: Callable[[], None]) -> bytes:
     try:
         command()
-    except Exception as failure:
+    except (Exception, SystemExit) as failure:
         said = str(failure) if isinstance(failure, UserError) else last_line(failure)
         return said.encode(errors="backslashreplace")
     return b""

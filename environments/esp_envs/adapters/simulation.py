@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from esp_envs.errors import UserError
-from esp_envs.installed import install
+from esp_envs.installed import install, last_line
 from esp_envs.spec import Field, Items, Kind, Layout
 
 
@@ -36,8 +36,8 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
             raise UserError(
                 f"the VMAS scenario '{scenario}' has no arguments {told}; leave them out of what 'arguments' returns"
             ) from unknown
-        except (AssertionError, TypeError) as error:
-            raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {error}") from error
+        except (AssertionError, TypeError, SystemExit) as error:
+            raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {last_line(error)}") from error
 
     return make
 
@@ -77,13 +77,15 @@ class RandomNumbers:
 
     @contextlib.contextmanager
     def drawn(self) -> Iterator[None]:
-        """Let VMAS draw these numbers."""
+        """Let VMAS draw these numbers; a scenario that calls sys.exit ends no run with code 0."""
         from vmas.simulator.environment import Environment  # noqa: PLC0415 - an extra
 
         shared = Environment.vmas_random_state
         before, shared[0] = shared[0], self._state
         try:
             yield
+        except SystemExit as error:
+            raise UserError(f"the VMAS scenario raises {last_line(error)}") from error
         finally:
             self._state, shared[0] = shared[0], before
 

@@ -32,6 +32,9 @@ class CopyStepper:
         self._infos: dict[int, Mapping[str, Any]] = {}
         self._living: dict[int, set[Any]] = {}
         self._opponents_draws: dict[int, np.random.Generator] = {}
+        self._lost = set(task.metrics) if type(task).measure is CopyHooks.measure else set[str]()
+        self._told: set[str] = set()
+        self._whole: set[int] = set()  # copies that have ended an episode while a metric was lost
 
     def reset(self) -> None:
         """Start an episode in every copy."""
@@ -87,6 +90,9 @@ class CopyStepper:
         with copy.naming("measure", k):
             found = task.measure(copy.env, infos)
             board.metrics[k] = [found[name] for name in task.metrics]
+            if self._lost:
+                self._told |= {name for info in infos.values() for name in info}
+                self._lost -= self._told
         self._require_whole(copy, seen, acting, ended | cut, flags)
         if missing := [name for name in acting if name not in seen and (name in cut or name not in ended)]:
             of_task = f"of {type(task).__name__}"
@@ -111,10 +117,22 @@ class CopyStepper:
         self._living[k] = going | {name for name in acting if name not in ended}
         self._write(k, FINAL)
         if board.ended[k]:
+            if self._lost:
+                self._require_metrics(k)
             self._start(k)
         else:
             for seen_by in (board.obs, board.state, board.mask, board.alive):
                 seen_by[NOW, k] = seen_by[FINAL, k]
+
+    def _require_metrics(self, k: int) -> None:
+        """Refuse a metric that no info has held when every copy has ended an episode."""
+        self._whole.add(k)
+        if len(self._whole) == len(self._copies):
+            told = ", ".join(sorted(map(str, self._told))[:8]) or "nothing"
+            raise UserError(
+                f"no info of {type(self._task).__name__} holds the metric '{min(self._lost)}' in a whole episode; they "
+                f"hold {told}; correct 'metrics', or define 'measure'"
+            )
 
     def _require_whole(
         self, copy: Copy, seen: Mapping[Any, Any], acting: Sequence[Any], over: set[Any], flags: Sequence[Any]

@@ -101,7 +101,9 @@ class VmasTask(Environment):
         self._base = torch.zeros(self.num_seeds, dtype=torch.int64)
         lead = (self.num_seeds, num_envs)
         self._begun, self._time = torch.zeros(2, *lead, dtype=torch.int64).unbind()  # on the CPU: clocks are asked
-        width = self.reading(simulation.rows(self._sims[0].reset(), "observation", num_envs)).shape[-1]
+        with simulation.RandomNumbers(0).drawn():
+            first = self._sims[0].reset()
+        width = self.reading(simulation.rows(first, "observation", num_envs)).shape[-1]
         if width != self.spec.observation.width:
             raise UserError(
                 f"the scenario shows {width} numbers to an agent, but the layout has {self.spec.observation.width}"
@@ -216,7 +218,10 @@ def _joined(parts: Sequence[Observation]) -> Observation:
 
 def _mean(infos: Sequence[dict[str, Tensor]], name: str, like: Tensor) -> Tensor:
     found = [info[name].float().reshape(len(like)) for info in infos if name in info]
-    return torch.stack(found).mean(0) if found else torch.zeros_like(like, dtype=torch.float32)
+    if not found:
+        told = ", ".join({name: None for info in infos for name in info}) or "nothing"
+        raise UserError(f"the scenario's info has no metric '{name}'; it has {told}; correct 'metrics'")
+    return torch.stack(found).mean(0)
 
 
 def _body(entity: Any, world: int, is_agent: bool) -> Body:

@@ -63,7 +63,7 @@ def check(subject: Subject, promises: Sequence[Callable[[Subject], None]] = PROM
             yield Finding(name, not_asked=str(reason))
         except Broken as failure:
             yield Finding(name, broken=str(failure))
-        except Exception as failure:
+        except (Exception, SystemExit) as failure:
             place = raised_in(failure)
             said = str(failure) if isinstance(failure, UserError) else last_line(failure)
             said += f", in {place}" if place else ""
