@@ -62,7 +62,7 @@ def forked_jobs() -> Iterator[None]:
 
 @pytest.fixture
 def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let exports compare observations in a few states; test_epuck.py does it in all of them."""
+    """Let exports compare observations in a few states; test_epuck.py does it in more."""
     from esp_cli.export import epuck
 
     monkeypatch.setattr(epuck, "take_scenes", partial(epuck.take_scenes, count=50))

@@ -33,14 +33,16 @@ def test_what_is_printed_is_a_file_that_resolves_to_the_same(tmp_path: Path, opt
 
 
 def test_auto_means_the_same_over_a_whole_configuration(tmp_path: Path) -> None:
-    whole = written(tmp_path / "c.json", printed("--task", "formation", "--steps", "20k"))
+    small = [part for one in ("num_agents=2", "num_obstacles=0", "horizon=5") for part in ("--set", f"task.{one}")]
+    whole = written(tmp_path / "c.json", printed("--task", "formation", "--steps", "20k", *small))
     auto = printed("--config", whole, "--prior", "auto")["prior"]
     assert (auto["trust"], auto["fade"], auto["transforms"]) == ("measured", 0.5, "d4")
     assert printed("--config", whole, "--prior", "auto", "--set", "prior.fade=0.2")["prior"]["fade"] == 0.2
 
 
 def test_what_was_measured_in_a_task_is_measured_anew_in_a_changed_one(tmp_path: Path) -> None:
-    whole = printed("--prior", "auto", "--steps", "20k")
+    small = ("--set", "task.num_agents=1", "--set", "task.num_landmarks=1")
+    whole = printed("--prior", "auto", "--steps", "20k", *small)
     whole["prior"] |= {"weights": {"rot90": 0.5}, "transforms": "discovered:rot90"}
     file = written(tmp_path / "c.json", whole)
     for kept in ([], ["--set", "task.wind=0"]):

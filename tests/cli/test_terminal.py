@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import io
 import os
 import pty
 import re
@@ -171,18 +172,28 @@ def test_colours_are_there_and_go_with_no_color() -> None:
 
 
 def test_the_live_line_of_a_training_fits_the_terminal_and_says_what_matters(tmp_path: Path) -> None:
-    shown = on_terminal("train", *map(str, TINY_OPTIONS), "--steps", "2k", "--out", str(tmp_path / "run"))
+    shown = on_terminal("train", *map(str, TINY_OPTIONS), "--steps", "500", "--out", str(tmp_path / "run"))
     lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", part).rstrip() for part in re.split(r"[\r\n]+", shown)]
     live = [line for line in lines if "steps/s" in line]
     assert live
     assert too_wide(live) == []
-    assert re.search(r"navigation .*2k/2k  \S+ steps/s  0 s left  greedy -[\d.]+", live[-1])
+    assert re.search(r"navigation .*500/500  \S+ steps/s  0 s left  greedy -[\d.]+", live[-1])
 
 
-def test_long_output_goes_through_the_pager_on_a_terminal_and_short_output_does_not() -> None:
-    pager = "sed s/^/PAGED/"
-    assert "PAGED" in on_terminal("settings", "mappo", PAGER=pager)
-    assert "PAGED" not in on_terminal("settings", "evaluation", PAGER=pager)
+def test_long_output_goes_through_the_pager_on_a_terminal() -> None:
+    assert "PAGED" in on_terminal("settings", "mappo", PAGER="sed s/^/PAGED/")
+
+
+@pytest.mark.parametrize(("lines", "paged"), [(23, False), (24, True)])
+def test_what_fits_the_screen_is_not_paged(lines: int, paged: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = list[str]()
+    terminal = Console(width=80, height=24, force_terminal=True, color_system=None, file=io.StringIO())
+    monkeypatch.setattr(streams, "out", terminal)
+    monkeypatch.setattr(streams.sys, "stdin", SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(streams.pydoc, "pager", pages.append)
+    with streams.paged():
+        terminal.print("\n".join(["line"] * lines))
+    assert [bool(pages), "line" in terminal.file.getvalue()] == [paged, not paged]
 
 
 def test_nothing_is_paged_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> None:

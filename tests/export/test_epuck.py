@@ -36,8 +36,8 @@ def test_c_and_python_see_from_poses_what_the_task_shows(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = drawn_policy("wheels", **SETTINGS[case])
-    assert epuck.STATES == 10_000
-    states = epuck.STATES if case == "offset" else 500
+    assert epuck.STATES == 10_000, "in an export; that the formulas are the same shows in fewer"
+    states = 1_000 if case == "offset" else 300
     scenes = epuck.take_scenes(trained, states)
     assert len(scenes.poses) == len(scenes.observations) == states
     assert len(np.unique(scenes.poses[:, 0, 0])) > 0.99 * states, "states differ"

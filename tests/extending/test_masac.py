@@ -55,6 +55,7 @@ def test_the_file_is_as_short_as_the_page_says():
     assert len((DOCS / "masac.py").read_text().splitlines()) <= 250
 
 
+@pytest.mark.usefixtures("few_scenes")
 @pytest.mark.parametrize(("kind", "prior"), [("discrete", "none"), ("vectors", "esp"), ("wheels", "esp")])
 def test_it_trains_and_is_evaluated_drawn_exported_and_loaded(tmp_path, kind, prior):
     run = tmp_path / "run"
@@ -215,10 +216,8 @@ def test_the_value_consistency_is_0_for_an_invariant_critic_alone(actions):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("prior", "steps"), [("esp", "40k"), ("none", "20k")])
-def test_it_learns_navigation(tmp_path, prior, steps):
+def test_it_learns_navigation(tmp_path):
     """Random actions return -219."""
-    few = ["--steps", steps, "--set", "evaluation.episodes=64"]
-    esp("train", *ALGO, "--prior", prior, *few, "--out", tmp_path / "run")
+    esp("train", *ALGO, "--steps", "40k", "--set", "evaluation.episodes=64", "--out", tmp_path / "run")
     returns = column(read_metrics(tmp_path / "run" / "metrics.jsonl"), "eval/return_greedy")[1].ravel()
     assert returns[-1] > -195
