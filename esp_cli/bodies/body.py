@@ -16,7 +16,7 @@ from esp_cli.bodies.deriving import Match, derive
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.parts import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY, Proof, prove
-from esp_cli.bodies.reading import MOST_PARTS, printable, read_model
+from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
@@ -118,10 +118,11 @@ class Body:
 
     @classmethod
     def _from_model(cls, model: Any, tolerated: float) -> Body:
-        if not model.nv or max(model.nv, model.nu, model.nbody) > MOST_PARTS:
+        if not 0 < model.nv <= MOST_MOVING or model.nu > MOST_MOVING or model.nbody > MOST_BODIES:
             raise UserError(
                 f"the model has {model.nv} degrees of freedom, {model.nu} actuators and {model.nbody} bodies; give one "
-                f"robot, with at least one degree of freedom and at most {MOST_PARTS} of each"
+                f"robot, with 1 to {MOST_MOVING} degrees of freedom and at most {MOST_MOVING} actuators and "
+                f"{MOST_BODIES} bodies"
             )
         self, frame = cls([], {}), Frame(model)
         idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot

@@ -74,9 +74,10 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
     bodies, joints = _matched(frame, R)
     if not joints:
         every = range(frame.model.njnt)
-        alone = [i for i in every if min(_joint_gap(frame, R, i, j) for j in every) >= _APART]
-        name = printable(frame.name("joint", alone[0])) if alone else ""
-        raise UserError(f"no joint is like the image of {name}" if name else "its bodies hang together otherwise")
+        alone = next((i for i in every if min(_joint_gap(frame, R, i, j) for j in every) >= _APART), None)
+        if alone is None:
+            raise UserError("its bodies hang together otherwise")
+        raise UserError(f"no joint is like the image of {printable(frame.name('joint', alone))}")
     qpos, offset, qvel = _state_maps(frame, R, joints)
     ctrl, unmatched = _control_map(frame, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
@@ -90,10 +91,12 @@ def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
     @cache
     def cost(b: int, c: int) -> tuple[float, tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]]:
         """Return how badly c is the image of b with all that hangs on them, and the pairs of joints and bodies."""
+        off = float(np.linalg.norm(R @ frame.com[b] - frame.com[c])) / frame.size if frame.mass[b] else 0.0
+        if off > FAR:
+            return _APART, (), ()
         own, pairs = _assigned(frame.joints(b), frame.joints(c), lambda i, j: _joint_gap(frame, R, i, j))
         own += abs(frame.mass[b] - frame.mass[c]) / total
-        off = float(np.linalg.norm(R @ frame.com[b] - frame.com[c])) / frame.size if frame.mass[b] else 0.0
-        own += off if off <= FAR else _APART
+        own += off
         # of two legs on one line, as in a planar walker, a mirror exchanges them
         own += 1e-9 * (b == c and mirrored)
         hanging, below = _assigned(frame.children[b], frame.children[c], lambda x, y: cost(x, y)[0])

@@ -15,8 +15,8 @@ from esp_envs.errors import UserError
 
 XML_MIB, ASSET_MIB = 16, 256
 """Largest size of an XML file, and of a mesh or picture."""
-MOST_ELEMENTS, MOST_DEPTH, MOST_PARTS = 50_000, 100, 1000
-"""Most elements of a model after replication, how deep they nest; most degrees of freedom, actuators and bodies."""
+MOST_ELEMENTS, MOST_DEPTH, MOST_BODIES, MOST_MOVING = 50_000, 100, 1000, 200
+"""Most elements of a model after replication, depth of nesting, bodies, and degrees of freedom or actuators."""
 _LIMITS = dict.fromkeys(("nrow", "ncol", "width", "height", "nuser", "nkey"), 65_536)
 _LIMITS |= dict.fromkeys(("njmax", "nconmax", "nstack"), 10**7) | {"memory": 2**30}
 """Largest numbers that ask MuJoCo for memory, by how their attributes begin."""

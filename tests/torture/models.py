@@ -165,7 +165,10 @@ class Models:
         except ElementTree.ParseError:
             return text
         for _ in range(rng.choice((1, 2, 5))):
-            parent = rng.choice([element for element in tree.iter() if len(element)])
+            parents = [element for element in tree.iter() if len(element)]
+            if not parents:  # a change before this one removed all
+                break
+            parent = rng.choice(parents)
             child = rng.choice(list(parent))
             kind = rng.randrange(4)
             if kind == 0:
