@@ -16,7 +16,7 @@ from esp_cli.bodies.deriving import Match, derive
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.parts import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY, Proof, prove
-from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, read_model
+from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, quiet, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
@@ -117,6 +117,7 @@ class Body:
         return cls._from_model(read_model(path, root, floating), tolerated)
 
     @classmethod
+    @quiet()
     def _from_model(cls, model: Any, tolerated: float) -> Body:
         if not 0 < model.nv <= MOST_MOVING or model.nu > MOST_MOVING or model.nbody > MOST_BODIES:
             raise UserError(

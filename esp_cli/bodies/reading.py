@@ -66,13 +66,19 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings to a file in the working directory."""
+    """Keep MuJoCo from writing its warnings to a file in the working directory, and put its errors in a sentence.
+
+    Raises:
+        UserError: it cannot go on, as where contacts take more memory than the model grants.
+    """
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
+    except mujoco.FatalError as error:
+        raise UserError(f"MuJoCo cannot simulate the model ({str(error).splitlines()[0]})") from None
     finally:
         mujoco.set_mju_user_warning(before)
 

@@ -104,6 +104,18 @@ def test_models_of_thousands_of_parts_are_refused(tmp_path):
         assert "1 to 200 degrees of freedom and at most 200 actuators and 1000 bodies" in refused("mirror", path)
 
 
+def test_contacts_that_take_more_memory_than_the_model_grants_are_one_sentence_or_none(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    limbs = "".join(f'<body pos="0 0 {k / 100}"><joint axis="0 1 0"/><geom size=".3"/></body>' for k in range(40))
+    for memory in ("20K", "200K"):
+        text = f'<mujoco><size memory="{memory}"/><worldbody><body><freejoint/><geom size=".3"/>{limbs}</body>'
+        (tmp_path / f"{memory}.xml").write_text(f"{text}</worldbody></mujoco>")
+    assert "MuJoCo cannot simulate the model" in refused("mirror", "20K.xml")
+    assert Body.from_mjcf("200K.xml").group == "d2"
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_urdf_moves_freely_and_keeps_its_mimic_joint(tmp_path):
     path = tmp_path / "two.urdf"
     path.write_text(URDF.format('<mimic joint="left_joint" multiplier="-1"/>'))

@@ -79,6 +79,8 @@ PARTS = """
     <worldbody><replicate count="99999"><geom size="1"/></replicate></worldbody>
     <worldbody><composite type="cable" count="900 1 1"><geom type="capsule" size=".1"/></composite></worldbody>
     <size memory="900G"/>
+    <size memory="20K"/>
+    <size memory="200K"/>
     <option timestep="nan"/>
     <custom><text name={0} data={0}/></custom>
 """.strip().splitlines()
