@@ -132,6 +132,9 @@ class Environment(ABC):
     spec: TaskSpec
     heuristics: tuple[str, ...] = ()
     """Names that `heuristic` accepts, the main anchor first; an environment may have fewer than its class."""
+    renews: bool = True
+    """Whether worlds whose episode ends begin the next one. Who sets each state may do without where that takes long;
+    `next` then holds what was reached. An environment may ignore it."""
     robot: ClassVar[Mapping[str, float]] = {}
     """Dimensions of the e-puck that a policy of this task can drive, by name with unit; empty for other tasks."""
 

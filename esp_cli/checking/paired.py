@@ -13,6 +13,7 @@ that differs by more than rounding is a proof.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -27,9 +28,11 @@ from esp_cli.checking.verdicts import (
     SIGNIFICANT,
     ElementVerdict,
     FieldVerdict,
+    Late,
     Watch,
     chance,
     concluded,
+    stop_at,
     verdicts_of,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
@@ -76,22 +79,24 @@ def check_paired(
         make: makes E worlds for some seeds.
         elements: to try.
         most: worlds in which outcomes are compared, at most.
-        watch: told of how many elements of how many are judged.
+        watch: told of how many steps of how many are taken to visit states, then of how many elements are judged.
         until: when to stop, see `verdicts_of`.
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = _visit(make(worlds, [0]))
+    visited = _visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2)
     if most is None:  # one step of many worlds takes less time than many steps
         states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
         visited = [(states, actions)]
     some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in visited]
-    everywhere, few = (cache(lambda states=states: _Pairs(make, states)) for states in (visited, some))
+    everywhere, few = (cache(lambda states=states: _Pairs(make, states, until)) for states in (visited, some))
 
     @cache
     def further() -> _Pairs | None:
         try:
-            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in some])
+            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in some], until)
+        except Late:
+            raise
         except (Exception, SystemExit):  # such states, or what was done elsewhere, are not for this task
             return None
 
@@ -117,24 +122,32 @@ class _Pairs:
     Args:
         make: makes E worlds for some seeds.
         visited: states [1, E, state width] and joint actions, for each moment.
+        until: when to stop.
+
+    Raises:
+        Late: it is later than that, here or in `judge`.
     """
 
-    def __init__(self, make: MakeWorlds, visited: Sequence[tuple[Tensor, Tensor]]) -> None:
-        self._visited, worlds = visited, visited[0][0].shape[1]
+    def __init__(self, make: MakeWorlds, visited: Sequence[tuple[Tensor, Tensor]], until: float) -> None:
+        self._visited, self._until, worlds = visited, until, visited[0][0].shape[1]
         self._twins = [make(worlds, [seed]) for seed in (101, 102)]
+        for env in self._twins:
+            env.renews = False
         self._spec = spec = self._twins[0].spec
-        self._here = [_outcomes(env, visited, None) for env in self._twins]
+        self._here = [_outcomes(env, visited, None, until) for env in self._twins]
         one, other = (_fields(steps, spec, None) for steps in self._here)
         if all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one):
             self._twins = self._twins[:1]  # nothing is left to chance, so one run from each image will do
             near = [(_nudged(state), action) for state, action in visited]
-            self._here.append(_outcomes(self._twins[0], near, None))
+            self._here.append(_outcomes(self._twins[0], near, None, until))
 
     def judge(self, element: Element) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
         declared, transform = is_declared(element, self._spec), build_transform([element], self._spec)
         try:
-            there = [_outcomes(env, self._visited, transform) for env in self._twins]
+            there = [_outcomes(env, self._visited, transform, self._until) for env in self._twins]
+        except Late:
+            raise
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
@@ -147,23 +160,32 @@ class _Pairs:
         return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
 
 
-def _visit(env: Environment) -> list[tuple[Tensor, Tensor]]:
-    """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any."""
+def _visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, Tensor]]:
+    """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any.
+
+    After `until` no more steps are taken.
+    """
     observation = env.reset()
     taken = {round(k * (env.spec.horizon - 1) / MOMENTS) for k in range(MOMENTS)}
-    visited = []
+    visited: list[tuple[Tensor, Tensor]] = []
     for t in range(max(taken) + 1):
+        if visited and time.monotonic() > until:
+            break
         action = env.random_action()
         if t in taken:
             visited.append((observation.state.clone(), action))
         observation = env.step(env.half_by_heuristic(action)).next
+        watch(t + 1, max(taken) + 1, "steps")
     return visited
 
 
-def _outcomes(env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | None) -> list[Step]:
+def _outcomes(
+    env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | None, until: float
+) -> list[Step]:
     """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end."""
     steps = []
     for state, action in visited:
+        stop_at(until)
         env.reset()  # draws chance of its own
         start = env.set_state(state if turned is None else turned.state(state))
         step = env.step(action if turned is None else turned.action(action))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from esp_cli.checking.verdicts import Watch
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment
 
@@ -42,19 +43,28 @@ class Transitions:
         return Transitions(*(part[where] for part in vars(self).values() if part is not None))
 
 
-def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS, until: float = math.inf) -> Transitions:
+def collect(
+    env: Environment,
+    episodes: int = EPISODES,
+    steps: int = STEPS,
+    until: float = math.inf,
+    watch: Watch = lambda *_: None,
+) -> Transitions:
     """Return the first steps of episodes of the random policy.
 
-    An episode that ends earlier repeats its last transition. After `until`, by `time.monotonic`, no more are begun.
+    An episode that ends earlier repeats its last transition. After `until`, by `time.monotonic`, no step is begun:
+    episodes that are under way are left out, of the first ones the steps that are missing.
     """
+    worlds = env.num_envs * env.num_seeds
+    rounds, count = -(-episodes // worlds), min(steps, env.spec.horizon)
     found: list[list[tuple[Tensor, ...]]] = []
-    for _ in range(-(-episodes // (env.num_envs * env.num_seeds))):
-        if found and time.monotonic() > until:
-            break
+    for k in range(rounds):
         observation = env.reset()
         over = torch.zeros(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
         rows: list[tuple[Tensor, ...]] = []
-        for _ in range(min(steps, env.spec.horizon)):
+        for t in range(count):
+            if (found or rows) and time.monotonic() > until:
+                break
             action = env.random_action()
             step = env.step(action)
             row: tuple[Tensor, ...] = (observation.obs, action, step.reward, step.reached.obs)
@@ -67,6 +77,9 @@ def collect(env: Environment, episodes: int = EPISODES, steps: int = STEPS, unti
             rows.append(row)
             over = over | step.ended
             observation = step.next
+            watch((k * count + t + 1) * worlds, rounds * count * worlds, "steps")
+        if found and len(rows) < len(found[0]):
+            break
         found.append(rows)
     parts = [
         torch.cat([torch.stack(column, 2).flatten(0, 1) for column in columns]).cpu()

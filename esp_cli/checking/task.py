@@ -81,8 +81,9 @@ def check_symmetry(
         make: makes E worlds for some seeds.
         transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
         from_transitions: use transitions of the random policy even where the task can be set to states.
-        watch: told of how many elements of how many are judged.
-        seconds: after which elements that are left are not tried; declared ones are tried first.
+        watch: told of how many steps of how many are collected, then of how many elements are judged.
+        seconds: after which elements that are left are not covered; declared ones are tried first. No more than half
+            of the time that is left goes to collecting.
 
     Raises:
         UserError: the transforms mean nothing, or the task can carry none of them.
@@ -112,8 +113,8 @@ def judged(
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
     if from_transitions or not probe.settable():
-        worlds = make(min(_COPIES, max(32, 8192 // seen.horizon)), [0])
-        data = collect(worlds, _EPISODES, until=(until + time.monotonic()) / 2)
+        worlds = make(min(_COPIES, max(transitions.FEWEST, 8192 // seen.horizon)), [0])
+        data = collect(worlds, _EPISODES, until=(until + time.monotonic()) / 2, watch=watch)
         return TRANSITIONS, transitions.check_transitions(seen, data, elements, watch, until)
 
     def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
@@ -125,7 +126,7 @@ def judged(
     found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until)
     verdicts = dict(zip(carried, found, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        verdicts |= dict(zip(rest, judged(make, rest, from_transitions=True, until=until)[1], strict=True))
+        verdicts |= dict(zip(rest, judged(make, rest, True, watch, until)[1], strict=True))
     return PAIRED, [verdicts[element] for element in elements]
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -47,6 +48,8 @@ _SEEN = 0.1
 """Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
 _DOUBTFUL = 4.0
 """Standard errors from which such a gap is no breaking yet, but leaves an element uncovered."""
+_HIDES = 0.25
+"""Share of the variance of rewards from which on the rarest hundredth of them hides what is usual."""
 _MOST_ROWS = 1 << 15
 """Steps of agents that are looked at, at most; of more episodes every k-th step."""
 _FEWEST_INSIDE = 0.5
@@ -82,12 +85,15 @@ def check_transitions(
     thinned = Transitions(*(part[:, ::stride] for part in vars(data).values() if part is not None))
     half = len(data.obs) // 2
     parts = thinned.episodes(slice(half)), thinned.episodes(slice(half, None))
-    controls = Controls(spaces.observation, thinned)
-    halves = [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
     first = Transitions(*(part[:, :1] for part in vars(data).values() if part is not None))
 
+    @cache
+    def halves() -> list[_Half]:
+        controls = Controls(spaces.observation, thinned)
+        return [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
+
     def judge(element: Element) -> ElementVerdict:
-        return _judge(element, spaces, halves, first)
+        return _judge(element, spaces, halves(), first)
 
     return verdicts_of(elements, judge, lambda element: is_declared(element, spaces), watch, until)
 
@@ -253,9 +259,13 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
 
 
 def _without_tails(reward: Tensor) -> Tensor:
-    """Return rewards of which the rarest hundredth counts as the next: rare large ones hide what is usual."""
+    """Return rewards of which the rarest hundredth counts as the next, if it hides what is usual.
+
+    Others stay as they are: where a law ends, no regression on few transitions follows it.
+    """
     low, high = torch.quantile(reward.flatten()[: 1 << 24], torch.tensor([0.005, 0.995])).tolist()
-    return reward.clamp(low, high) if low < high else reward
+    clamped = reward.clamp(low, high)
+    return clamped if low < high and clamped.var() < (1 - _HIDES) * reward.var() else reward
 
 
 def _done(data: Transitions, spaces: Spaces) -> Tensor:

@@ -11,8 +11,8 @@ from typing import Literal
 
 from esp_cli.symmetry import Element
 
-Watch = Callable[[int, int], object]
-"""Takes how many of how many are done."""
+Watch = Callable[[int, int, str], object]
+"""Takes how many of how many are done, and of what: "steps" while states or transitions are collected, "elements"."""
 Outcome = Literal["holds", "broken", "not covered"]
 RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}
 """The outcome of several verdicts is the one of the highest rank."""
@@ -23,6 +23,16 @@ NEGLIGIBLE = 1e-3
 LATE = "not tried, as the time was over"
 LEVEL = 0.05
 """Probability with which an element that is off by the tolerance may be said to hold, at most."""
+
+
+class Late(Exception):  # noqa: N818 - what is left is not covered, which is no error
+    """The time for a check is over."""
+
+
+def stop_at(until: float) -> None:
+    """Raise `Late` once `time.monotonic` is beyond `until`."""
+    if time.monotonic() > until:
+        raise Late
 
 
 @dataclass(frozen=True)
@@ -111,7 +121,10 @@ def verdicts_of(
     """
     found = dict[Element, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
-        late = done > 1 and time.monotonic() > until
-        found[element] = ElementVerdict(element.name, is_declared(element), (), LATE) if late else judge(element)
-        watch(done, len(elements))
+        try:
+            stop_at(until)
+            found[element] = judge(element)
+        except Late:
+            found[element] = ElementVerdict(element.name, is_declared(element), (), LATE)
+        watch(done, len(elements), "elements")
     return [found[element] for element in elements]

@@ -149,14 +149,18 @@ class TrainingProgress:
 
 
 @contextmanager
-def watching(description: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield what shows how many parts (of that unit) of how many are done, from the first one on."""
+def watching(description: str, unit: str) -> Iterator[Callable[..., None]]:
+    """Yield what shows how many parts of how many are done, from the first one on: `watch(done, total, unit)`.
+
+    Parts of another unit or total get a bar of their own.
+    """
     with ExitStack() as stack:
         bars: list[TrainingProgress] = []
 
-        def watch(done: int, total: int) -> None:
-            if not bars:
+        def watch(done: int, total: int, unit: str = unit) -> None:
+            if not bars or (bars[-1].total, bars[-1].unit) != (total, unit):
+                stack.close()
                 bars.append(stack.enter_context(TrainingProgress(total, description=description, unit=unit)))
-            bars[0].update(done)
+            bars[-1].update(done)
 
         yield watch

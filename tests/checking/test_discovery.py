@@ -24,8 +24,8 @@ from esp_cli.checking import (
 from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
 from esp_cli.checking.paired import _verdict
-from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, chance, concluded
-from esp_cli.symmetry import parse_elements, transform_set
+from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, Late, chance, concluded, verdicts_of
+from esp_cli.symmetry import Element, parse_elements, transform_set
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
@@ -392,13 +392,25 @@ def test_where_nothing_is_found_there_is_no_prior() -> None:
 
 @pytest.mark.parametrize("logs", [False, True])
 def test_what_does_not_fit_into_the_time_is_not_covered(logs: bool) -> None:
-    """What is declared is tried first, and one element is always tried."""
-    undeclared, declared = check_symmetry(
-        lambda n, seeds: make("navigation", n, seeds, {"wind": 0.3}), "rot90,flip-x", logs, seconds=0
+    """Collecting takes no more than half of the time and tells how far it is, whatever comes of it."""
+    told: list[tuple[int, int, str]] = []
+    elements = check_symmetry(
+        lambda n, seeds: make("navigation", n, seeds), "rot90,flip-x", logs, lambda *news: told.append(news), seconds=0
     ).elements
-    assert (undeclared.outcome, undeclared.reason) == ("not covered", LATE)
-    assert declared.reason == ""
-    assert logs or declared.outcome == "holds"
+    assert [(element.outcome, element.reason) for element in elements] == [("not covered", LATE)] * 2
+    assert told == [(256, 16 * 8 * 256, "steps") if logs else (1, 22, "steps"), (1, 2, "elements"), (2, 2, "elements")]
+
+
+def test_declared_elements_are_tried_first_until_the_time_is_over_within_one() -> None:
+    first, second = parse_elements("rot90,flip-x", 1)
+
+    def judge(element: Element) -> ElementVerdict:
+        if element == first:
+            raise Late
+        return ElementVerdict(element.name, True, (concluded("reward", 0.0, 0.0, False, 0.0),))
+
+    late, declared = verdicts_of([first, second], judge, lambda element: element == second)
+    assert (late.outcome, late.reason, declared.outcome) == ("not covered", LATE, "holds")
 
 
 def test_few_transitions_say_nothing() -> None:

@@ -14,7 +14,7 @@ from esp_cli.checking.candidates import is_declared, refused
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
-from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, layout
+from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, discrete_moves, layout
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
 CONTINUOUS = {"actions": "continuous"}
@@ -119,6 +119,19 @@ def test_a_reward_that_never_comes_is_not_covered_and_one_that_is_noise_is() -> 
     noise = torch.Generator().manual_seed(1)
     assert set(paid(lambda x: 0 * x[..., 0]).values()) == {"not covered"}
     assert set(paid(lambda x: torch.randn(x.shape[:-1], generator=noise)).values()) == {"holds"}
+
+
+def test_few_steps_of_a_law_without_chance_cover_it_where_some_are_far_out() -> None:
+    """If the rarest rewards of this draw count as the next, the reward is not covered: p is 0.3."""
+    g = torch.Generator().manual_seed(63)
+    start, pushed = torch.randn(400, 1, 1, 2, generator=g), torch.randint(4, (400, 1, 1), generator=g)
+    after = 0.8 * start + 0.3 * torch.tensor(discrete_moves(4).points)[pushed]
+    row = layout(Field("velocity", Kind.VECTOR))
+    spaces = Spaces(num_agents=1, observation=row, state=row, action=discrete_moves(4), symmetry="d4")
+    data = Transitions(start, pushed, -after.square().sum(-1), after)
+    (verdict,) = check_transitions(spaces, data, parse_elements("rot90", 1))
+    assert verdict.outcome == "holds"
+    assert verdict.p_value < 1e-6
 
 
 def test_one_exchange_is_not_all_orders() -> None:

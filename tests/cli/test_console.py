@@ -188,6 +188,15 @@ def test_progress_in_a_pipe_is_a_line_every_ten_seconds_and_the_last(capsys: pyt
     ]
 
 
+def test_parts_of_another_kind_get_progress_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+    with console.watching("check", "elements") as watch:
+        watch(1, 22, "steps")
+        watch(22, 22, "steps")
+        watch(3, 4)
+    shown = [line.split()[:3] for line in capsys.readouterr().err.splitlines()]
+    assert shown == [["check", "5%", "1/22"], ["check", "100%", "22/22"], ["check", "75%", "3/4"]]
+
+
 def test_the_rate_forgets_what_is_half_a_minute_old() -> None:
     clock = Clock()
     with TrainingProgress(total=10**6, clock=clock) as progress:

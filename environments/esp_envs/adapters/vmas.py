@@ -190,7 +190,7 @@ class VmasTask(Environment):
 
     def _renew(self, s: int, over: Tensor, here: Observation) -> Observation:
         """Start the next episode in some worlds [E] of one seed, each from a seed of its own; the others go on."""
-        if not over.any():
+        if not over.any() or not self.renews:
             return here
         if not self.terminates:
             return self._begin(s)
